@@ -22,6 +22,7 @@ COMMANDS: Final = {
     "liability": ("mesh.cli.liability:command", "list, show, follow and cancel liabilities"),
     "lighthouse": ("mesh.cli.lighthouse:command", "list and create lighthouses; become a provider"),
     "logs": ("mesh.cli.logs:command", "show the log of an agent, provider, bridge or device"),
+    "model": ("mesh.cli.model:command", "write, check and show descriptions of models"),
     "objective": ("mesh.cli.objective:command", "create, show, check and fetch objectives and recordings"),
     "order": ("mesh.cli.order:command", "list and withdraw open orders"),
     "peers": ("mesh.cli.status:peers", "list the peers on a lighthouse's channel"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from mesh.content import Progress
     from mesh.recording.source import RecordingChannel
+    from schemas.model import ModelDescription
 
     Obstacle: TypeAlias = Callable[[str, Any], str]
     """Returns why no handler accepts a message, given its topic and value; empty if one does."""
@@ -35,8 +37,9 @@ class Preflight:
 
     `reason` is machine-readable: empty if the objective can be played, or one of `not-a-recording`, `too-large`,
     `expands-too-much`, `corrupt`, `no-messages`, `too-long`, `unplayable-topic`, `unknown-topic`, `unreadable-message`
-    (its payload does not match its schema), `unfit-message` (no handler accepts it). `detail` is for people.
-    `objective` is set if the file itself is sound.
+    (its payload does not match its schema), `unfit-message` (no handler, or not the model, accepts it),
+    `missing-topic`, `too-many-messages` (for the model). `detail` is for people. `objective` is set if the file itself
+    is sound.
     """
 
     reason: str = ""
@@ -55,14 +58,15 @@ def preflight(
     *,
     topics: Collection[str] | None = None,
     obstacle: Obstacle | None = None,
+    model: ModelDescription | None = None,
     progress: Progress | None = None,
 ) -> Preflight:
     """Check the whole file at `path`. Raises nothing for a bad file. Reads the whole file: use a thread.
 
-    `topics` are those that the device accepts (None: any), `obstacle` finds messages that it does not accept.
-    `progress` is called with the bytes read, of all.
+    `topics` are those that the device accepts (None: any), `obstacle` finds messages that it does not accept, `model`
+    describes what objectives play. `progress` is called with the bytes read, of all.
     """
-    check = _MessageCheck(limits, obstacle)
+    check = _MessageCheck(limits, obstacle, model)
     try:
         objective = Objective(open_source(path, limits, on_message=check.on_message, progress=progress))
     except RecordingError as error:
@@ -70,6 +74,9 @@ def preflight(
     reason, detail = _recording_fault(objective, limits, topics)
     if not reason:
         reason, detail = check.reason, check.detail
+    if not reason and model is not None:
+        fault = model.objective_fault(check.counts, duration_ns=objective.duration_ns, size=objective.size)
+        reason, detail = fault or ("", "")
     return Preflight(reason=reason, detail=detail, objective=objective)
 
 
@@ -92,8 +99,11 @@ def _recording_fault(objective: Objective, limits: Limits, topics: Collection[st
 class _MessageCheck:
     """Finds the first message that would fail in the middle of the job."""
 
-    def __init__(self, limits: Limits, obstacle: Obstacle | None) -> None:
+    def __init__(self, limits: Limits, obstacle: Obstacle | None, model: ModelDescription | None) -> None:
         self.reason = self.detail = ""
+        self.counts: Counter[str] = Counter()
+        """Messages by topic, until one has failed."""
+        self._model = model
         self._most_json = limits.json
         self._obstacle = obstacle
         self._messages = 0
@@ -113,10 +123,13 @@ class _MessageCheck:
         except InvalidPayload as error:
             self._fail("unreadable-message", channel, str(error))
             return
-        why = self._obstacle(channel.topic, said) if self._obstacle is not None else ""
-        if why:
+        fault = None if self._model is None else self._model.message_fault(channel.topic, channel.type, said)
+        if fault is not None:
+            self._fail(fault.reason, channel, fault.detail)
+        elif self._obstacle is not None and (why := self._obstacle(channel.topic, said)):
             self._fail("unfit-message", channel, why)
         self._messages += 1
+        self.counts[channel.topic] += 1
 
     def _fail(self, reason: str, channel: RecordingChannel, why: str) -> None:
         self.reason, self.detail = reason, f"message {self._messages} on {channel.topic}: {why}"

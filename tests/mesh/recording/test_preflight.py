@@ -6,8 +6,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.recording import Limits, preflight
+from schemas.model import ModelDescription, ModelTopic
+from schemas.value_schema import ValueSchema
 from tests.mesh.recording.files import SECOND, T0, mcap_file, with_messages
 from tests.support.bags import Bag, BagMessage, string
+from tests.support.objectives import objective
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -115,3 +118,30 @@ def test_too_much_json_is_refused(tmp_path: Path) -> None:
     path.write_bytes(on_topic("/a", b"[" + b" " * 1000 + b"]"))
     assert preflight(path, Limits(json=1002)).ok
     assert preflight(path, Limits(json=1001)).reason == "expands-too-much"
+
+
+MODEL = ModelDescription(
+    title="Says a number",
+    objective=(
+        ModelTopic(topic="/a", value=ValueSchema(type="integer", minimum=1), required=True, max_messages=2),
+        ModelTopic(topic="/b"),
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (objective(("/a", 1), ("/b", "any")), ""),
+        (objective(("/a", 0)), "unfit-message"),
+        (objective(("/a", 1), ("/c", 1)), "unknown-topic"),
+        (objective(("/b", 1)), "missing-topic"),
+        (objective(("/a", 1), ("/a", 1), ("/a", 1)), "too-many-messages"),
+    ],
+)
+def test_an_objective_fits_the_description_of_the_model(tmp_path: Path, content: bytes, reason: str) -> None:
+    path = tmp_path / "objective"
+    path.write_bytes(content)
+    outcome = preflight(path, model=MODEL)
+    assert (outcome.ok, outcome.reason) == (not reason, reason)
+    assert bool(outcome.detail) is bool(reason)

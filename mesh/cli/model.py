@@ -1,0 +1,208 @@
+"""`aira model`: writes, checks and shows descriptions of models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mesh.cli.errors import FileExists
+from mesh.cli.files import FETCH_SETTINGS, require_readable, write_error
+from mesh.cli.objective_show import local_file
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import (
+    format_duration,
+    format_size,
+    plural,
+    print_facts,
+    print_json,
+    print_line,
+    print_table,
+    printable,
+    run_sync,
+)
+from mesh.recording import Limits, preflight
+from schemas import cid_of_file
+from schemas.model import (
+    MAX_MODEL_SIZE,
+    ModelDescription,
+    description_schema,
+    is_description,
+    parse_description,
+    read_description,
+)
+from schemas.value_schema import ValueSchema
+
+if TYPE_CHECKING:
+    from mesh.settings import Settings
+    from schemas.model import ModelLimits, ModelTopic
+
+
+@click.group("model")
+def command() -> None:
+    """Describe models: what an objective plays, what a result holds, what a success is, the price and the duration.
+
+    A model is named by the CID of its file. If the file is a description, agents and people check objectives against
+    it. Any other file, such as a text, is a model without a description.
+    """
+
+
+@command.command("new", short_help="write the description of a model")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="file to write [model.json beside SOURCE]")
+@click.option("--replace", is_flag=True, help="replace the file if it exists; the model then has another CID")
+@with_json
+def new(source: Path, out: Path | None, replace: bool, as_json: bool) -> None:
+    """Write the description in SOURCE, a JSON file as people write it, in the only form that models have; print its
+    CID. docs/models.md explains the fields."""
+
+    def work() -> None:
+        path = out or source.with_name("model.json")
+        description = parse_description(require_readable(source).read_bytes())
+        if path.exists() and not replace and not path.samefile(source):
+            raise FileExists(f"{path} already exists", hint="give --replace, or another name with --out")
+        try:
+            path.write_bytes(description.encode())
+        except OSError as error:
+            raise write_error(path, error) from None
+        if as_json:
+            print_json({"cid": description.cid, "file": str(path)})
+        else:
+            print_line(f"{description.cid}  {path}")
+
+    run_sync(work)
+
+
+@command.command("check", short_help="check a description, or an objective against it")
+@click.argument("model")
+@click.argument("objective", required=False)
+@with_json
+@with_settings(*FETCH_SETTINGS, "objective_size_limit", "objective_expanded_limit")
+def check(settings: Settings, model: str, objective: str | None, as_json: bool) -> None:
+    """Check MODEL, a file or a CID; with OBJECTIVE, a file or a CID, check whether a robot of that model accepts it.
+
+    The exit code is 1 if the objective does not fit, 2 if the description is not valid. The printed reason is a stable
+    code. A model without a description fits any objective that can be played.
+    """
+    path = local_file(settings, model)
+    recording = None if objective is None else local_file(settings, objective)
+
+    def work() -> bool:
+        description = description_in(path)
+        facts = {"cid": cid_of_file(path), "described": description is not None, "ok": True, "reason": "", "detail": ""}
+        if recording is not None:
+            limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
+            outcome = preflight(recording, limits, model=description)
+            facts |= {"ok": outcome.ok, "reason": outcome.reason, "detail": outcome.detail}
+        if as_json:
+            print_json(facts)
+        elif facts["ok"]:
+            print_line(f"{facts['cid']}  valid: {'a description' if description else 'a model without a description'}")
+        else:
+            print_line(f"{facts['cid']}  {facts['reason']}: {printable(str(facts['detail']))}")
+        return bool(facts["ok"])
+
+    if not run_sync(work):
+        raise SystemExit(1)
+
+
+@command.command("show", short_help="show the description of a model")
+@click.argument("model")
+@with_json
+@with_settings(*FETCH_SETTINGS)
+def show(settings: Settings, model: str, as_json: bool) -> None:
+    """Show MODEL, a file or a CID: its description, or its text if it has none."""
+    path = local_file(settings, model)
+
+    def work() -> None:
+        description = description_in(path)
+        if as_json:
+            print_json({"cid": cid_of_file(path), "description": description})
+        elif description is None:
+            with path.open("rb") as file:
+                text = file.read(MAX_MODEL_SIZE).decode(errors="replace")
+            print_line("\n".join(printable(line.expandtabs()) for line in text.splitlines()))
+        else:
+            _print_description(description)
+
+    run_sync(work)
+
+
+@command.command("schema", short_help="print the JSON Schema of descriptions")
+def schema() -> None:
+    """Print the JSON Schema of descriptions, with which editors check and complete them."""
+    click.echo(description_schema(), nl=False)
+
+
+def description_in(path: Path) -> ModelDescription | None:
+    """The description in a model's file; None if it is another file. Raises `InvalidDescription`."""
+    with path.open("rb") as file:
+        data = file.read(MAX_MODEL_SIZE + 1)
+    return read_description(data) if is_description(data) else None
+
+
+def _print_description(description: ModelDescription) -> None:
+    print_line(description.title)
+    if description.description:
+        print_line(f"\n{description.description}\n")
+    facts = {
+        "model": description.cid,
+        "price": description.price or None,
+        "duration": None if description.seconds is None else _duration(description.seconds),
+        "objective": _limits(description.limits),
+        "success": description.success.replace("\n", " ") or None,
+    }
+    print_facts(facts)
+    _print_topics("an objective plays", description.objective)
+    if description.other_topics:
+        print_line("and other topics")
+    _print_topics("the result has", description.result)
+
+
+def _limits(limits: ModelLimits | None) -> str | None:
+    if limits is None:
+        return None
+    messages = None if limits.messages is None else plural(limits.messages, "message")
+    seconds = None if limits.seconds is None else _duration(limits.seconds)
+    size = None if limits.size is None else format_size(limits.size)
+    return "at most " + ", ".join(part for part in (messages, seconds, size) if part)
+
+
+def _print_topics(title: str, topics: tuple[ModelTopic, ...]) -> None:
+    if not topics:
+        return
+    print_line(f"\n{title}")
+    rows = []
+    for topic in topics:
+        most = "" if topic.max_messages is None else f"at most {topic.max_messages}"
+        count = ", ".join(word for word in ("required" * topic.required, most) if word)
+        value = topic.value or ValueSchema()
+        rows.append((printable(topic.topic), _shown(topic.value, topic.encoding), count, topic.title or value.title))
+        for name, schema in value.properties.items():
+            rows.append((f"  {name}", _shown(schema), "required" * (name in value.required), schema.title))
+    print_table(("topic", "value", "", "title"), rows)
+
+
+def _shown(schema: ValueSchema | None, encoding: str = "") -> str:
+    """A schema in a few words: `number, 0 to 2 m/s`."""
+    if schema is None:
+        return encoding or "anything"
+    words: list[str] = [schema.type or "anything"]
+    if schema.enum:
+        words = [" | ".join(str(choice) for choice in schema.enum[:8]) + (" | …" if len(schema.enum) > 8 else "")]
+    low = f"from {schema.minimum}" if schema.minimum is not None else ""
+    low = f"above {schema.exclusive_minimum}" if schema.exclusive_minimum is not None else low
+    high = f"to {schema.maximum}" if schema.maximum is not None else ""
+    high = f"below {schema.exclusive_maximum}" if schema.exclusive_maximum is not None else high
+    if bounds := " ".join(word for word in (low, high, schema.unit) if word):
+        words.append(bounds)
+    if schema.items is not None:
+        words.append(f"of {_shown(schema.items)}")
+    if schema.default is not None:
+        words.append(f"default {schema.default}")
+    return ", ".join(words)
+
+
+def _duration(seconds: float) -> str:
+    return format_duration(round(seconds * 1e9))

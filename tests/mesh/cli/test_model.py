@@ -1,0 +1,139 @@
+"""`aira model`."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from mesh.cli.errors import FileExists
+from schemas import cid_of_file
+from schemas.model import InvalidDescription, ModelDescription, read_description
+from tests.support.commands import invoke, refused
+from tests.support.objectives import objective
+
+if TYPE_CHECKING:
+    import subprocess
+
+ROOT = Path(__file__).parents[3]
+EXAMPLES = ROOT / "examples"
+DRAFT: dict[str, Any] = {
+    "title": "Lamp",
+    "description": "A lamp that blinks.",
+    "objective": [
+        {"topic": "/blink", "required": True, "value": {"type": "string", "enum": ["red", "blue"], "default": "red"}},
+        {
+            "topic": "/drive",
+            "maxMessages": 2,
+            "value": {
+                "type": "object",
+                "properties": {"speed": {"type": "number", "title": "Speed", "unit": "m/s", "maximum": 2.0}},
+            },
+        },
+    ],
+    "result": [{"topic": "/led"}],
+    "success": "The lamp has blinked.",
+    "price": "5 XRT",
+    "limits": {"messages": 10},
+}
+
+
+def model(*words: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
+    return invoke("model", *words, AIRA_DATA_DIR=str(folder / "data"))
+
+
+@pytest.fixture
+def draft(tmp_path: Path) -> Path:
+    path = tmp_path / "draft.json"
+    path.write_text(json.dumps(DRAFT))
+    return path
+
+
+@pytest.fixture
+def described(draft: Path) -> Path:
+    assert model("new", draft, folder=draft.parent).returncode == 0
+    return draft.with_name("model.json")
+
+
+def test_new_writes_the_only_form_and_prints_the_model(draft: Path) -> None:
+    done = model("new", draft, "--json", folder=draft.parent)
+    path = draft.with_name("model.json")
+    assert json.loads(done.stdout) == {"cid": cid_of_file(path), "file": str(path)}
+    description = read_description(path.read_bytes())
+    assert json.loads(msgspec.json.encode(description)) == {"format": "aira-model/1", **DRAFT}
+
+
+def test_new_replaces_a_file_only_if_asked_or_if_it_is_the_source(draft: Path, described: Path) -> None:
+    refused(model("new", draft, folder=draft.parent), FileExists, described)
+    described.write_text(json.dumps(DRAFT | {"title": "Other"}))
+    assert model("new", described, folder=draft.parent).returncode == 0
+    assert read_description(described.read_bytes()).title == "Other"
+    assert model("new", draft, "--replace", folder=draft.parent).returncode == 0
+    assert read_description(described.read_bytes()).title == "Lamp"
+
+
+def test_new_refuses_what_is_wrong_and_writes_nothing(draft: Path) -> None:
+    draft.write_text(json.dumps(DRAFT | {"price": "cheap"}))
+    refused(model("new", draft, folder=draft.parent), InvalidDescription, "price", exit_code=2)
+    assert not draft.with_name("model.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("message", "exit_code", "reason"),
+    [
+        (("/blink", "red"), 0, ""),
+        (("/blink", "green"), 1, "unfit-message"),
+        (("/fly", "red"), 1, "unknown-topic"),
+        (("/drive", {"speed": 1}), 1, "missing-topic"),
+    ],
+)
+def test_check_finds_out_whether_an_objective_fits(
+    described: Path, message: tuple[str, object], exit_code: int, reason: str
+) -> None:
+    path = described.with_name("objective.mcap")
+    path.write_bytes(objective(message))
+    done = model("check", described, path, "--json", folder=described.parent)
+    facts = json.loads(done.stdout)
+    assert (done.returncode, facts["ok"], facts["reason"]) == (exit_code, not reason, reason)
+    assert facts["cid"] == cid_of_file(described)
+    assert model("check", described, path, folder=described.parent).returncode == exit_code
+
+
+def test_check_refuses_a_description_that_is_not_canonical(described: Path) -> None:
+    described.write_bytes(described.read_bytes().rstrip())
+    refused(model("check", described, folder=described.parent), InvalidDescription, "not-canonical", exit_code=2)
+
+
+def test_a_text_is_a_model_without_a_description(tmp_path: Path) -> None:
+    text = EXAMPLES / "blink" / "model.md"
+    done = model("check", text, EXAMPLES / "blink" / "blink.mcap", "--json", folder=tmp_path)
+    facts = {"cid": cid_of_file(text), "described": False, "ok": True, "reason": "", "detail": ""}
+    assert json.loads(done.stdout) == facts
+    assert json.loads(model("show", text, "--json", folder=tmp_path).stdout)["description"] is None
+    assert model("show", text, folder=tmp_path).stdout == text.read_text()
+
+
+def test_show_prints_the_description(described: Path) -> None:
+    done = model("show", described, folder=described.parent)
+    lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
+    assert f"model {cid_of_file(described)}" in lines
+    assert "/blink red | blue, default red required" in lines
+    assert "speed number, to 2 m/s Speed" in lines
+    shown = json.loads(model("show", described, "--json", folder=described.parent).stdout)
+    assert msgspec.convert(shown["description"], ModelDescription) == read_description(described.read_bytes())
+
+
+def test_the_schema_in_the_docs_is_that_of_the_source(tmp_path: Path) -> None:
+    documented = ROOT / "docs" / "model.schema.json"
+    assert model("schema", folder=tmp_path).stdout == documented.read_text(), (
+        "aira model schema > docs/model.schema.json"
+    )
+
+
+def test_the_description_in_the_docs_is_canonical() -> None:
+    (block,) = re.findall(r"```json\n(.*?)```", (ROOT / "docs" / "models.md").read_text(), re.DOTALL)
+    assert read_description(block.encode()).title == "Blink with arguments"

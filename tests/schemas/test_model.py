@@ -1,0 +1,226 @@
+"""Descriptions of models: their only form, what is refused, and which objectives fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, cid_of_bytes
+from schemas.model import (
+    MAX_MODEL_SIZE,
+    InvalidDescription,
+    ModelDescription,
+    ModelLimits,
+    ModelTopic,
+    is_description,
+    parse_description,
+    read_description,
+)
+from schemas.value_schema import MAX_DEPTH, SAFE_INTEGER, ValueSchema
+
+SPEED = ValueSchema(type="number", title="Speed", unit="m/s", minimum=0, maximum=2, default=0.5)
+DRIVE = ModelDescription(
+    title="Drive",
+    description="Drives.\nStops at the end.",
+    objective=(
+        ModelTopic(
+            topic="/drive",
+            title="Drive",
+            value=ValueSchema(type="object", properties={"speed": SPEED}, required=("speed",)),
+            required=True,
+            max_messages=3,
+        ),
+        ModelTopic(
+            topic="/lamp", encoding="ros1;std_msgs/String", value=ValueSchema(type="string", enum=("on", "off"))
+        ),
+        ModelTopic(topic="/stop", encoding=EMPTY.zenoh_encoding, value=ValueSchema(type="null")),
+        ModelTopic(topic="/map", encoding="application/octet-stream"),
+    ),
+    result=(ModelTopic(topic="/position", value=ValueSchema(type="array", items=SPEED, max_items=3), required=True),),
+    success="It has stopped where it should.",
+    price="5 XRT",
+    seconds=2.5,
+    limits=ModelLimits(messages=5, seconds=60, size=10_000),
+)
+SMALL = b'{\n  "format": "aira-model/1",\n  "title": "Small"\n}\n'
+
+
+def refused(data: bytes) -> str:
+    with pytest.raises(InvalidDescription) as caught:
+        read_description(data)
+    assert "\n" not in str(caught.value)
+    return caught.value.reason
+
+
+def test_a_description_is_read_as_it_was_written_and_its_bytes_are_the_model() -> None:
+    data = DRIVE.encode()
+    assert read_description(data) == DRIVE
+    assert DRIVE.cid == cid_of_bytes(data)
+    assert ModelDescription(title="Small").encode() == SMALL
+
+
+numbers = st.none() | st.integers(-SAFE_INTEGER, SAFE_INTEGER) | st.floats(-1e15, 1e15)
+schemas = st.recursive(
+    st.builds(ValueSchema, type=st.sampled_from(("", "boolean", "null", "string")), title=st.sampled_from(("", "Räum")))
+    | st.builds(
+        ValueSchema, type=st.just("number"), minimum=numbers.filter(lambda one: one is None or abs(one) < 1e15)
+    ),
+    lambda inner: (
+        st.builds(ValueSchema, type=st.just("array"), items=inner)
+        | st.builds(
+            ValueSchema, type=st.just("object"), properties=st.dictionaries(st.sampled_from("abc"), inner, max_size=3)
+        )
+    ),
+    max_leaves=5,
+)
+
+
+@given(schemas, st.booleans())
+def test_every_description_has_one_form(value: ValueSchema, required: bool) -> None:
+    description = ModelDescription(title="x", objective=(ModelTopic(topic="/a", value=value, required=required),))
+    assert read_description(description.encode()) == description
+    assert parse_description(msgspec.json.encode(description)).encode() == description.encode()
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"# Blink\n", "not-json"),
+        (b"\xff", "not-json"),
+        (b'{"title":"x","objective":[{"topic":"/a","value":' + b'{"items":' * 5000, "not-json"),
+        (b'{"format":"aira-model/2","title":"x"}', "not-a-description"),
+        (b"{}", "field"),
+        (b'{"title":"x","titel":"y"}', "field"),
+        (SMALL.rstrip(), "not-canonical"),
+        (SMALL.replace(b'"Small"', b'"Other",\n  "title": "Small"'), "not-canonical"),
+        (SMALL.replace(b'"Small"', b'"Small",\n  "seconds": 1.0'), "not-canonical"),
+        (SMALL.replace(b'"Small"', b'"Small",\n  "seconds": 0'), "field"),
+        (SMALL.replace(b'"Small"', b'"Small",\n  "price": "five"'), "field"),
+        (SMALL.replace(b"Small", b"S" * 81), "field"),
+        (SMALL.replace(b"Small", b"\\u202eSmall"), "field"),
+        (SMALL.replace(b"Small", b"Small\\n"), "field"),
+        (SMALL.replace(b"Small", b"S" * MAX_MODEL_SIZE), "too-large"),
+        (SMALL.replace(b'"Small"', b'"Small","objective":[{"topic":"go"}]'), "field"),
+        (SMALL.replace(b'"Small"', b'"Small","objective":[{"topic":"/a"},{"topic":"/a"}]'), "field"),
+    ],
+)
+def test_what_is_no_description_is_refused_with_a_reason(data: bytes, reason: str) -> None:
+    assert refused(data) == reason
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"type": "text"},
+        {"type": "string", "minimum": 1},
+        {"minimum": 1},
+        {"type": "number", "enum": (1,)},
+        {"type": "number", "minimum": 2, "maximum": 1},
+        {"type": "number", "minimum": 2**53},
+        {"type": "number", "minimum": 1, "default": 0},
+        {"type": "integer", "default": True},
+        {"type": "string", "enum": ("a", "a")},
+        {"type": "string", "enum": ("a", 1)},
+        {"type": "string", "max_length": 1, "enum": ("ab",)},
+        {"type": "object", "required": ("a",)},
+        {"type": "object", "properties": {"": {}}},
+        {"type": "object", "properties": {"a\n": {}}},
+        {"type": "string", "pattern": "(a+)+$"},
+        {"$ref": "#"},
+    ],
+)
+def test_a_schema_that_contradicts_itself_or_says_more_than_we_check_is_refused(fields: dict[str, Any]) -> None:
+    camel = {"min_length": "minLength", "max_length": "maxLength"}
+    value = {camel.get(name, name): field for name, field in fields.items()}
+    with pytest.raises(InvalidDescription) as caught:
+        parse_description(msgspec.json.encode({"title": "x", "objective": [{"topic": "/a", "value": value}]}))
+    assert caught.value.reason == "field"
+
+
+def test_schemas_are_nested_only_so_deep() -> None:
+    schema = ValueSchema()
+    for _ in range(MAX_DEPTH - 1):
+        schema = ValueSchema(type="array", items=schema)
+    assert schema.depth == MAX_DEPTH
+    with pytest.raises(ValueError, match="deep"):
+        ValueSchema(type="array", items=schema)
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "value", "reason"),
+    [
+        ("/drive", JSON, {"speed": 2}, None),
+        ("/drive", PayloadType("json", "Move", "jsonschema"), {"speed": 0.0, "other": []}, None),
+        ("/drive", JSON, {"speed": 2.001}, "unfit-message"),
+        ("/drive", JSON, {"speed": True}, "unfit-message"),
+        ("/drive", JSON, {"speed": float("nan")}, "unfit-message"),
+        ("/drive", JSON, {}, "unfit-message"),
+        ("/drive", JSON, [], "unfit-message"),
+        ("/drive", RAW, b"{}", "unfit-message"),
+        ("/lamp", STRING, String("on"), None),
+        ("/lamp", STRING, String("red"), "unfit-message"),
+        ("/lamp", JSON, "on", "unfit-message"),
+        ("/stop", EMPTY, Empty(), None),
+        ("/stop", JSON, None, "unfit-message"),
+        ("/map", RAW, b"anything", None),
+        ("/map", JSON, {}, "unfit-message"),
+        ("/fly", EMPTY, Empty(), "unknown-topic"),
+    ],
+)
+def test_a_message_fits_or_not(topic: str, kind: PayloadType, value: object, reason: str | None) -> None:
+    fault = DRIVE.message_fault(topic, kind, value)
+    assert (fault and fault.reason) == reason
+
+
+def test_other_topics_are_played_where_the_model_says_so() -> None:
+    open_one = msgspec.structs.replace(DRIVE, other_topics=True)
+    assert open_one.message_fault("/fly", EMPTY, Empty()) is None
+    assert open_one.message_fault("/stop", JSON, None) is not None
+
+
+@pytest.mark.parametrize(
+    ("counts", "seconds", "size", "reason"),
+    [
+        ({"/drive": 1}, 60, 10_000, None),
+        ({"/stop": 1}, 1, 1, "missing-topic"),
+        ({"/drive": 4}, 1, 1, "too-many-messages"),
+        ({"/drive": 3, "/stop": 3}, 1, 1, "too-many-messages"),
+        ({"/drive": 1}, 61, 1, "too-long"),
+        ({"/drive": 1}, 1, 10_001, "too-large"),
+    ],
+)
+def test_an_objective_fits_as_a_whole_or_not(
+    counts: dict[str, int], seconds: int, size: int, reason: str | None
+) -> None:
+    fault = DRIVE.objective_fault(counts, duration_ns=seconds * 10**9, size=size)
+    assert (fault and fault.reason) == reason
+
+
+@pytest.mark.parametrize(
+    ("values", "fits"),
+    [
+        ([0, 1.5, 2], True),
+        ([], True),
+        ([1] * 4, False),
+        ([1, -1], False),
+        ([1, 3], False),
+        ([1, "a"], False),
+        ([1, float("nan")], False),
+        ([1, float("inf")], False),
+        ([1, True], False),
+    ],
+)
+def test_every_number_of_an_array_is_checked(values: list[Any], fits: bool) -> None:
+    schema = ValueSchema(type="array", items=SPEED, max_items=3)
+    assert (schema.fault(values) == "") is fits
+
+
+def test_a_file_that_says_it_is_a_description_is_one_or_is_refused() -> None:
+    assert is_description(SMALL)
+    assert is_description(b'{"format":"aira-model/1", "title": 5}')
+    assert not is_description(b"# A model of a lamp")
+    assert not is_description(b'{"title": "x"}')
