@@ -197,10 +197,16 @@ class _Statement(Record, frozen=True, kw_only=True):
         return replace(self, signature=signer.sign_hash(self._hash()).hex())
 
     @property
+    def signer(self) -> str:
+        """The author's address."""
+        address: str = getattr(self, self.author)
+        return address
+
+    @property
     def is_signed(self) -> bool:
         """Whether the signature is the author's."""
         try:
-            return bool(recover(self._hash(), self.signature) == getattr(self, self.author))
+            return recover(self._hash(), self.signature) == self.signer
         except InvalidMessage:
             return False
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 
 from mesh.agent.errors import LiabilityReverted
+from mesh.agent.progress import Progress, followed_job, nothing, report
 from mesh.content import ContentUnavailable
 from mesh.errors import AiraError
 from mesh.log_context import log_event
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.components import AgentComponents
+    from mesh.agent.progress import OnProgress
     from schemas import Liability
 
 log = logging.getLogger(__name__)
@@ -55,20 +57,25 @@ class Contract:
         """The contract's address (EIP-55)."""
         return self.liability.address
 
-    async def outcome(self) -> Outcome:
+    async def outcome(self, *, on_progress: OnProgress = nothing) -> Outcome:
         """Wait until the contract is finalized. Cancelling the wait changes nothing.
+
+        `on_progress` is called with what the promisor says of the job meanwhile, and with the end.
 
         Raises `ClosedError` if the agent ends first, and `LiabilityReverted` if a reorganisation reverted the contract
         and it was not created again by its orders' deadline.
 
         Of a job that failed it fetches the recording, for at most `REASON_TIMEOUT`, and reads the reason.
         """
-        ended = await asyncio.shield(self._ended)
-        if ended.success:
-            return ended
-        if self._failure is None:
-            self._failure = await self._reason(ended)
-        return msgspec.structs.replace(ended, reason=self._failure.text, code=self._failure.code)
+        async with followed_job(self._parts, self.liability, on_progress):
+            ended = await asyncio.shield(self._ended)
+        if not ended.success:
+            if self._failure is None:
+                self._failure = await self._reason(ended)
+            ended = msgspec.structs.replace(ended, reason=self._failure.text, code=self._failure.code)
+        kind: Literal["paid", "refunded"] = "paid" if ended.success else "refunded"
+        report(on_progress, Progress(kind=kind, agent=self.liability.promisor, code=ended.code, detail=ended.reason))
+        return ended
 
     async def recording(self) -> Path:
         """Wait for the outcome, and fetch the result's recording, every block of it checked.

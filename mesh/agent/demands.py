@@ -11,6 +11,8 @@ from contextvars import ContextVar
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from mesh.agent.declines import BUSY, grounds_of
+from mesh.agent.errors import Declined
 from mesh.agent.handlers import call
 from mesh.content import ContentUnavailable
 from mesh.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
@@ -19,6 +21,7 @@ from mesh.work.objectives import Buyer, ObjectiveNotFetched
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from mesh.agent.declines import DeclinePublisher
     from mesh.agent.handlers import Handler
     from mesh.chain import Chain
     from mesh.errors import AiraError
@@ -53,7 +56,7 @@ class DemandDispatcher:
     """Calls `handlers` with the demands of a subscription: `await dispatcher.run()`.
 
     A demand whose maker can't pay now is not handled, but its next copy is looked at again. Pay counts in `token` (an
-    address) only. What is not handled is counted in `drops`.
+    address) only. What is not handled is counted in `drops`; what makers with money should know goes to `declines`.
     """
 
     def __init__(
@@ -65,6 +68,7 @@ class DemandDispatcher:
         token: str,
         customers: KnownSenders,
         outages: OutageLog,
+        declines: DeclinePublisher,
         drops: Drops,
     ) -> None:
         self._subscription = subscription
@@ -73,6 +77,7 @@ class DemandDispatcher:
         self._token = token
         self._customers = customers
         self._outages = outages
+        self._declines = declines
         self._drops = drops
         self._arrived: FairQueue[Verified[Demand]] = FairQueue(per_sender=WAITING, total=WAITING)
         self._funded: FairQueue[Verified[Demand]] = FairQueue(per_sender=WAITING, total=WAITING)
@@ -106,6 +111,7 @@ class DemandDispatcher:
                     continue
                 for dropped in self._funded.put(demand.signer, demand, priority=self._worth(demand)):
                     self._drop(dropped, "queue-full")
+                    self._declines.decline(dropped, BUSY)
             self._changed.set()
 
     def _worth(self, demand: Verified[Demand]) -> int:
@@ -120,6 +126,7 @@ class DemandDispatcher:
                 pays = self._chain.costs.worth(demand.message, token=self._token) > 0
                 if not pays and not self._free_rate.allow(demand.signer):
                     self._drop(demand, "free-rate")
+                    self._declines.decline(demand, BUSY)
                     continue
                 self._running += 1
                 self._running_free += not pays
@@ -134,6 +141,7 @@ class DemandDispatcher:
 
     async def _handle_one(self, demand: Verified[Demand], *, pays: bool) -> None:
         _handled.set(Buyer(demand.signer, pays))
+        grounds = []
         try:
             for handler in self._handlers:
                 error = await call(handler, demand, logged=self._is_logged)
@@ -141,13 +149,17 @@ class DemandDispatcher:
                     self._drop(demand, f"objective-{error.reason}")
                 elif isinstance(error, ContentUnavailable):
                     self._drop(demand, "objective-missing")
+                if error is not None and (reason := grounds_of(error)) is not None:
+                    grounds.append(reason)
+            if grounds:
+                self._declines.decline(demand, grounds[0])
         finally:
             self._running -= 1
             self._running_free -= not pays
             self._changed.set()
 
     def _is_logged(self, error: AiraError) -> bool:
-        return not isinstance(error, ObjectiveNotFetched) and self._logged.allow(error.code)
+        return not isinstance(error, ObjectiveNotFetched | Declined) and self._logged.allow(error.code)
 
     def _drop(self, demand: Verified[Demand], reason: str, *, after: float = 0.0) -> None:
         """Count a demand that is not handled now, and let its next copy through, `after` seconds."""

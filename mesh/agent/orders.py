@@ -10,22 +10,23 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from mesh.agent.contract import fail_future
 from mesh.agent.errors import OrderClosed, OrderExpired
+from mesh.agent.progress import Progress, nothing, report, stated
 from mesh.market.book import Refusal
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
+    from mesh.agent.progress import OnProgress
     from mesh.chain import Chain
-    from schemas.signing import Rejection
+    from schemas.signing import Decline, Rejection
 
-    OnRejection = Callable[[Rejection], object]
     Terms = Mapping[str, Any]
 
-REJECTIONS_KEPT: Final = 64
-"""Most providers whose rejection of an order is remembered."""
+STATEMENTS_KEPT: Final = 64
+"""Most providers whose rejection of an order is remembered, and most agents whose decline is."""
 REPEATED: Final = ("model", "objective", "token", "cost", "lighthouse", "validator", "sender")
 """The fields that are the same when an order is posted again; its nonce and perhaps its deadline are new."""
 LIFETIME: Final = 600.0
@@ -62,7 +63,9 @@ class TradedOrder:
     """What those wait for who asked for its contract."""
     rejections: dict[str, Rejection] = field(default_factory=dict)
     """The last rejection by each provider."""
-    on_rejection: list[OnRejection] = field(default_factory=list)
+    declines: dict[str, Decline] = field(default_factory=dict)
+    """The last decline by each agent."""
+    on_progress: list[OnProgress] = field(default_factory=list)
 
     def __str__(self) -> str:
         return f"{self.signed.kind} {self.identity}"
@@ -120,23 +123,37 @@ class TradedOrder:
         before = self.rejections.get(rejection.provider)
         if before is not None and before.reason == rejection.reason:
             return False
-        if before is not None or len(self.rejections) < REJECTIONS_KEPT:
+        if before is not None or len(self.rejections) < STATEMENTS_KEPT:
             self.rejections[rejection.provider] = rejection
-        for report in self.on_rejection:
-            report(rejection)
+        self._report(stated(rejection))
         return True
 
-    async def contract(self, on_rejection: OnRejection) -> Contract:
-        """Wait until it is a contract, and report rejections meanwhile, those of before first."""
+    def decline(self, decline: Decline) -> bool:
+        """Remember a decline and report it. False if the agent said the same before, or too many others declined."""
+        before = self.declines.get(decline.agent)
+        if before is None and len(self.declines) == STATEMENTS_KEPT:
+            return False
+        if before is not None and (before.code, before.detail) == (decline.code, decline.detail):
+            return False
+        self.declines[decline.agent] = decline
+        self._report(stated(decline))
+        return True
+
+    async def contract(self, on_progress: OnProgress) -> Contract:
+        """Wait until it is a contract, and report rejections and declines meanwhile, those of before first."""
         if self.created is None:
             self.created = asyncio.get_running_loop().create_future()
-        for rejection in self.rejections.values():
-            on_rejection(rejection)
-        self.on_rejection.append(on_rejection)
+        for said in (*map(stated, self.rejections.values()), *map(stated, self.declines.values())):
+            report(on_progress, said)
+        self.on_progress.append(on_progress)
         try:
             return await asyncio.shield(self.created)
         finally:
-            self.on_rejection.remove(on_rejection)
+            self.on_progress.remove(on_progress)
+
+    def _report(self, progress: Progress) -> None:
+        for on_progress in self.on_progress:
+            report(on_progress, progress)
 
 
 class OrderActions(Protocol):
@@ -150,7 +167,7 @@ class OrderActions(Protocol):
         """See `Order.withdraw_on_chain`."""
         ...
 
-    async def contract_of(self, order: TradedOrder, on_rejection: OnRejection) -> Contract:
+    async def contract_of(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
         """See `Order.contract`."""
         ...
 
@@ -204,14 +221,15 @@ class Order:
         """
         return await self._actions.withdraw_on_chain(self._traded)
 
-    async def contract(self, *, on_rejection: OnRejection = lambda rejection: None) -> Contract:
+    async def contract(self, *, on_progress: OnProgress = nothing) -> Contract:
         """Wait until the order is a contract. Cancelling the wait changes nothing.
 
-        `on_rejection` is called with each provider's signed statement that it can't use the order, those of before
-        included. The order stays valid, so another provider, or the same one later, may use it. Raises `OrderClosed` if
-        the order was withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
+        `on_progress` is called with what happens meanwhile: offers for a demand, agents' declines, providers'
+        rejections (both also from before), and the contract. A decline or a rejection is information: the order stays
+        valid, so another agent or provider, or the same one later, may use it. Raises `OrderClosed` if the order was
+        withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
         """
-        return await self._actions.contract_of(self._traded, on_rejection)
+        return await self._actions.contract_of(self._traded, on_progress)
 
 
 class TermsWriter:

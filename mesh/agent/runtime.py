@@ -6,6 +6,7 @@ import asyncio
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from mesh.agent.declines import DeclinePublisher
 from mesh.agent.demands import DemandDispatcher
 from mesh.agent.handlers import call
 from mesh.agent.listener import ChainListener, LateResults
@@ -96,6 +97,7 @@ class AgentRuntime(Role):
             token=token,
             customers=self.trader.customers,
             outages=parts.outages,
+            declines=DeclinePublisher(parts.channel, parts.signer, parts.drops),
             drops=parts.drops,
         ).run()
 

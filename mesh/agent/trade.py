@@ -12,7 +12,8 @@ from mesh.agent.contract import Contract, WatchedContracts, fail_future
 from mesh.agent.demands import current_buyer
 from mesh.agent.offers import OpenOffers
 from mesh.agent.orders import Order, OrderState, TermsWriter, TradedOrder
-from mesh.agent.rejections import received_rejections
+from mesh.agent.progress import Progress, report, seen_offers
+from mesh.agent.statements import received_declines, received_rejections
 from mesh.background import Background
 from mesh.chain import Allowances, OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
-    from mesh.agent.orders import OnRejection, Terms
+    from mesh.agent.orders import Terms
+    from mesh.agent.progress import OnProgress
     from schemas import Liability
     from schemas.signing import Rejection
 
@@ -77,6 +79,7 @@ class Trader(Lifecycle):
             facts = log_event("order-resumed", order=order.identity, kind=order.signed.kind, deadline=order.deadline)
             log.info("the %s of an earlier run is open until block %d", order, order.deadline, extra=facts)
         await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
+        await stack.enter_async_context(received_declines(self._parts, self._orders))
         self._tasks = await stack.enter_async_context(Background())
         self._send_when_covered([order for order in resumed if order.is_open])
 
@@ -110,15 +113,19 @@ class Trader(Lifecycle):
             raise
         return order.shown(self)
 
-    async def contract_of(self, order: TradedOrder, on_rejection: OnRejection) -> Contract:
+    async def contract_of(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
         """See `Order.contract`."""
         if order.state is OrderState.MATCHED:
-            return await self.contracts.read(order.liability)
-        if not order.is_open:
+            contract = await self.contracts.read(order.liability)
+        elif not order.is_open:
             raise order.why_closed
-        if not self.is_open:
+        elif not self.is_open:
             raise ENDED()
-        return await order.contract(on_rejection)
+        else:
+            async with seen_offers(self._parts.channel, order.signed, on_progress):
+                contract = await order.contract(on_progress)
+        report(on_progress, Progress(kind="contract", agent=contract.liability.promisor, detail=contract.address))
+        return contract
 
     async def withdraw(self, order: TradedOrder) -> Order:
         """See `Order.withdraw`."""

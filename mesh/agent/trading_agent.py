@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, TypedDict, Unpack
 from mesh.agent.demands import current_buyer
 from mesh.agent.errors import OrderClosed
 from mesh.agent.orders import Order, OrderState
+from mesh.agent.progress import nothing
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.role import Lifecycle
 from mesh.settings import load
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
-    from mesh.agent.orders import OnRejection
+    from mesh.agent.progress import OnProgress
     from mesh.agent.runtime import AgentRuntime
     from mesh.network import Channel, Network
     from mesh.recording import Objective
@@ -152,16 +153,16 @@ class TradingAgent(Lifecycle):
         return await self.runtime.trader.post(Demand, terms, validator_fee=validator_fee)
 
     async def demand(
-        self, objective: str | Path, *, on_rejection: OnRejection = lambda rejection: None, **terms: Unpack[DemandTerms]
+        self, objective: str | Path, *, on_progress: OnProgress = nothing, **terms: Unpack[DemandTerms]
     ) -> Contract:
         """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
 
-        The terms are those of `order`, `on_rejection` that of `Order.contract`. Cancelling withdraws the demand. Raises
+        The terms are those of `order`, `on_progress` that of `Order.contract`. Cancelling withdraws the demand. Raises
         `OrderExpired`, `OrderClosed` (withdrawn elsewhere) and `InsufficientTokens`.
         """
         order = await self.order(objective, **terms)
         try:
-            return await order.contract(on_rejection=on_rejection)
+            return await order.contract(on_progress=on_progress)
         except asyncio.CancelledError:
             if self._runtime is not None:
                 with suppress(OrderClosed):  # it has just become a contract

@@ -21,9 +21,8 @@ from mesh.errors import AiraError
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent, Contract, Order
+    from mesh.agent import Agent, Contract, Order, Progress
     from mesh.settings import Settings
-    from schemas.signing import Rejection
 
 CHOICES: Final = {
     "wait": "wait for it",
@@ -215,12 +214,13 @@ async def _wait_for_contract(order: Order | Contract) -> Contract:
     withdraw = f"withdraw it with `aira order withdraw {order.hash[:16]}`"
     stays = f"the demand stays valid until block {order.deadline:,}; {withdraw}"
 
-    def report(rejection: Rejection) -> None:
-        why = f"{rejection.detail} ({rejection.reason})"
-        click.echo(f"provider {rejection.provider} can't use the demand now: {why}\n{stays}", err=True)
+    def report(progress: Progress) -> None:
+        if progress.kind == "rejected":
+            why = f"{progress.detail} ({progress.code})"
+            click.echo(f"provider {progress.agent} can't use the demand now: {why}\n{stays}", err=True)
 
     try:
-        return await order.contract(on_rejection=report)
+        return await order.contract(on_progress=report)
     except asyncio.CancelledError:
         click.echo(stays, err=True)
         raise

@@ -153,7 +153,7 @@ async def _withdraw(
 async def _withdraw_orders(parts: AgentComponents, orders: Sequence[Order], *, on_chain: bool) -> list[dict[str, Any]]:
     """Withdraw orders, and wait a moment for providers to confirm it; returns what is printed of each."""
     from mesh.agent.orders import OrderState
-    from mesh.agent.rejections import received_rejections
+    from mesh.agent.statements import received_rejections
     from mesh.market.book import Refusal
 
     honoured = defaultdict[str, set[str]](set)

@@ -23,7 +23,7 @@ from mesh.settings import NetworkSettings, options_of
 from mesh.telemetry.logs import configure_logging
 from mesh.watching import JobEvent
 from schemas import Demand, Empty, InvalidAddress, Result, String, Verified, parse_address, parse_cid
-from schemas.signing import Rejection
+from schemas.signing import Decline, Rejection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 def command(
     settings: Settings, model: str | None, with_open: bool, readings: bool, out: Path | None, as_json: bool
 ) -> None:
-    """Print one line for each event on a lighthouse's channel: orders, rejections, contracts, jobs and results. Ctrl-C
-    stops it.
+    """Print one line for each event on a lighthouse's channel: orders, rejections, declines, contracts, jobs and
+    results. Ctrl-C stops it.
 
     Needs a router, but no account and no chain. Prints only orders and results with valid signatures; invalid messages
     are counted, and the counts are printed at the end and on SIGUSR1. --json prints one object per line, with amounts
@@ -203,6 +203,9 @@ def event_json(seen: MarketEvent, *, time: str) -> dict[str, Any]:
         case Rejection():
             about = {"event": "rejected", "order": seen.order, "provider": seen.provider}
             about |= {"reason": seen.reason, "detail": seen.detail}
+        case Decline():
+            about = {"event": "declined", "order": seen.order, "agent": seen.agent}
+            about |= {"code": seen.code, "detail": seen.detail}
         case Reading():
             about = {"event": "reading", "agent": seen.agent, "topic": seen.topic, "value": _value(seen)}
             if seen.result:
@@ -245,6 +248,9 @@ class EventFormatter:
             case Rejection():
                 why = printable(seen.detail[:LONGEST_TEXT] or seen.reason[:LONGEST_TEXT])
                 kind, words = "rejected", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.provider)}: {why}"
+            case Decline():
+                why = f"{printable(seen.detail[:LONGEST_TEXT])} ({seen.code})".lstrip()
+                kind, words = "declined", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.agent)}: {why}"
             case Reading():
                 kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.agent)}"
             case JobEvent(_, kind, liability):

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from mesh.network.channel import Channel, Subscription
     from mesh.network.connecting import NotAdmitted
     from mesh.network.endpoints import Endpoints, free_endpoint
+    from mesh.network.presence import PresentAgents
     from mesh.network.pump import Pump
     from mesh.network.readings import Reading, ReadingSubscription
     from mesh.network.services import ServiceFailed, Services, call
@@ -21,6 +22,7 @@ _NAMES: Final = {
     "mesh.network.channel": "Channel Subscription",
     "mesh.network.connecting": "NotAdmitted",
     "mesh.network.endpoints": "Endpoints free_endpoint",
+    "mesh.network.presence": "PresentAgents",
     "mesh.network.pump": "Pump",
     "mesh.network.readings": "Reading ReadingSubscription",
     "mesh.network.services": "ServiceFailed Services call",

@@ -1,7 +1,7 @@
-"""A live view of a market: verified orders and results, providers' rejections, and agents' job events, in one stream.
+"""A live view of a market: verified orders and results, rejections, declines, and agents' job events, in one stream.
 
-A rejection is signed by its provider. A job event is not signed: it must be on a key of the agent that its liability
-names as promisor. A router with a roster lets nobody else write there.
+A rejection is signed by its provider, a decline by its agent. A job event is not signed: it must be on a key of the
+agent that its liability names as promisor. A router with a roster lets nobody else write there.
 """
 
 from __future__ import annotations
@@ -9,21 +9,22 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeAlias, TypeVar
 
 import msgspec
 
 from mesh.background import Background
 from mesh.errors import AiraError, InputError
-from mesh.flood import BoundedDict, Rate, RateLimiter
-from mesh.network import Pump, Reading, ReadingSubscription, ValidationStatistics
+from mesh.flood import BoundedDict
+from mesh.network import PresentAgents, Pump, Reading, ReadingSubscription, ValidationStatistics
 from mesh.role import Lifecycle
 from schemas import (
     Demand,
     EventKey,
     Liability,
     Offer,
-    RejectKey,
+    ProgressKey,
     Result,
     Verified,
     event_selector,
@@ -32,7 +33,7 @@ from schemas import (
     parse_cid,
     parse_key,
 )
-from schemas.signing import Rejection
+from schemas.signing import Decline, Rejection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
@@ -44,10 +45,6 @@ if TYPE_CHECKING:
 
 WAITING: Final = 256
 """Events that wait for the consumer; beyond, the oldest incoming messages are dropped and counted."""
-PER_AGENT: Final = Rate(per_second=0.5, burst=4)
-"""Questions whether an agent with an unknown address is present."""
-QUESTIONS: Final = Rate(per_second=50, burst=500)
-"""Such questions in all."""
 RECENT: Final = 65_536
 """Texts that a `RecentSet` keeps."""
 
@@ -61,15 +58,18 @@ class JobEvent(NamedTuple):
     liability: Liability
 
 
-MarketEvent: TypeAlias = Verified[Demand] | Verified[Offer] | Verified[Result] | Rejection | JobEvent | Reading
-Claim: TypeAlias = Rejection | JobEvent
+MarketEvent: TypeAlias = (
+    Verified[Demand] | Verified[Offer] | Verified[Result] | Rejection | Decline | JobEvent | Reading
+)
+Claim: TypeAlias = Rejection | Decline | JobEvent
 C = TypeVar("C", bound=Claim)
+S = TypeVar("S", Rejection, Decline)
 
 
 class ClaimReader(Generic[C]):
     """Decodes samples for a pump and counts refused ones under `reason`."""
 
-    def __init__(self, read: Callable[[str, bytes], C], *, reason: str) -> None:
+    def __init__(self, read: Callable[[str, bytes], C | None], *, reason: str) -> None:
         self._read = read
         self._reason = reason
         self._lock = threading.Lock()
@@ -77,14 +77,14 @@ class ClaimReader(Generic[C]):
         self._accepted = 0
 
     def __call__(self, sample: zenoh.Sample) -> C | None:
-        """The claim in a sample; None if it is refused."""
+        """The claim in a sample; None if it is refused, or none that is read."""
         try:
             claim = self._read(str(sample.key_expr), sample.payload.to_bytes())
         except AiraError:
             self.refuse()
             return None
         with self._lock:
-            self._accepted += 1
+            self._accepted += claim is not None
         return claim
 
     def refuse(self) -> None:
@@ -128,9 +128,9 @@ class MarketWatch(Lifecycle):
     """Events on an open channel from now on: `async with MarketWatch(session, channel) as watch`, then iterate.
 
     With `model` (CIDv0), only events about orders and liabilities of that model; a result counts once its agent has
-    reported the liability. With `readings` also those of agents, which name no model. Readings and job events are taken
-    from agents that are present when one arrives. For one consumer. Leaving `async with` ends it; the
-    caller closes session and channel.
+    reported the liability. With `readings` also those of agents, which name no model. Readings, declines and job events
+    are taken from agents that are present when one arrives. For one consumer. Leaving `async with` ends it; the caller
+    closes session and channel.
     """
 
     title = "market watch"
@@ -141,21 +141,23 @@ class MarketWatch(Lifecycle):
         self._model = model
         self._readings = ReadingSubscription(session) if readings else None
         self._queue: asyncio.Queue[MarketEvent] = asyncio.Queue(WAITING)
-        self._agents = RecentSet()
-        self._questions = RateLimiter(per_sender=PER_AGENT, total=QUESTIONS)
+        self._agents = PresentAgents(channel)
         self._orders = RecentSet()
         self._contracts = RecentSet()
-        self._rejections = RecentSet()
+        self._statements = RecentSet()
 
     async def _open(self, stack: AsyncExitStack) -> None:
         channel = self._channel
         self._demands = await stack.enter_async_context(channel.subscribe(Demand, model=self._model))
         self._offers = await stack.enter_async_context(channel.subscribe(Offer, model=self._model))
         self._results = await stack.enter_async_context(channel.subscribe(Result))
-        self._rejection_reader = ClaimReader(read_rejection, reason="rejection")
+        self._rejection_reader = ClaimReader(partial(read_statement, Rejection), reason="rejection")
+        self._decline_reader = ClaimReader(partial(read_statement, Decline), reason="decline")
         self._event_reader = ClaimReader(read_event, reason="event")
         selector = market_selector(channel.lighthouse, "reject")
         self._rejected = await stack.enter_async_context(Pump(self._session, selector, self._rejection_reader))
+        selector = market_selector(channel.lighthouse, "decline")
+        self._declined = await stack.enter_async_context(Pump(self._session, selector, self._decline_reader))
         self._events = await stack.enter_async_context(Pump(self._session, event_selector(), self._event_reader))
         if self._readings is not None:
             await stack.enter_async_context(self._readings)
@@ -165,6 +167,7 @@ class MarketWatch(Lifecycle):
             ("offers", self._seen_orders(self._offers)),
             ("results", self._seen_results()),
             ("rejections", self._seen_rejections()),
+            ("declines", self._seen_declines()),
             ("events", self._seen_events()),
         ):
             tasks.start(self._move(items), f"watched {name}")
@@ -185,7 +188,11 @@ class MarketWatch(Lifecycle):
 
     def counters(self) -> MarketCounters:
         """What was received so far, and what of it was refused."""
-        claims = ((self._rejected, self._rejection_reader), (self._events, self._event_reader))
+        claims: tuple[tuple[Pump[Any], ClaimReader[Any]], ...] = (
+            (self._rejected, self._rejection_reader),
+            (self._declined, self._decline_reader),
+            (self._events, self._event_reader),
+        )
         return _sum_of(
             [
                 *(subscription.statistics() for subscription in (self._demands, self._offers, self._results)),
@@ -212,20 +219,24 @@ class MarketWatch(Lifecycle):
 
     async def _seen_rejections(self) -> AsyncIterator[MarketEvent]:
         async for rejection in self._rejected:
-            wanted = self._model == "*" or rejection.order in self._orders
-            if wanted and self._rejections.add(f"{rejection.order} {rejection.provider} {rejection.reason}"):
+            if self._is_new(rejection, rejection.reason):
                 yield rejection
 
-    async def _is_known(self, agent: str) -> bool:
-        """Whether an agent was found present on the channel. Who is unknown is asked after, at a limited rate."""
-        if agent in self._agents:
-            return True
-        is_known = self._questions.allow(agent) and bool(await self._channel.present(agent=agent))
-        return is_known and self._agents.add(agent)
+    async def _seen_declines(self) -> AsyncIterator[MarketEvent]:
+        async for decline in self._declined:
+            if not await self._agents.is_present(decline.agent):
+                self._decline_reader.refuse()
+            elif self._is_new(decline, decline.code):
+                yield decline
+
+    def _is_new(self, statement: Rejection | Decline, word: str) -> bool:
+        """Whether a statement is about an order of the model, and its author did not say the same of it before."""
+        wanted = self._model == "*" or statement.order in self._orders
+        return wanted and self._statements.add(f"{statement.order} {statement.signer} {word}")
 
     async def _seen_events(self) -> AsyncIterator[MarketEvent]:
         async for event in self._events:
-            if not await self._is_known(event.agent):
+            if not await self._agents.is_present(event.agent):
                 self._event_reader.refuse()
             elif self._model in ("*", event.liability.model):
                 self._contracts.add(event.liability.address)
@@ -233,25 +244,26 @@ class MarketWatch(Lifecycle):
 
     async def _known_readings(self, readings: ReadingSubscription) -> AsyncIterator[MarketEvent]:
         async for reading in readings:
-            if await self._is_known(reading.agent):
+            if await self._agents.is_present(reading.agent):
                 yield reading
             else:
                 readings.refuse(reading.agent)
 
 
-def read_rejection(key: str, payload: bytes) -> Rejection:
-    """A provider's signed rejection. Raises `AiraError`."""
-    if not isinstance(parse_key(key), RejectKey):
-        raise InputError("not the key of a rejection")
-    rejection = Rejection.decode(payload)
-    if not rejection.is_signed:
-        raise InputError("the rejection is not signed by its provider")
-    return rejection
+def read_statement(kind: type[S], key: str, payload: bytes) -> S:
+    """A signed rejection or decline on a valid key. Raises `AiraError`."""
+    parse_key(key)
+    statement = kind.decode(payload)
+    if not statement.is_signed:
+        raise InputError(f"the {kind.__name__} is not signed by {statement.signer}")
+    return statement
 
 
-def read_event(key: str, payload: bytes) -> JobEvent:
-    """An agent's event about its own job. Raises `AiraError`."""
-    liability, place = Liability.decode(payload), parse_key(key)
+def read_event(key: str, payload: bytes) -> JobEvent | None:
+    """An agent's event about its own job; None for the progress of its playback. Raises `AiraError`."""
+    if isinstance(place := parse_key(key), ProgressKey):
+        return None
+    liability = Liability.decode(payload)
     if not isinstance(place, EventKey):
         raise InputError("not the key of a job event")
     for address in (liability.promisee, liability.promisor, liability.lighthouse, liability.token, liability.validator):

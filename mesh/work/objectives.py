@@ -53,6 +53,7 @@ class ObjectiveUnfit(InputError, code="objective-unfit"):
         super().__init__(f"objective {cid} can't be played ({reason}): {detail}")
         self.cid = cid
         self.reason = reason
+        self.detail = detail
 
 
 class ObjectiveNotFetched(ContentError, code="objective-not-fetched"):

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+PUBLISH_INTERVAL: Final = 0.5
+"""Seconds after which a run's position is published, if it has changed."""
 SAVE_INTERVAL: Final = 0.5
 """Seconds after which a run's recording is synced and its position saved, again and again: what a crash repeats."""
 
@@ -105,7 +107,9 @@ class Playbacks:
             raise RecordingIncomplete(run.liability.address, run.missing)
         async with Background() as tasks:
             tasks.start(self._save_regularly(run), f"position {run.liability.address}")
+            tasks.start(_publish_regularly(run), f"progress {run.liability.address}")
             await run.play(handle)
+        run.publish_position()
         await self._save(run)
 
     async def _save_regularly(self, run: JobRun) -> None:
@@ -190,3 +194,12 @@ class Playbacks:
         """The recording when it is finished, while it is written, and while an interrupted one is continued."""
         finished = self._folder / f"{address}.mcap"
         return finished, finished.with_name(f"{finished.name}.part"), finished.with_name(f"{finished.name}.cut")
+
+
+async def _publish_regularly(run: JobRun) -> None:
+    published = None
+    while True:
+        if run.position != published:
+            published = run.position
+            run.publish_position()
+        await asyncio.sleep(PUBLISH_INTERVAL)

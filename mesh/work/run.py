@@ -16,8 +16,9 @@ from mesh.log_context import log_event
 from mesh.recording import AtOnce, Unrecordable, play
 from mesh.work.job import HandlerCancelled, Job
 from mesh.work.notes import NOTE_TOPIC
-from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey, parse_agent_key
-from schemas.payloads import STRING, PayloadType, String, payload_type
+from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey, ProgressKey, parse_agent_key
+from schemas.payloads import JSON, STRING, PayloadType, String, payload_type
+from schemas.records import PlaybackPosition
 from schemas.selectors import topic_selector
 
 if TYPE_CHECKING:
@@ -116,6 +117,13 @@ class JobRun(Job):
             failed = group.exceptions[0]
         if failed is not None:
             raise failed
+
+    def publish_position(self) -> None:
+        """Put on the job's progress key how far the playback is."""
+        assert self._objective is not None, "a run without an objective only records"
+        key = str(ProgressKey(self._agent, self.liability.address))
+        playback = PlaybackPosition(position=self.position, total=self._objective.count)
+        self._put(key, playback.encode(), JSON)
 
     async def sync(self) -> SyncedRun:
         """Sync the recording of all messages that were handled, and of what their handlers published.

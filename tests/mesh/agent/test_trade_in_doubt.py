@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from mesh.agent import Agent, LiabilityReverted, OrderExpired
+from mesh.agent import Agent, LiabilityReverted, OrderExpired, Progress
 from mesh.chain import Chain, Timing
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
@@ -39,9 +39,9 @@ async def test_a_rejection_is_information_and_the_order_stays_valid(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A provider says that it can't use the demand; a robot offers later, and the contract is created."""
-    heard: list[Rejection] = []
+    heard: list[Progress] = []
     async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as network:
-        demand = asyncio.create_task(person.demand(cid_of_file(job(place)), on_rejection=heard.append))
+        demand = asyncio.create_task(person.demand(cid_of_file(job(place)), on_progress=heard.append))
         await posted(person)
         (order,) = person.orders()
         key = str(RejectKey(person.channel.lighthouse, place.address("person")))
@@ -51,24 +51,26 @@ async def test_a_rejection_is_information_and_the_order_stays_valid(
         facts = {"order": order.hash, "provider": place.address("provider"), "reason": "Unwanted"}
         assert facts in logged_facts(caplog, "order-rejected")
         assert not demand.done()
-        again: list[Rejection] = []
-        waiting_too = asyncio.create_task(order.contract(on_rejection=again.append))
+        again: list[Progress] = []
+        waiting_too = asyncio.create_task(order.contract(on_progress=again.append))
         await until(lambda: again == heard)
         async with place.provider(), working(place.agent("robot")):
             contract = await demand
             assert (await waiting_too).address == contract.address
+        kinds = [progress.kind for progress in heard if progress.kind != "offer"]
+        assert kinds == ["rejected", "contract"]
         assert (await place.chains["person"].liabilities.order_hashes(contract.address))[0].hex() == order.hash
-        assert len(heard) == 1
 
 
 async def test_the_reason_of_the_contracts_is_reported(place: Place) -> None:
     robot = working(place.agent("robot"))
-    heard: list[Rejection] = []
+    heard: list[Progress] = []
     async with place.provider(), robot, place.agent("person", generation=5) as person:
-        wanted = person.demand(OBJECTIVE, validator=place.address("provider"), on_rejection=heard.append)
+        wanted = person.demand(OBJECTIVE, validator=place.address("provider"), on_progress=heard.append)
         demand = asyncio.create_task(wanted)
-        await until(lambda: heard)
-        assert (heard[0].reason, heard[0].provider) == ("ValidatorWithoutCode", place.address("provider"))
+        await until(lambda: any(progress.kind == "rejected" for progress in heard))
+        (rejected,) = (progress for progress in heard if progress.kind == "rejected")
+        assert (rejected.code, rejected.agent) == ("ValidatorWithoutCode", place.address("provider"))
         assert not demand.done()
         assert await waiting(person) == ["demand"]
         demand.cancel()

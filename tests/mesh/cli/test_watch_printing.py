@@ -11,7 +11,7 @@ from mesh.network import Reading
 from mesh.watching import JobEvent, MarketCounters
 from schemas import Empty, String, verify_message
 from schemas.payloads import encode_value
-from schemas.signing import Rejection
+from schemas.signing import Decline, Rejection
 from tests.mesh.watching.test_market import JOB
 from tests.support.orders import CONTRACT, RECORDING, ROBOT, TOKEN, demand, offer, result
 
@@ -68,6 +68,21 @@ def test_a_rejection_is_printed_as_json() -> None:
         "provider": ROBOT.address,
         "reason": "expired",
         "detail": "too late",
+    }
+
+
+def test_a_decline_is_printed_as_a_line_and_as_json() -> None:
+    decline = Decline(order="ab" * 32, code="too-cheap", detail="\x1b[2Jat least 5 XRT", agent=ROBOT.address)
+    assert format_line(decline).startswith("declined   abababab by 0x")
+    assert format_line(decline).endswith("at least 5 XRT (too-cheap)")
+    assert "\x1b" not in format_line(decline)
+    assert event_json(decline, time=NOON) == {
+        "time": NOON,
+        "event": "declined",
+        "order": "ab" * 32,
+        "agent": ROBOT.address,
+        "code": "too-cheap",
+        "detail": "\x1b[2Jat least 5 XRT",
     }
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from mesh.network import Channel, Endpoints, Network, message_key
 from mesh.watching import JobEvent, MarketWatch
-from schemas import EventKey, RejectKey, Verified, encode, message_hash
-from schemas.signing import Rejection
+from schemas import DeclineKey, EventKey, ProgressKey, RejectKey, Signer, Verified, encode, message_hash
+from schemas.signing import Decline, Rejection
 from tests.support.orders import (
     CONTRACT,
     LIGHTHOUSE,
@@ -50,7 +50,13 @@ class Market:
     async def heard(self) -> None:
         """Wait until messages on every kind of key are received."""
         rejection = RejectKey(MARKET, PERSON.address)
-        for key in (str(rejection), EVENT, *(str(self.key(message)) for message in (demand(), offer(), result()))):
+        decline = DeclineKey(MARKET, PERSON.address)
+        for key in (
+            str(rejection),
+            str(decline),
+            EVENT,
+            *(str(self.key(message)) for message in (demand(), offer(), result())),
+        ):
             await until_heard(self.session, key)
 
     def key(self, message: Any) -> str:
@@ -63,6 +69,11 @@ class Market:
     def reject(self, order: str, *, signer: Any = ROBOT, **changes: str) -> None:
         word = Rejection(order=order, reason="expired", detail="too late", provider=ROBOT.address).signed_by(signer)
         key = str(RejectKey(MARKET, PERSON.address))
+        self.channel.put(key, msgspec.structs.replace(word, **changes).encode())
+
+    def decline(self, order: str, *, agent: Signer = ROBOT, **changes: str) -> None:
+        word = Decline(order=order, code="busy", detail="later", agent=agent.address).signed_by(agent)
+        key = str(DeclineKey(MARKET, PERSON.address))
         self.channel.put(key, msgspec.structs.replace(word, **changes).encode())
 
     async def refused(self, reason: str, count: int = 1) -> None:
@@ -116,6 +127,25 @@ async def test_a_rejection_is_shown_once_and_only_when_its_provider_has_signed_i
     market.reject(order)
     market.reject("ab" * 32)
     assert [(await market.next()).order for _ in range(2)] == [order, "ab" * 32]
+
+
+async def test_a_decline_is_shown_once_and_only_of_a_present_agent_that_has_signed_it(market: Market) -> None:
+    order = message_hash(demand()).hex()
+    market.decline(order, detail="somebody else's words")
+    await market.refused("decline")
+    market.decline(order, agent=STRANGER)
+    await market.refused("decline", 2)
+    market.decline(order)
+    market.decline(order)
+    market.decline("ab" * 32)
+    assert [(await market.next()).order for _ in range(2)] == [order, "ab" * 32]
+
+
+async def test_the_progress_of_a_playback_is_neither_shown_nor_refused(market: Market) -> None:
+    market.channel.put(str(ProgressKey(ROBOT.address, CONTRACT)), b'{"position":1,"total":2}')
+    market.channel.put(EVENT, JOB.encode())
+    assert await market.next() == JobEvent(ROBOT.address, "incoming", JOB)
+    assert market.watch.counters().refused == {}
 
 
 async def test_an_agents_events_are_shown_with_the_record_of_the_contract(market: Market) -> None:

@@ -1,0 +1,117 @@
+"""What others state about an account's own orders: providers' rejections, and agents' declines of its demands.
+
+Anybody can sign either, so only those count that a provider with a stake, or an agent that is present, has signed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import asynccontextmanager, contextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+
+from mesh.background import Background, call_in_loop
+from mesh.flood import FairQueue
+from mesh.log_context import log_event
+from mesh.market.book import Refusal
+from mesh.network import PresentAgents
+from schemas import InvalidRecord, market_selector
+from schemas.signing import Decline, Rejection
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable, Container, Iterator, Mapping
+
+    import zenoh
+
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.orders import TradedOrder
+
+log = logging.getLogger(__name__)
+
+QUEUED: Final = 64
+"""Most signed rejections, and most declines, that wait to be checked; more are dropped, since anybody can sign one."""
+QUEUED_OF_ONE: Final = 16
+"""Of these, those of one agent or provider."""
+
+S = TypeVar("S", Rejection, Decline)
+
+
+@asynccontextmanager
+async def received_rejections(
+    parts: AgentComponents, orders: Container[str], on_rejection: Callable[[Rejection], Awaitable[None]]
+) -> AsyncIterator[None]:
+    """Meanwhile call `on_rejection` with each rejection of one of `orders` that a provider of the lighthouse signed.
+
+    A full order book is only logged. It is called again if it raises that the node is away.
+    """
+
+    async def check(rejection: Rejection) -> None:
+        lighthouse = await parts.chain.lighthouses.get(parts.settings.lighthouse_contract)
+        order, signer, reason = rejection.order, rejection.provider, rejection.reason
+        if signer not in lighthouse.stakes:
+            facts = log_event("rejection-ignored", signer=signer, reason=reason)
+            log.warning("%s is no provider, but rejects: %s", signer, reason, extra=facts)
+        elif reason == Refusal.FULL:
+            facts = log_event("order-deferred", order=order, provider=signer, reason=reason)
+            log.warning("provider %s has no room for the order %s now", signer, order, extra=facts)
+        else:
+            await on_rejection(rejection)
+
+    async def check_all(queue: FairQueue[Rejection]) -> None:
+        while True:
+            await parts.chain.retrying(partial(check, await queue.get()), outages=parts.outages)
+
+    with _queued(parts, "reject", Rejection, orders) as queue:
+        async with Background() as tasks:
+            tasks.start(check_all(queue), "rejections")
+            yield
+
+
+@asynccontextmanager
+async def received_declines(parts: AgentComponents, orders: Mapping[str, TradedOrder]) -> AsyncIterator[None]:
+    """Meanwhile report to the waiters of `orders` each decline that an agent signed that is present."""
+    agents = PresentAgents(parts.channel, role="agent")
+
+    async def check_all(queue: FairQueue[Decline]) -> None:
+        while True:
+            decline = await queue.get()
+            if not await agents.is_present(decline.agent):
+                parts.drops.count("declines", decline.agent)
+            elif (order := orders.get(decline.order)) is not None and order.is_open and order.decline(decline):
+                facts = log_event("order-declined", order=decline.order, agent=decline.agent, code=decline.code)
+                log.info("agent %s declines the %s (%s)", decline.agent, order, decline.code, extra=facts)
+
+    with _queued(parts, "decline", Decline, orders) as queue:
+        async with Background() as tasks:
+            tasks.start(check_all(queue), "declines")
+            yield
+
+
+@contextmanager
+def _queued(
+    parts: AgentComponents, kind: Literal["reject", "decline"], record: type[S], orders: Container[str]
+) -> Iterator[FairQueue[S]]:
+    """Meanwhile put the signed statements about these orders into the queue, while it has room."""
+    loop, queue = asyncio.get_running_loop(), FairQueue[S](per_sender=QUEUED_OF_ONE, total=QUEUED)
+
+    def put(statement: S) -> None:
+        for dropped in queue.put(statement.signer, statement):
+            parts.drops.count("declines" if kind == "decline" else "rejections", dropped.signer)
+
+    def receive(sample: zenoh.Sample) -> None:
+        try:
+            statement = record.decode(sample.payload.to_bytes())
+        except InvalidRecord as error:
+            log.debug("an unreadable statement: %s", error)
+            return
+        if statement.order in orders and statement.is_signed:  # others cost no more than reading them
+            call_in_loop(loop, put, statement)
+
+    selector = market_selector(parts.channel.lighthouse, kind, parts.signer.address)
+    subscriber: Any = parts.network.session.declare_subscriber(selector, receive)
+    try:
+        yield queue
+    finally:
+        if not parts.network.session.is_closed():
+            subscriber.undeclare()

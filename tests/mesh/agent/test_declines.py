@@ -1,0 +1,123 @@
+"""Robots say why they don't work for a demand, and those who demand hear it of robots that are present."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from msgspec.structs import replace
+
+from mesh import Declined, InputError, Progress
+from mesh.agent.declines import PER_MAKER, DeclinePublisher, Grounds
+from mesh.flood import Drops
+from mesh.network import Endpoints, Network
+from schemas import DeclineKey, Demand, Empty, Signer, Verified, cid_of_bytes
+from schemas.signing import Decline
+from tests.mesh.agent.trades import OBJECTIVE, posted
+from tests.support import orders
+from tests.support.log_events import logged_facts
+from tests.support.market import Place, offering
+from tests.support.objectives import objective
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from mesh.agent import Agent
+    from mesh.work.job import Job
+
+
+def taking_speeds(robot: Agent) -> Agent:
+    """The same robot, which offers for all that it can play: numbers on `/go`."""
+
+    @robot.on("/go", float)
+    async def go(job: Job, speed: float) -> None:
+        pass
+
+    return offering(robot)
+
+
+async def declined(person: Agent, wanted: Any) -> Progress:
+    """The first decline that a person hears who demands something."""
+    heard: list[Progress] = []
+    demand = asyncio.create_task(person.demand(wanted, on_progress=heard.append))
+    await until(lambda: any(progress.kind == "declined" for progress in heard), seconds=60)
+    demand.cancel()
+    await asyncio.wait([demand])
+    return next(progress for progress in heard if progress.kind == "declined")
+
+
+@pytest.mark.parametrize(
+    ("messages", "code"), [((("/fly", Empty()),), "unknown-topic"), ((("/go", "fast"),), "unfit-message")]
+)
+async def test_a_robot_says_why_an_objective_does_not_fit(place: Place, messages: Any, code: str) -> None:
+    async with place.at_work(taking_speeds(place.agent("robot"))) as person:
+        progress = await declined(person, place.save(objective(*messages)))
+        assert (progress.agent, progress.code) == (place.address("robot"), code)
+        assert messages[0][0] in progress.detail
+
+
+async def test_a_robot_says_that_it_found_nobody_with_the_objective(place: Place) -> None:
+    async with place.at_work(offering(place.agent("robot", fetch_timeout=0.5))) as person:
+        progress = await declined(person, cid_of_bytes(b"nobody has this"))
+        assert progress.code == "objective-unavailable"
+        assert str(place.folder) not in progress.detail
+
+
+async def test_a_handler_declines_with_a_word_of_its_own(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+    robot = place.agent("robot")
+
+    @robot.on_demand
+    async def weigh(demand: Verified[Demand]) -> None:
+        raise Declined("too-cheap", "costs at least 5 XRT" + "!" * 1000)
+
+    async with place.at_work(robot) as person:
+        progress = await declined(person, OBJECTIVE)
+        assert progress.code == "too-cheap"
+        assert progress.detail.startswith("costs at least 5 XRT")
+        assert len(progress.detail) == 500
+    assert logged_facts(caplog, "handler-failed") == []
+
+
+def test_a_decline_needs_a_word_for_programs() -> None:
+    for word in ("", "Too cheap", "too_cheap", "a" * 65):
+        with pytest.raises(InputError):
+            Declined(word)
+
+
+async def test_a_decline_is_believed_of_agents_that_are_present(place: Place) -> None:
+    """Not of accounts that are not; not if it has another's signature; and of each agent once."""
+    stranger, heard = Signer(secrets.token_bytes(32)), list[Progress]()
+    async with (
+        place.agent("robot") as robot,
+        place.agent("person") as person,
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+    ):
+        demand = asyncio.create_task(person.demand(OBJECTIVE, on_progress=heard.append))
+        await posted(person)
+        (order,) = person.orders()
+        key = str(DeclineKey(person.channel.lighthouse, place.address("person")))
+        absent = Decline(order=order.hash, code="busy", detail="", agent=stranger.address).signed_by(stranger)
+        true = Decline(order=order.hash, code="busy", detail="", agent=robot.address).signed_by(robot.parts.signer)
+        forged = replace(absent, agent=robot.address)
+        other = Decline(order="00" * 32, code="busy", detail="", agent=robot.address).signed_by(robot.parts.signer)
+
+        def are_heard() -> bool:
+            for decline in (absent, forged, other, true):
+                network.session.put(key, decline.encode())
+            return bool(heard) and "declines" in person.drops.totals()
+
+        await until(are_heard)
+        assert heard == [Progress(kind="declined", agent=robot.address, code="busy")]
+        demand.cancel()
+        await asyncio.wait([demand])
+
+
+async def test_declines_are_limited_for_each_maker(place: Place) -> None:
+    drops = Drops()
+    async with place.agent("robot") as robot:
+        publisher = DeclinePublisher(robot.channel, robot.parts.signer, drops)
+        for _ in range(int(PER_MAKER.burst) + 5):
+            signed = orders.demand(signer=Signer(b"\x05" * 32))
+            publisher.decline(Verified(signed, secrets.token_bytes(32), place.address("person")), Grounds("busy", ""))
+    assert drops.totals()["declines"] >= 4

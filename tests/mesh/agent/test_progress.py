@@ -1,0 +1,159 @@
+"""Those who wait for a job see what happens: offers, the contract, the playback, the result, the payment."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from mesh import JobFailed, Progress
+from mesh.network import Endpoints, Network
+from mesh.work import playbacks
+from schemas import EventKey, PlaybackPosition, ProgressKey
+from tests.mesh.agent.trades import job, working
+from tests.support.log_events import logged_facts
+from tests.support.market import Place, offering
+from tests.support.objectives import objective
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    import pytest
+
+    from mesh.agent import Agent
+    from mesh.work.job import Job
+
+
+def kinds(heard: list[Progress]) -> list[str]:
+    """The kinds in their order, without repetitions."""
+    return list(dict.fromkeys(progress.kind for progress in heard))
+
+
+async def test_a_person_sees_a_job_from_the_offer_to_the_payment(place: Place) -> None:
+    heard: list[Progress] = []
+    robot = working(place.agent("robot"))
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(*[("/go", "on")] * 5)), on_progress=heard.append)
+        outcome = await contract.outcome(on_progress=heard.append)
+        assert [kind for kind in kinds(heard) if kind != "offer"] == ["contract", "ready", "playing", "result", "paid"]
+        assert {progress.agent for progress in heard} == {robot.address}
+        said = {progress.kind: progress for progress in heard}
+        assert said["contract"].detail == contract.address
+        assert (said["playing"].position, said["playing"].total) == (5, 5)
+        assert said["result"].detail == outcome.result
+
+
+async def test_a_person_sees_why_a_job_failed(place: Place) -> None:
+    heard: list[Progress] = []
+    robot = offering(place.agent("robot"))
+
+    @robot.on("/go")
+    async def go(job: Job, message: Any) -> None:
+        raise JobFailed("the lamp is broken")
+
+    async with place.at_work(robot) as person:
+        contract = await person.demand(job(place))
+        await contract.outcome(on_progress=heard.append)
+        said = {progress.kind: progress for progress in heard}
+        assert said["result"].code == "failed"
+        assert (said["refunded"].code, said["refunded"].detail) == ("job-failed", "the lamp is broken")
+
+
+async def test_an_offer_with_other_terms_says_which(place: Place) -> None:
+    heard: list[Progress] = []
+    robot = working(place.agent("robot"))
+    async with robot, place.provider(), place.agent("person") as person:
+        cid = await person.add(job(place))
+        await robot.offer(objective=cid, cost=7)
+        demand = asyncio.create_task(person.demand(cid, cost=5, on_progress=heard.append))
+        other = Progress(kind="offer", agent=robot.address, code="other-cost", detail="7")
+        await until(lambda: other in heard)
+        await demand
+        assert heard.count(other) == 1
+
+
+async def test_the_position_of_a_playback_is_published_while_it_changes(place: Place) -> None:
+    said: list[PlaybackPosition] = []
+    robot = offering(place.agent("robot"))
+
+    @robot.on("/go")
+    async def go(job: Job, message: Any) -> None:
+        await asyncio.sleep(playbacks.PUBLISH_INTERVAL)
+
+    async with place.at_work(robot) as person:
+        selector = f"aira/agent/{robot.address.lower()}/liability/*/progress"
+
+        def hear(sample: Any) -> None:
+            said.append(PlaybackPosition.decode(sample.payload.to_bytes()))
+
+        with person.parts.network.session.declare_subscriber(selector, hear):
+            contract = await person.demand(place.save(objective(*[("/go", "on")] * 4)))
+            assert (await contract.outcome()).success
+            await until(lambda: said and said[-1].position == 4)
+    assert {playback.total for playback in said} == {4}
+    positions = [playback.position for playback in said]
+    assert positions == sorted(positions)
+    assert len(set(positions)) >= 3
+
+
+async def test_what_others_say_of_a_job_is_not_reported(place: Place) -> None:
+    """On the keys of another agent or another liability, or unreadable."""
+    heard: list[Progress] = []
+    robot: Agent = offering(place.agent("robot"))
+    done = asyncio.Event()
+
+    @robot.on("/go")
+    async def go(job: Job, message: Any) -> None:
+        await done.wait()
+
+    async with place.at_work(robot) as person, Network(Endpoints(connect=(place.endpoint,))) as network:
+        contract = await person.demand(job(place))
+        outcome = asyncio.create_task(contract.outcome(on_progress=heard.append))
+        own = str(ProgressKey(robot.address, contract.address))
+        playback = PlaybackPosition(position=1, total=3)
+
+        def is_heard() -> bool:
+            network.session.put(str(ProgressKey(person.address, contract.address)), b'{"position":9,"total":9}')
+            network.session.put(str(ProgressKey(robot.address, person.address)), b'{"position":9,"total":9}')
+            network.session.put(own, b"nonsense")
+            network.session.put(str(EventKey(robot.address, contract.address, "complete")), b"nonsense")
+            network.session.put(own, playback.encode())
+            return any(progress.total == 3 for progress in heard)
+
+        await until(is_heard)
+        assert all(progress.total != 9 for progress in heard)
+        assert "result" not in kinds(heard)
+        done.set()
+        await outcome
+
+
+async def test_a_person_sees_that_the_robot_is_gone(place: Place) -> None:
+    heard: list[Progress] = []
+    done = asyncio.Event()
+
+    def robot() -> Agent:
+        robot = offering(place.agent("robot"))
+
+        @robot.on("/go")
+        async def go(job: Job, message: Any) -> None:
+            await done.wait()
+
+        return robot
+
+    async with place.provider(), place.agent("person") as person:
+        async with robot():
+            contract = await person.demand(job(place))
+        outcome = asyncio.create_task(contract.outcome(on_progress=heard.append))
+        await until(lambda: "gone" in kinds(heard), seconds=30)
+        async with robot():
+            await until(lambda: "back" in kinds(heard), seconds=30)
+            done.set()
+            assert (await outcome).success
+
+
+async def test_a_callback_that_fails_ends_nothing(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(progress: Progress) -> None:
+        raise RuntimeError("broken")
+
+    async with place.at_work(working(place.agent("robot"))) as person:
+        contract = await person.demand(job(place), on_progress=fail)
+        assert (await contract.outcome(on_progress=fail)).success
+    assert {facts["kind"] for facts in logged_facts(caplog, "progress-not-reported")} >= {"contract", "paid"}
