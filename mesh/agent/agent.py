@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from mesh.agent.components import watching, working
 from mesh.agent.demands import HANDLED
-from mesh.agent.handlers import HandlerDecorators, dispatch, repeat
+from mesh.agent.handlers import HandlerDecorators, check_model, dispatch, repeat
 from mesh.agent.reading_agent import ReadingAgent
 from mesh.agent.status import WatcherStatus
 from mesh.background import Background
@@ -51,6 +51,7 @@ class Agent(HandlerDecorators, ReadingAgent):
         chain: Chain | None = None,
         resend: RetryPolicy = RESEND,
     ) -> None:
+        check_model(model)
         HandlerDecorators.__init__(self)
         ReadingAgent.__init__(self, model, settings)
         self._account = account

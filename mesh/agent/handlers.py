@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from mesh.errors import AiraError
 from mesh.log_context import log_event
-from mesh.work.job import TopicHandlers
+from mesh.work.registration import RegistrationError, call_handler, check_handler, name_of
+from mesh.work.topic_handlers import InvalidTopic, TopicHandlers, check_topic
 from schemas import Demand, Liability, Offer, Result, Verified, reading_selector
+from schemas.address import is_ens_name
+from schemas.cid import parse_cid
+from schemas.errors import InvalidCid, InvalidKey
 
 if TYPE_CHECKING:
     from mesh.network import Reading, ReadingSubscription, Subscription
@@ -20,13 +25,39 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Handler = Callable[..., Awaitable[object]]
-DemandHandler = Callable[[Verified[Demand]], Awaitable[object]]
-OfferHandler = Callable[[Verified[Offer]], Awaitable[object]]
-ResultHandler = Callable[[Verified[Result]], Awaitable[object]]
-LiabilityHandler = Callable[["Phase", Liability], Awaitable[object]]
-ReadingHandler = Callable[["Reading"], Awaitable[object]]
-PeriodicHandler = Callable[[], Awaitable[object]]
+Handler = Callable[..., object]
+DemandHandler = Callable[[Verified[Demand]], object]
+OfferHandler = Callable[[Verified[Offer]], object]
+ResultHandler = Callable[[Verified[Result]], object]
+LiabilityHandler = Callable[["Phase", Liability], object]
+ReadingHandler = Callable[["Reading"], object]
+PeriodicHandler = Callable[[], object]
+
+
+class InvalidPeriod(RegistrationError, code="invalid-period"):
+    """A handler is to be called every so many seconds, but that is no such number."""
+
+    def __init__(self, seconds: object) -> None:
+        super().__init__(f"{seconds!r} is not a number of seconds above 0", hint="write @agent.every(5.0)")
+        self.seconds = seconds
+
+
+class InvalidModel(RegistrationError, code="invalid-model"):
+    """What an agent is given as its model is neither a CID nor an ENS name."""
+
+    def __init__(self, model: object) -> None:
+        hint = 'the CID of a file is cid_of_file("model.md"), or what `aira cid model.md` prints'
+        super().__init__(f"the model {str(model)[:80]!r} is neither a CID nor an ENS name", hint=hint)
+        self.model = model
+
+
+def check_model(model: object) -> None:
+    """Raise `InvalidModel` for what can't be a model. Empty stands for any model."""
+    try:
+        if not isinstance(model, str) or (model and not is_ens_name(model) and not parse_cid(model)):
+            raise InvalidModel(model)
+    except InvalidCid:
+        raise InvalidModel(model) from None
 
 
 @dataclass
@@ -34,6 +65,7 @@ class Handlers:
     """The handlers of one agent."""
 
     topics: TopicHandlers = field(default_factory=TopicHandlers)
+    """`topics.declared` has the type of each topic's messages."""
     market: dict[type[Demand | Offer | Result], list[Handler]] = field(default_factory=dict)
     liabilities: list[LiabilityHandler] = field(default_factory=list)
     readings: list[tuple[str, str, ReadingHandler]] = field(default_factory=list)
@@ -48,34 +80,39 @@ L = TypeVar("L", bound=LiabilityHandler)
 G = TypeVar("G", bound=ReadingHandler)
 P = TypeVar("P", bound=PeriodicHandler)
 K = TypeVar("K")
+V = TypeVar("V")
+T = TypeVar("T", bound=Callable[["Job", Any], object])
 
 
 class HandlerDecorators:
-    """The decorators of an `Agent`, which register handlers."""
+    """The decorators of an `Agent`, which register handlers.
+
+    A handler may be sync: it then runs in a thread of its own, and may block. What can't work raises a
+    `RegistrationError`, a `ConfigurationError` with the line of your program.
+    """
 
     def __init__(self) -> None:
         self._handlers = Handlers()
 
     @overload
-    def on(
-        self, topic: str
-    ) -> Callable[[Callable[[Job, Any], Awaitable[object]]], Callable[[Job, Any], Awaitable[object]]]: ...
+    def on(self, topic: str) -> Callable[[T], T]: ...
 
     @overload
-    def on(
-        self, topic: str, kind: type[K]
-    ) -> Callable[[Callable[[Job, K], Awaitable[object]]], Callable[[Job, K], Awaitable[object]]]: ...
+    def on(self, topic: str, kind: type[K]) -> Callable[[Callable[[Job, K], V]], Callable[[Job, K], V]]: ...
 
     def on(self, topic: str, kind: type | None = None) -> Callable[[Any], Any]:
         """Handle what objectives play on `topic` (`*`: on topics without a handler): `async def handler(job, message)`.
 
-        `message` is decoded (`Empty`, `String`, JSON data, or bytes), or converted to `kind`, a msgspec Struct.
-        Messages are handled one after the other. When the last handler has returned, the job finishes with success;
-        an exception (best `JobFailed("why")`) ends it without, and the promisee is refunded. Raises
-        `ConfigurationError` for a second handler of a topic.
-        """
+        The type of `message`, or `kind`, says what it is: a msgspec Struct, a dataclass, float, int, bool, str, bytes,
+        `Empty`, `String`, list, dict, or a union of these. An objective with other messages is refused before it is
+        played. Without a type, `message` is what was decoded: `Empty`, `String`, a number, JSON data, or bytes.
 
-        def register(handler: Callable[[Job, Any], Awaitable[object]]) -> Callable[[Job, Any], Awaitable[object]]:
+        Messages are handled one after the other. When the last handler has returned, the job finishes with success;
+        an exception (best `JobFailed("why")`) ends it without, and the promisee is refunded.
+        """
+        check_topic(topic)
+
+        def register(handler: Any) -> Any:
             self._handlers.topics.add(topic, handler, kind)
             return handler
 
@@ -98,6 +135,7 @@ class HandlerDecorators:
 
     def on_liability(self, handler: L) -> L:
         """Handle each phase of each of the agent's jobs: `async def handler(phase, liability)`."""
+        check_handler(handler, "phase: Phase, liability: Liability", arguments=2)
         self._handlers.liabilities.append(handler)
         return handler
 
@@ -106,9 +144,13 @@ class HandlerDecorators:
 
         A `Reading` has the `agent`, the `topic` and the `value`. They are handled one after the other.
         """
-        reading_selector(agent, topic)  # raises InvalidKey
+        try:
+            reading_selector(agent, topic)
+        except InvalidKey as error:
+            raise InvalidTopic(error.text, error.why) from None
 
         def register(handler: G) -> G:
+            check_handler(handler, "reading: Reading", arguments=1)
             self._handlers.readings.append((topic, agent, handler))
             return handler
 
@@ -116,15 +158,24 @@ class HandlerDecorators:
 
     def every(self, seconds: float) -> Callable[[P], P]:
         """Call the handler, which takes no argument, at the start and then every `seconds` seconds."""
+        _check_period(seconds)
 
         def register(handler: P) -> P:
+            check_handler(handler, "", arguments=0)
             self._handlers.periodic.append((seconds, handler))
             return handler
 
         return register
 
     def _on_market(self, kind: type[Demand | Offer | Result], handler: Handler) -> None:
+        name = kind.__name__
+        check_handler(handler, f"{name.lower()}: Verified[{name}]", arguments=1)
         self._handlers.market.setdefault(kind, []).append(handler)
+
+
+def _check_period(seconds: object) -> None:
+    if not isinstance(seconds, int | float) or not 0 < seconds < math.inf:
+        raise InvalidPeriod(seconds)
 
 
 async def call(
@@ -134,9 +185,9 @@ async def call(
 
     The agent goes on. Returns the `AiraError`.
     """
-    name = getattr(handler, "__name__", handler)
+    name = name_of(handler)
     try:
-        await handler(*arguments)
+        await call_handler(handler, *arguments)
     except AiraError as error:
         if logged(error):
             log.warning("handler %s: %s", name, error, extra=log_event("handler-failed", handler=name, code=error.code))

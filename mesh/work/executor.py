@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
     from mesh.content import Store
     from mesh.recording import Objective
-    from mesh.work.job import TopicHandlers
     from mesh.work.ledger import JobRecord, Ledger
     from mesh.work.objectives import Objectives
     from mesh.work.outbox import Outbox
     from mesh.work.playbacks import Playbacks
     from mesh.work.run import JobRun
+    from mesh.work.topic_handlers import TopicHandlers
     from schemas import Liability, Signer
 
     OnPhase = Callable[[Phase, Liability], Awaitable[None]]

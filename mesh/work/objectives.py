@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mesh.content import Exchange, Store
     from mesh.recording import Objective
     from mesh.settings import ContentSettings
-    from mesh.work.job import TopicHandlers
+    from mesh.work.topic_handlers import TopicHandlers
 
 FETCHES: Final = 32
 """Objectives fetched at once for jobs: one that nobody has must not delay the others."""

@@ -66,6 +66,11 @@ async def stop(job: Job, nothing: Empty) -> None:
     print(__version__)
 
 
+@agent.on("/turn")
+def turn(job: Job, radians: float) -> None:
+    print(radians / 2)
+
+
 @agent.on("*")
 async def anything(job: Job, message: String) -> None:
     print(message.data)
@@ -87,7 +92,7 @@ async def on_liability(phase: Phase, liability: Liability) -> None:
 
 
 @agent.every(5.0)
-async def tick() -> None:
+def tick() -> None:
     print("tick")
 
 
@@ -119,8 +124,9 @@ class Move(Struct):
 
 BAD = {
     "another_kind": ("@agent.on('/go', kind=Move)\nasync def go(job: Job, move: String) -> None: ...", "arg-type"),
-    "no_job": ("@agent.on('/go')\nasync def go(message: object) -> None: ...", "arg-type"),
-    "not_async": ("@agent.on('/go')\ndef go(job: Job, message: object) -> None: ...", "arg-type"),
+    "no_job": ("@agent.on('/go')\nasync def go(message: object) -> None: ...", "type-var"),
+    "sync_another_kind": ("@agent.on('/go', Move)\ndef go(job: Job, move: float) -> None: ...", "arg-type"),
+    "sync_no_job": ("@agent.on('/go')\ndef go(message: float) -> None: ...", "type-var"),
     "offer_for_demand": ("@agent.on_demand\nasync def f(offer: Verified[Offer]) -> None: ...", "type-var"),
     "unverified": ("@agent.on_demand\nasync def f(demand: Demand) -> None: ...", "type-var"),
     "swapped": ("@agent.on_liability\nasync def f(liability: Liability, phase: Phase) -> None: ...", "type-var"),

@@ -14,7 +14,7 @@ from mesh import Agent, Settings
 from mesh.chain import WrongPassword, write_keyfile
 from mesh.devchain import JsonRpcServer
 from mesh.errors import ConfigurationError
-from mesh.work.job import DuplicateHandler
+from mesh.work.topic_handlers import DuplicateHandler
 from schemas import Demand, Offer, Result, Verified, cid_of_bytes
 from tests.mesh.agent.agents import SOON, channel, heard_on, settings
 from tests.support.log_events import logged_facts

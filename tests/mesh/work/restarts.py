@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from mesh.agent import Agent, Contract
     from mesh.work.job import Job
-    from schemas import String
     from tests.support.market import Place
 
 COST = 1000
@@ -30,11 +29,11 @@ def speaking(robot: Agent, said: list[str], *, stuck_at: str = "") -> Agent:
     """The same robot, which takes note of what it plays and never gets over `stuck_at`."""
 
     @robot.on("/say")
-    async def say(job: Job, message: String) -> None:
-        if message.data == stuck_at:
+    async def say(job: Job, message: str) -> None:
+        if message == stuck_at:
             await asyncio.Event().wait()
-        said.append(message.data)
-        job.publish("/said", message.data)
+        said.append(message)
+        job.publish("/said", message)
 
     return robot
 

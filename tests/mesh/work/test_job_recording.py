@@ -156,7 +156,7 @@ async def test_a_forged_end_mark_of_another_session_does_not_cut_the_recording(
     with making.session.declare_subscriber(f"{TOPICS}/**", zenoh.handlers.RingChannel(8)) as copies:
         await until_heard(device, "aira/agent/*/liability/*/topic/y")
         device.put(f"{TOPICS}/x", b"arrived")
-        await until(copies.try_recv)
+        await until(lambda: (copy := copies.try_recv()) is not None and copy.payload.to_bytes() == b"arrived")
     run.publish("/last", b"mine")
     await run.close()
     assert (b"mine") in [payload for _, payload, _ in making.recorded()]

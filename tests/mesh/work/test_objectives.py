@@ -9,8 +9,8 @@ import pytest
 
 from mesh.content import ContentUnavailable
 from mesh.errors import InputError
-from mesh.work.job import TopicHandlers
 from mesh.work.objectives import Objectives, ObjectiveUnfit
+from mesh.work.topic_handlers import TopicHandlers
 from schemas import Empty, cid_of_bytes
 from tests.support.objectives import objective
 
