@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         Phase,
         Progress,
     )
+    from mesh.agent.answers import Answer, Unanswered
     from mesh.chain import InsufficientTokens, NodeUnreachable, NotALiability
     from mesh.content import ContentUnavailable
     from mesh.errors import (
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 
 _NAMES: Final = {
     "mesh.agent.agent": "Agent",
+    "mesh.agent.answers": "Answer Unanswered",
     "mesh.agent.contract": "Contract Outcome",
     "mesh.agent.errors": "Declined LiabilityReverted OrderClosed OrderExpired",
     "mesh.agent.orders": "Order OrderState",
@@ -100,6 +102,7 @@ __all__ = [
     "ZERO_ADDRESS",
     "Agent",
     "AiraError",
+    "Answer",
     "ChainError",
     "ClosedError",
     "ConfigurationError",
@@ -137,6 +140,7 @@ __all__ = [
     "Result",
     "Settings",
     "String",
+    "Unanswered",
     "Verified",
     "WrongPhase",
     "__version__",

@@ -13,7 +13,7 @@ import zenoh
 
 from bridges.serial.calls import PATIENCE, PRESENT
 from bridges.serial.dialect import CallStatus
-from bridges.serial.errors import CALL_ERRORS, CallFailed, CallInDoubt, CallNotDone
+from bridges.serial.errors import CALL_ERRORS, CallFailed, CallInDoubt, CallNotDone, DeviceSilent
 from mesh.network import Pump
 from mesh.retry import Backoff, RetryPolicy
 from schemas import DeviceTopicKey, LiabilityTopicKey, payload_type
@@ -101,6 +101,14 @@ class Device:
         Messages are decoded; those that are not of their type are left out.
         """
         return Pump(self._session, self._key(topic), _decode)
+
+    async def next(self, topic: str) -> Any:
+        """The next message that the device publishes on a topic. Raises `DeviceSilent` after `patience` seconds."""
+        try:
+            async with asyncio.timeout(self._patience), self.listen(topic) as messages:
+                return await anext(messages)
+        except TimeoutError:
+            raise DeviceSilent(self.name, topic, self._patience) from None
 
     @property
     def _session(self) -> zenoh.Session:

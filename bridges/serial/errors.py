@@ -75,6 +75,18 @@ class BoardBusy(RemoteError, code="board-busy"):
         self.waiting = waiting
 
 
+class DeviceSilent(RemoteError, code="device-silent"):
+    """A device published nothing on a topic."""
+
+    def __init__(self, device: str, topic: str, seconds: float) -> None:
+        super().__init__(
+            f"the device {device} published nothing on {topic} within {seconds:g} s",
+            hint="is it plugged in, and its `aira edge` running?",
+        )
+        self.device = device
+        self.topic = topic
+
+
 class CallFailed(AiraError, code="call-failed"):
     """A call to a device failed; `reason` is a short word for programs, a key of `CALL_ERRORS`."""
 

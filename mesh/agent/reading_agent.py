@@ -1,18 +1,33 @@
-"""What an agent says and hears outside of jobs: readings."""
+"""What an agent says and hears without a contract: readings, and answers to questions."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import asyncio
+import logging
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
+from mesh.agent.answers import Answer, Question, Unanswered, record_answer
 from mesh.agent.trading_agent import TradingAgent
 from mesh.errors import InputError
+from mesh.log_context import log_event
 from mesh.network import ReadingSubscription, sending
 from mesh.network.readings import LARGEST_READING
-from schemas.agent_keys import ReadingKey
+from schemas import Result, parse_address
+from schemas.agent_keys import ReadingKey, topic_chunks
 from schemas.payloads import encode_value
 
 if TYPE_CHECKING:
     from mesh.flood import Drops
+    from schemas import Demand, Verified
+    from schemas.payloads import PayloadType
+
+log = logging.getLogger(__name__)
+
+ASK_SECONDS: Final = 60.0
+"""How long `Agent.ask` waits for an answer by default."""
 
 
 class ReadingTooLarge(InputError, code="reading-too-large"):
@@ -28,7 +43,7 @@ class ReadingTooLarge(InputError, code="reading-too-large"):
 
 
 class ReadingAgent(TradingAgent):
-    """The methods of an `Agent` for readings."""
+    """The methods of an `Agent` for readings, questions and answers."""
 
     drops: Drops
 
@@ -39,9 +54,7 @@ class ReadingAgent(TradingAgent):
         an invalid topic, `ClosedError`, and `ConfigurationError` if the agent has no account.
         """
         session, key = self.parts.network.session, str(ReadingKey(self.address, topic))
-        payload, kind = encode_value(message)
-        if len(payload) > LARGEST_READING:
-            raise ReadingTooLarge(topic, len(payload))
+        payload, kind = _encoded(topic, message)
         sending.put(session, key, payload, encoding=kind.zenoh_encoding)
 
     def readings(self, topic: str = "/**", *, agent: str = "*") -> ReadingSubscription:
@@ -50,3 +63,52 @@ class ReadingAgent(TradingAgent):
         By default on all topics, by all agents; `agent` is an address. Raises `InvalidKey`, `ClosedError`.
         """
         return ReadingSubscription(self.network.session, agent=agent, topic=topic, drops=self.drops)
+
+    async def answer(self, demand: Verified[Demand], value: object, *, topic: str = "/answer") -> str:
+        """Answer a demand without a contract; returns the CID of the recording with the `value`.
+
+        `value` is anything that `Job.publish` accepts. A Result that names the asker as its liability is put on the
+        market once; who asks with `ask` asks again if it is lost. Raises as `publish` does.
+        """
+        _encoded(topic, value)
+        with tempfile.TemporaryDirectory(prefix="aira-answer-") as folder:
+            path = Path(folder) / "answer.mcap"
+            write = partial(record_answer, path, demand, value, agent=self.address, topic=topic_chunks(topic))
+            await asyncio.to_thread(write)
+            cid = await self.add(path)
+        self.send(Result(liability=demand.signer, result=cid, success=True))
+        facts = log_event("demand-answered", demand=demand.hash.hex(), signer=demand.signer, result=cid)
+        log.info("answered %s without a contract: %s", demand.signer, cid, extra=facts)
+        return cid
+
+    async def ask(
+        self, model: str = "", objective: str | Path = "", *, agent: str = "", timeout: float = ASK_SECONDS
+    ) -> Answer:
+        """Ask the agents of a model, by default this agent's, and return the first answer: `(await agent.ask()).value`.
+
+        The question is a demand that pays nothing, asked again until an answer comes. Its `objective` (a CID, or the
+        path of a file) says what is asked, if the model needs that. With an `agent` (address) only its answer counts.
+        Anybody can answer: who did is `Answer.agent`. Legacy answers don't say which question they are for.
+
+        Raises `Unanswered` after `timeout` seconds. A robot may make a contract of a question, one that costs nothing.
+        """
+        cid = await self.add(objective) if isinstance(objective, Path) else objective
+        writer = self.runtime.trader.writer
+        by = parse_address(agent) if agent else ""
+        try:
+            async with asyncio.timeout(timeout):
+                named = await self.parts.chain.names.model(model or self.model)
+                terms = await writer.terms(
+                    model=named, objective=cid or named, cost=0, token="", validator="", lifetime=None
+                )
+                return await Question(self.parts, writer, agent=by).ask(terms)
+        except TimeoutError:
+            raise Unanswered(model or self.model, timeout) from None
+
+
+def _encoded(topic: str, value: object) -> tuple[bytes, PayloadType]:
+    """The payload of a reading and its type. Raises `InvalidPayload`, `ReadingTooLarge`."""
+    payload, kind = encode_value(value)
+    if len(payload) > LARGEST_READING:
+        raise ReadingTooLarge(topic, len(payload))
+    return payload, kind

@@ -13,6 +13,7 @@ from mesh.content import Exchange, Store
 from mesh.errors import AiraError
 from mesh.log_context import log_event
 from mesh.network import Reading
+from mesh.network.readings import LARGEST_READING
 from mesh.recording import Limits, open_objective
 from mesh.role import Lifecycle
 from mesh.watching.market import JobEvent, RecentSet
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LARGEST: Final = 64 * 1024
-"""Bytes of a result that is fetched. Answers are small; larger recordings are not fetched unasked."""
+LARGEST: Final = LARGEST_READING + 64 * 1024
+"""Bytes of a result that is fetched: a reading and what a file adds. Larger recordings are not fetched unasked."""
 LIMITS: Final = Limits(size=LARGEST, expanded=LARGEST, messages=100)
 KEPT: Final = 16 * 1024 * 1024
 """Bytes of results kept in the temporary store; beyond, the oldest are evicted."""

@@ -1,0 +1,147 @@
+"""Answers without a contract: a demand that pays nothing is a question, and a Result addressed to its maker the answer.
+
+The Result names the asker's address as its liability, as in the legacy network; its file holds the values. It is put on
+the market once: who gets no answer asks again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from mesh.background import Background
+from mesh.errors import AiraError, RemoteError
+from mesh.flood import FairQueue
+from mesh.recording import ABOUT, Played, RecordingAbout, open_objective, pack
+from mesh.retry import Backoff, RetryPolicy
+from mesh.watching.readings import LARGEST, LIMITS
+from schemas import Demand, Result, Verified, message_hash
+from schemas.payloads import decode_value, encode_value
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.orders import Terms, TermsWriter
+    from mesh.network import Subscription
+
+log = logging.getLogger(__name__)
+
+ANSWERED: Final = "aira-answer"
+"""The metadata record of an answer's recording that has the hash of the demand."""
+ASKING: Final = RetryPolicy(initial=2.0, ceiling=10.0)
+"""When a question without an answer is asked again."""
+PER_SIGNER: Final = 4
+"""Answers of one signer that wait to be fetched."""
+WAITING: Final = 64
+"""Answers that wait to be fetched."""
+FETCHES: Final = 4
+"""Answers that are fetched at once."""
+FETCH_TIMEOUT: Final = 10.0
+"""Seconds without a block after which fetching an answer fails."""
+
+
+class Unanswered(RemoteError, code="unanswered"):
+    """Nobody answered a question in time."""
+
+    def __init__(self, model: str, seconds: float) -> None:
+        super().__init__(
+            f"nobody answered a demand for {model} within {seconds:g} s",
+            hint="`aira peers` shows who is present on the market",
+        )
+        self.model = model
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """An answer without a contract."""
+
+    agent: str
+    """Who signed it."""
+    result: str
+    """The CID of its recording."""
+    values: tuple[Any, ...]
+    """The messages of the recording, decoded."""
+    messages: tuple[Played, ...] = field(repr=False)
+    """The same as they were recorded, with their topics and times."""
+
+    @property
+    def value(self) -> Any:
+        """The first value, which is the only one of most answers."""
+        return self.values[0]
+
+
+def record_answer(path: Path, demand: Verified[Demand], value: object, *, agent: str, topic: str) -> None:
+    """Write the recording of an answer to `path`. Blocks on the disk. Raises `InvalidPayload`."""
+    payload, kind = encode_value(value)
+    now = time.time_ns()
+    about = RecordingAbout(agent=agent, lighthouse=demand.message.lighthouse, objective=demand.message.objective)
+    metadata = {ABOUT: asdict(about), ANSWERED: {"demand": demand.hash.hex()}}
+    pack([Played(topic, payload, now, now, 0, kind)], path, metadata=metadata)
+
+
+def read_answer(path: Path, result: Verified[Result]) -> tuple[Answer, str]:
+    """An answer and the hash of the demand that it is for; legacy answers name none. Raises a `RecordingError`."""
+    recording = open_objective(path, LIMITS)
+    messages = tuple(recording.messages())
+    values = tuple(decode_value(message.payload, message.type) for message in messages)
+    demand = recording.metadata.get(ANSWERED, {}).get("demand", "")
+    return Answer(result.signer, result.message.result, values, messages), demand
+
+
+class Question:
+    """A demand that pays nothing, asked again until an answer comes: `await Question(…).ask(terms)`.
+
+    With an `agent` (address) only its answers count. Answers come from strangers: their fetching is bounded, and what
+    is no answer is counted in the agent's drops.
+    """
+
+    def __init__(self, parts: AgentComponents, writer: TermsWriter, *, agent: str = "") -> None:
+        self._parts = parts
+        self._writer = writer
+        self._agent = agent
+        self._asked: set[str] = set()
+        self._arrived: FairQueue[Verified[Result]] = FairQueue(per_sender=PER_SIGNER, total=WAITING)
+
+    async def ask(self, terms: Terms) -> Answer:
+        """Ask until the first answer comes."""
+        answered: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        async with self._parts.channel.subscribe(Result) as results, Background() as tasks:
+            tasks.start(self._receive(results), "answers")
+            for _ in range(FETCHES):
+                tasks.start(self._fetch(answered), "fetch an answer")
+            tasks.start(self._publish(terms), "ask")
+            return await answered
+
+    async def _publish(self, terms: Terms) -> None:
+        """Publish the demand again and again; a new one each time, as a robot takes each only once."""
+        backoff = Backoff(ASKING)
+        while True:
+            demand = await self._writer.sign(Demand, terms, validator_fee=0)
+            self._asked.add(message_hash(demand).hex())
+            self._parts.channel.publish(demand)
+            await backoff.wait()
+
+    async def _receive(self, results: Subscription[Result]) -> None:
+        async for result in results:
+            if result.message.liability == self._parts.signer.address and self._agent in ("", result.signer):
+                for dropped in self._arrived.put(result.signer, result):
+                    self._parts.drops.count("answer-overflow", dropped.signer)
+
+    async def _fetch(self, answered: asyncio.Future[Answer]) -> None:
+        while True:
+            result = await self._arrived.get()
+            try:
+                path = await self._parts.exchange.fetch(
+                    result.message.result, size_limit=LARGEST, timeout=FETCH_TIMEOUT, sync=False
+                )
+                answer, demand = await asyncio.to_thread(read_answer, path, result)
+            except AiraError as error:
+                self._parts.drops.count("answer-unreadable", result.signer)
+                log.debug("%s of %s is no answer: %s", result.message.result, result.signer, error)
+                continue
+            if answer.values and demand in ("", *self._asked) and not answered.done():
+                answered.set_result(answer)

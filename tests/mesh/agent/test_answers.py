@@ -1,0 +1,89 @@
+"""Answers without a contract: asked by a demand that pays nothing, given by a Result that names the asker."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh import Demand, Result, String, Unanswered, Verified
+from mesh.agent.reading_agent import ReadingTooLarge
+from mesh.network.readings import LARGEST_READING
+from schemas import cid_of_bytes, verify_message
+from tests.support.market import MODEL
+from tests.support.objectives import objective
+from tests.support.orders import demand as someones_demand
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from mesh import Agent, Answer
+    from tests.support.market import Place
+
+ARGUMENTS = cid_of_bytes(b"what is asked")
+
+
+def answering(robot: Agent) -> Agent:
+    """A robot that answers with the demand's objective."""
+
+    @robot.on_demand
+    async def answer(demand: Verified[Demand]) -> None:
+        await robot.answer(demand, {"asked": demand.message.objective}, topic="/said")
+
+    return robot
+
+
+async def test_a_question_is_answered_by_a_robot_that_starts_later_and_no_contract_is_made(place: Place) -> None:
+    async with place.provider(), place.agent("person") as person:
+        asking = asyncio.create_task(person.ask(objective=ARGUMENTS))
+        async with answering(place.agent("robot")) as robot:
+            answer = await asking
+            bare = await person.ask(MODEL, agent=robot.address)
+        assert person.orders() == []
+    assert (answer.value, answer.agent) == ({"asked": ARGUMENTS}, place.address("robot"))
+    assert [message.topic for message in answer.messages] == ["/said"]
+    assert bare.value == {"asked": MODEL}
+
+
+async def test_nobody_answers(place: Place) -> None:
+    async with place.agent("person") as person:
+        with pytest.raises(Unanswered) as caught:
+            await person.ask(timeout=0.5)
+    assert caught.value.model == MODEL
+
+
+async def test_an_answer_that_is_too_large_is_refused_at_once(place: Place) -> None:
+    async with place.agent("robot") as robot:
+        with pytest.raises(ReadingTooLarge):
+            await robot.answer(verify_message(someones_demand()), bytes(LARGEST_READING + 1))
+
+
+async def answer_from(robot: Agent, person: Agent, *results: str, answered: asyncio.Task[Answer]) -> None:
+    """Send these results to the asker again and again, as a stranger or a legacy robot may, until it has an answer."""
+    while not answered.done():
+        for result in results:
+            robot.send(Result(liability=person.address, result=result, success=True))
+        await asyncio.sleep(0.1)
+
+
+async def test_what_is_no_answer_is_passed_over_and_a_legacy_answer_is_taken(place: Place) -> None:
+    async with place.agent("robot") as robot, place.agent("person") as person:
+        to_another_question = await robot.answer(verify_message(someones_demand()), "wrong")
+        unreadable = await robot.add(place.save(b"no recording"))
+        legacy = await robot.add(place.save(objective(("/measurements", "0.5 1.0"))))
+        asking = asyncio.create_task(person.ask())
+        await answer_from(robot, person, ARGUMENTS, unreadable, to_another_question, legacy, answered=asking)
+        answer = await asking
+        await until(lambda: "answer-unreadable" in person.drops.totals(), what="the count")
+    assert (answer.value, answer.result) == (String("0.5 1.0"), legacy)
+
+
+async def test_only_the_named_agent_is_believed(place: Place) -> None:
+    async with place.agent("robot") as robot, place.agent("provider") as other, place.agent("person") as person:
+        cid = await other.add(place.save(objective(("/said", "by another"))))
+        asking = asyncio.create_task(person.ask(agent=robot.address, timeout=2))
+        with suppress(Unanswered):
+            await answer_from(other, person, cid, answered=asking)
+        with pytest.raises(Unanswered):
+            await asking
