@@ -14,6 +14,7 @@ from mesh.errors import ClosedError, ConfigurationError, InvalidKey
 from mesh.flood import Drops
 from mesh.network import Endpoints, Network, ReadingSubscription
 from mesh.network.readings import LARGEST_READING, PER_AGENT
+from mesh.work.topic_handlers import InvalidTopic
 from schemas import InvalidPayload, ReadingKey
 from tests.support.orders import PERSON, ROBOT
 from tests.support.waiting import until, until_heard
@@ -60,7 +61,7 @@ async def test_what_cannot_be_a_reading_is_refused_at_once(place: Place) -> None
     robot = place.agent("robot")
     with pytest.raises(ClosedError):
         robot.publish("/battery", 1.0)
-    with pytest.raises(InvalidKey):
+    with pytest.raises(InvalidTopic):
         robot.on_reading("battery")
     async with robot:
         with pytest.raises(InvalidKey):
