@@ -7,7 +7,7 @@ the same time at a thousand open orders and at a million; an order takes little 
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, OrderedDict
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
@@ -145,7 +145,7 @@ class OrderBook:
         """How many orders each signer has."""
         self._heaviest = ""
         """The signer that had the most orders when it added one."""
-        self._unpaid: dict[bytes, None] = {}
+        self._unpaid: OrderedDict[bytes, None] = OrderedDict()
         """The identities of orders that are not matched or pay nothing, oldest first."""
         self._demands: Queues[Terms, Verified[Order]] = Queues()
         self._offers: Queues[Terms, Verified[Order]] = Queues()

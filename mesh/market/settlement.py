@@ -94,7 +94,7 @@ class Settlement:
             open_limit=open_limit,
         )
         self._commitments = Commitments(self._funding, waiting=queue.counted)
-        self._unfunded_pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
+        self._pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
         self._unfunded = UnfundedOrders(book, self.shortages, funded=self.add, interval=chain.node.timing.poll_interval)
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
@@ -114,7 +114,7 @@ class Settlement:
         outcome = self._refusal(order) or self._book.add(order)
         for evicted in outcome.evicted if isinstance(outcome, Added) else ():
             self._drops.count("book-full", evicted.signer)
-            self._forget(evicted)
+            self._forget(evicted, after=self._pause)
         if isinstance(outcome, Match):
             demand, offer = outcome.demand.hash.hex(), outcome.offer.hash.hex()
             event = log_event("orders-matched", demand=demand, offer=offer)
@@ -127,7 +127,7 @@ class Settlement:
             if outcome is not Refusal.DUPLICATE:
                 self.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
             if outcome not in (Refusal.DUPLICATE, Refusal.WITHDRAWN):
-                self._forget(order)
+                self._forget(order, after=self._pause if outcome is Refusal.FULL else 0.0)
             return outcome
         return None
 
@@ -135,7 +135,7 @@ class Settlement:
         """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
         if self._refusal(order) is None and order_id(order) not in self._book and self._unfunded.add(order):
             self.reject(order, reason, "its maker does not have, or does not allow the factory to take, what it costs")
-        self._forget(order, after=self._unfunded_pause)
+        self._forget(order, after=self._pause)
 
     def _settle_again(self, message: Verified[Any]) -> None:
         if isinstance(message.message, Result):
@@ -146,7 +146,7 @@ class Settlement:
     def _refusal(self, order: Verified[Order]) -> Refusal | None:
         if order in self._unfunded:
             self._unfunded.hasten(order)
-            self._forget(order, after=self._unfunded_pause)
+            self._forget(order, after=self._pause)
             return Refusal.DUPLICATE
         if order in self._unconfirmed:
             return Refusal.DUPLICATE
@@ -257,7 +257,7 @@ class Settlement:
                 continue
             self._unfunded.add(order)
             self.reject(order, reason, detail)
-            self._forget(order, after=self._unfunded_pause)
+            self._forget(order, after=self._pause)
         return bool(unfunded)
 
     async def shortages(self, orders: Sequence[Verified[Order]], *, fresh: bool = False) -> list[str]:

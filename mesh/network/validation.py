@@ -269,13 +269,15 @@ class MessageValidator(Generic[M]):
             if after:
                 self._forgetting.append((self._clock.monotonic() + after, identity))
             else:
-                self._seen.pop(self._seen.pop(identity, identity), 0)
+                self._forget(identity)
 
     def _forget_due(self) -> None:
         with self._lock:
             while self._forgetting and self._forgetting[0][0] <= self._clock.monotonic():
-                _, identity = self._forgetting.popleft()
-                self._seen.pop(self._seen.pop(identity, identity), 0)
+                self._forget(self._forgetting.popleft()[1])
+
+    def _forget(self, identity: int) -> None:
+        self._seen.pop(self._seen.pop(identity, identity), 0)
 
     def statistics(self, *, received: int, dropped: int) -> ValidationStatistics:
         """The counts so far, with what a subscription `received` and `dropped` before validation."""
