@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 
+VERSION: Final = 3
+"""Of Web3 secret storage."""
 SHORT: Final = 55
 """The most bytes whose number RLP writes into one byte with their kind."""
 
@@ -178,6 +180,12 @@ def keyfile_address(keyfile: Path | str) -> str | None:
 def _open_keyfile(keyfile: Path, password: bytes, *, password_from: object) -> bytes:
     """The private key in a keyfile. Raises `KeyfileError`, `WrongPassword`."""
     content = _read_keyfile(keyfile)
+    version = next((value for name, value in content.items() if name.lower() == "version"), None)
+    if version != VERSION:
+        why = "it has no version" if version is None else f"it has version {str(version)[:20]}"
+        raise NotAKeyfile(
+            keyfile, f"is not a keyfile that can be read here: {why}", hint=f"keyfiles have version {VERSION}"
+        )
     try:
         key = decode_keyfile_json(content, password)
         Signer(key)

@@ -48,6 +48,9 @@ class Timing:
     request_timeout: float = 15.0
     """For one answer of the node."""
 
+    first_timeout: float = 3.0
+    """For the answers of a server that has not answered yet as a node does; it gets only one attempt to answer."""
+
     attempts: int = 4
     """How often a request is made before the node counts as unreachable."""
 
@@ -59,7 +62,7 @@ class Timing:
 
     def __post_init__(self) -> None:
         intervals = (self.poll_interval, self.receipt_interval, self.replace_after)
-        above_zero = (*intervals, self.receipt_timeout, self.request_timeout)
+        above_zero = (*intervals, self.receipt_timeout, self.request_timeout, self.first_timeout)
         counts, others = (self.attempts, self.confirmations, self.reorg_depth), (self.retry_delay, self.repeat_within)
         if min(counts) < 1 or min(above_zero) <= 0 or min(others) < 0:
             raise ConfigurationError(

@@ -158,7 +158,9 @@ class ReliableProvider:
 
     async def _ask(self, upstream: Upstream, method: str, params: Any, kind: Any) -> Any:
         """What a node answers. Raises `CONNECTION_ERRORS`."""
-        async with asyncio.timeout(self._timing.request_timeout):
+        timing = self._timing
+        most = timing.request_timeout if upstream.is_node else min(timing.first_timeout, timing.request_timeout)
+        async with asyncio.timeout(most):
             if not upstream.is_on_chain and len(self._upstreams) > 1:
                 await self._check_chain(upstream)
             return await _ask(upstream, method, params, kind)
@@ -251,7 +253,7 @@ def _may_pass(error: Exception, upstream: Upstream) -> bool:
     """Whether the same request to the same node may succeed later."""
     if isinstance(error, ClientResponseError):
         return error.status in TRANSIENT_STATUS
-    return upstream.is_node or isinstance(error, SpoiledAnswer) or not isinstance(error, ValueError)
+    return upstream.is_node or isinstance(error, SpoiledAnswer) or not isinstance(error, ValueError | TimeoutError)
 
 
 def _shown(chain: int | RpcFailure) -> str:

@@ -46,25 +46,25 @@ class Unit:
         """Parse an amount into the smallest unit. Raises `InvalidAmount`."""
         found = AMOUNT.fullmatch(text.strip())
         if found is None:
-            raise InvalidAmount(f"{text[:40]!r} is not an amount", hint=self._hint())
+            raise InvalidAmount(f"{text[:40]!r} is not an amount", hint=self.hint())
         whole, part, ending = found["whole"] or "0", (found["part"] or "").rstrip("0"), found["ending"].lower()
         if ending in (self.smallest, "units"):
             decimals = 0
         elif ending in ("", self.symbol.lower()):
             decimals = self.decimals
         else:
-            raise InvalidAmount(f"{text[:40]!r} is not an amount of {self.symbol}", hint=self._hint())
+            raise InvalidAmount(f"{text[:40]!r} is not an amount of {self.symbol}", hint=self.hint())
         if len(part) > decimals:
             unit = self.symbol if decimals else self.smallest
             raise InvalidAmount(
-                f"{text[:40]!r} has more than {decimals} decimals, the most that {unit} has", hint=self._hint()
+                f"{text[:40]!r} has more than {decimals} decimals, the most that {unit} has", hint=self.hint()
             )
         amount = int(whole.replace("_", "") + part.ljust(decimals, "0"))
         if amount > UNLIMITED:
-            raise InvalidAmount(f"{text[:40]!r} is more than a contract can store", hint=self._hint())
+            raise InvalidAmount(f"{text[:40]!r} is more than a contract can store", hint=self.hint())
         return amount
 
-    def _hint(self) -> str:
+    def hint(self) -> str:
         return f"write 1.5 for one and a half {self.symbol}, or the smallest unit: 1500000{self.smallest}"
 
 
@@ -73,14 +73,14 @@ ETH: Final = Unit("ETH", 18, "wei")
 
 
 class AmountText(click.ParamType[str]):
-    """An option with an amount. Its syntax is checked here; its value depends on the token."""
+    """An amount. Its syntax is checked here; its value depends on the token. Raises `InvalidAmount`."""
 
     name = "amount"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the text. Fails for one that is not an amount."""
-        if AMOUNT.fullmatch(str(value).strip()) is None:
-            self.fail(
-                f"{str(value)[:40]!r} is not an amount; write 1.5 for one and a half XRT, or 1500000wn", param, ctx
-            )
-        return str(value)
+        """Return the text."""
+        text = str(value)
+        if AMOUNT.fullmatch(text.strip()) is None:
+            flag = f"{param.opts[0]}: " if isinstance(param, click.Option) else ""
+            raise InvalidAmount(f"{flag}{text[:40]!r} is not an amount", hint=XRT.hint())
+        return text

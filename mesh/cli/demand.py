@@ -14,8 +14,8 @@ import click
 
 from mesh.cli.amounts import XRT, AmountText
 from mesh.cli.errors import DemandExists, InvalidOptions, JobNotDone, OutputFailed
-from mesh.cli.files import file_or_cid, require_readable, require_writable
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.files import file_or_cid, require_model, require_readable, require_writable
+from mesh.cli.options import ADDRESS, with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable
 from mesh.errors import AiraError
 from mesh.settings import ChainSettings, NetworkSettings, options_of
@@ -41,7 +41,7 @@ CHOICES: Final = {
     show_default=True,
     help="what you pay: whole tokens (1.5), or the smallest unit (1500000000wn for XRT, 15units for other tokens)",
 )
-@click.option("--validator", default="", help="address or ENS name of the validator of the result [none]")
+@click.option("--validator", type=ADDRESS, default="", help="address or ENS name of the validator of the result [none]")
 @click.option(
     "--validator-fee", type=AmountText(), default="0", show_default=True, help="the validator's fee, in XRT (or wn)"
 )
@@ -90,6 +90,7 @@ async def demand(
 ) -> None:
     from mesh.agent import Agent
 
+    require_model(terms["model"])
     settings.keyfile_and_password()
     source = await asyncio.to_thread(_source, objective)
     fee = XRT.parse(validator_fee)

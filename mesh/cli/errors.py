@@ -9,6 +9,10 @@ class InvalidOptions(InputError, code="invalid-options"):
     """Options or arguments that can't be used together, or one that is missing."""
 
 
+class InvalidUsage(InputError, code="invalid-usage"):
+    """A command line that can't be understood: an unknown command or option, or a value of the wrong kind."""
+
+
 class InvalidAmount(InputError, code="invalid-amount"):
     """A text is not an amount of the token."""
 
@@ -27,6 +31,10 @@ class FolderMissing(InputError, code="folder-missing"):
 
 class FileUnwritable(ConfigurationError, code="file-unwritable"):
     """The operating system refuses to write a file."""
+
+
+class NotAModel(InputError, code="not-a-model"):
+    """A text is neither the CID nor the ENS name of a model; the hint has the CID if it is the name of a file."""
 
 
 class NotAFileOrCid(InputError, code="not-a-file-or-cid"):

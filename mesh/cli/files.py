@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from mesh.cli.chain_client import own_address
-from mesh.cli.errors import FileExists, FileUnreadable, FileUnwritable, FolderMissing, NotAFileOrCid
-from mesh.cli.output import progress
+from mesh.cli.errors import FileExists, FileUnreadable, FileUnwritable, FolderMissing, NotAFileOrCid, NotAModel
+from mesh.cli.output import printable, progress
 from mesh.content import Exchange, Store
 from mesh.settings import NetworkSettings, options_of
-from schemas import InvalidCid, parse_cid
+from schemas import InvalidCid, cid_of_file, parse_cid
+from schemas.address import is_ens_name
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -76,6 +77,20 @@ def file_or_cid(text: str) -> Path | str:
         raise NotAFileOrCid(
             f"{text!r} is neither a file nor a CID", hint="give an existing file, or a CID of 46 characters (Qm…)"
         ) from None
+    return text
+
+
+def require_model(text: str) -> str:
+    """Return the text if it may be a model. Raises `NotAModel`."""
+    if is_ens_name(text):
+        return text
+    try:
+        parse_cid(text)
+    except InvalidCid:
+        hint = "`aira cid FILE` prints the CID of a model's file"
+        if Path(text).is_file():
+            hint = f"`aira cid {text}` prints its CID: {cid_of_file(Path(text))}"
+        raise NotAModel(f"{printable(text[:60])!r} is neither the CID nor the ENS name of a model", hint=hint) from None
     return text
 
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 import sys
 from functools import cached_property
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import click
 
 from mesh.errors import AiraError, ConfigurationError
 from mesh.extras import PackageMissing
 from mesh.running import INTERRUPTED, fail
+from mesh.suggestions import nearest
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -92,10 +93,8 @@ class LazyGroup(click.Group):
         if name and not name.startswith("-") and name not in self.commands and name not in self._lazy:
             known = self.list_commands(ctx)
             if name not in known:
-                import difflib  # here, as an edge agent must stay small and rarely needs it
-
-                near = difflib.get_close_matches(name, known, n=1)
-                ctx.fail(f"no such command {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""))
+                near = nearest(name, known)
+                ctx.fail(f"no such command {name!r}" + (f"; did you mean {near!r}?" if near else ""))
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -104,8 +103,19 @@ class LazyGroup(click.Group):
             return super().invoke(ctx)
         except KeyboardInterrupt:
             sys.exit(INTERRUPTED)
+        except click.UsageError as error:
+            _fail_usage(error)
         except AiraError as error:
             fail(error)
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        """As click's, but wrong usage is reported as other errors are."""
+        try:
+            return super().make_context(info_name, args, parent, **extra)
+        except click.UsageError as error:
+            _fail_usage(error)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands. Imports only installed ones, whose help is not known otherwise."""
@@ -142,3 +152,15 @@ class LazyGroup(click.Group):
             return str(error)
         assert command is not None
         return command.get_short_help_str(HELP_WIDTH)
+
+
+def _fail_usage(error: click.UsageError) -> NoReturn:
+    """Exit with 2 after one line that says what is wrong, and where to read on."""
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        raise error  # it shows the help
+    from mesh.cli.errors import InvalidUsage
+
+    message = " ".join(error.format_message().split()).removesuffix(".")
+    path = error.ctx.command_path if error.ctx else "aira"
+    message = message[:1].lower() + message[1:] if message[1:2].islower() else message
+    fail(InvalidUsage(message, hint=f"`{path} --help` shows what it takes"))

@@ -11,7 +11,7 @@ import click
 from mesh.cli.amounts import XRT, Unit
 from mesh.cli.chain_client import account_of, open_chain, own_address, units_of
 from mesh.cli.lazy import LazyGroup
-from mesh.cli.options import with_chain_settings, with_json
+from mesh.cli.options import ADDRESS, with_chain_settings, with_json
 from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, short_address
 from schemas.address import ZERO_ADDRESS
 
@@ -39,7 +39,7 @@ command = LazyGroup(
 
 
 @command.command("list", short_help="list the liabilities of an account, or all")
-@click.option("--account", help="address or ENS name of a promisee or promisor [the settings' account]")
+@click.option("--account", type=ADDRESS, help="address or ENS name of a promisee or promisor [the settings' account]")
 @click.option("--all", "all_accounts", is_flag=True, help="list the liabilities of all accounts")
 @click.option(
     "--state",
@@ -103,7 +103,7 @@ async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> S
 
 
 @command.command("show", short_help="show the parties, terms, cost and state of one")
-@click.argument("address")
+@click.argument("address", type=ADDRESS)
 @with_json
 @with_chain_settings()
 async def show(settings: Settings, address: str, as_json: bool) -> None:

@@ -9,7 +9,7 @@ import click
 from mesh.cli.chain_client import notice_when_slow, open_signing_chain, units_of
 from mesh.cli.errors import InvalidSignature, LiabilityEnded, NotAParty, NotRefundable, SignatureMissing
 from mesh.cli.liability import OUTCOMES, liability_json, refund_words, state_of
-from mesh.cli.options import with_json, with_signing_settings
+from mesh.cli.options import ADDRESS, with_json, with_signing_settings
 from mesh.cli.output import print_facts, print_json, print_line
 from mesh.errors import InvalidMessage
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @click.command("cancel")
-@click.argument("address")
+@click.argument("address", type=ADDRESS)
 @click.option("--signature", "signatures", multiple=True, help="a party's signature, as its own command printed it")
 @click.option("--refund", is_flag=True, help="refund the promisee after the refund delay, without signatures")
 @with_json

@@ -13,7 +13,7 @@ import click
 
 from mesh.cli.chain_client import open_chain, own_address, units_of
 from mesh.cli.liability import liability_json, print_liability, state_of
-from mesh.cli.options import with_chain_settings, with_json
+from mesh.cli.options import ADDRESS, with_chain_settings, with_json
 from mesh.cli.output import print_json, print_line, short_address
 from mesh.outage_log import OutageLog
 
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 @click.command("watch")
-@click.argument("address", required=False)
+@click.argument("address", required=False, type=ADDRESS)
 @click.option(
     "--from-block", type=click.IntRange(min=0), help="without ADDRESS: the first block to read [the next one]"
 )

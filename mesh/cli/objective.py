@@ -23,13 +23,19 @@ from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import format_duration, format_size, plural, print_json, printable, progress, run_sync
 from mesh.recording import GENEROUS, Limits, NotARecording, bag_to_mcap, open_objective, preflight, recover
+from mesh.running import report
 from schemas import cid_of_file
 
 if TYPE_CHECKING:
     from mesh.content import Store
-    from mesh.settings import Settings
+    from mesh.recording.preflight import Preflight
+    from mesh.settings import ContentSettings, Settings
+    from mesh.work.objectives import ObjectiveUnfit
 
 
+LIMIT_SETTINGS = {"size": "objective_size_limit", "expanded": "objective_expanded_limit"}
+"""The settings for fields of `Limits`."""
+CHECK_SETTINGS = (*STORE_SETTINGS, *LIMIT_SETTINGS.values())
 PIN = "user"
 """The pin of files that a user added; they are never evicted."""
 
@@ -48,35 +54,50 @@ command = LazyGroup(
 @command.command("add", short_help="add files to the store, from which robots fetch them")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
 @with_json
-@with_settings(*STORE_SETTINGS)
+@with_settings(*CHECK_SETTINGS)
 def add(settings: Settings, files: tuple[Path, ...], as_json: bool) -> None:
-    """Add FILES to the store and print their CIDs. With --keyfile, use the store of that account.
+    """Add FILES to the store of the account in --keyfile, and print their CIDs. Without --keyfile they go to a store
+    that commands read, but no agent serves.
 
-    Others can fetch the files by CID while an agent with this store runs. Files that robots would refuse are added with
-    a warning.
+    Others can fetch the files by CID while an agent of that account runs. Files that robots would refuse are added,
+    too, but the exit code is 2.
     """
-    run_sync(lambda: _add(settings, files, as_json=as_json))
+    refused = run_sync(lambda: _add(settings, files, as_json=as_json))
+    for error in refused:
+        report(error)
+    if refused:
+        raise SystemExit(2)
 
 
-def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> None:
+def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> list[ObjectiveUnfit]:
     for path in files:
         require_readable(path)
-    added = []
+    if not settings.keyfile:
+        click.echo("no agent serves the store of no account; --keyfile FILE selects that of yours", err=True)
+    added, refused = [], []
     with open_store(settings) as store:
         for path in files:
             with progress(f"adding {path.name}") as tell:
                 cid = store.put_file(path, pin=PIN, progress=tell)
             with progress(f"examining {path.name}") as tell:
-                outcome = preflight(path, progress=tell)
+                outcome = preflight(path, limits_of(settings), progress=tell)
             if not outcome.ok:
-                click.echo(
-                    f"aira: robots would refuse this file ({outcome.reason}): {printable(outcome.detail)}", err=True
-                )
+                refused.append(_unfit(cid, outcome))
             added.append({"cid": cid, "file": str(path), "reason": outcome.reason})
             if not as_json:
                 click.echo(cid if len(files) == 1 else f"{cid}  {path}")
     if as_json:
         print_json(added)
+    return refused
+
+
+def _unfit(cid: str, outcome: Preflight) -> ObjectiveUnfit:
+    """The error for a file that robots would refuse; its hint names the setting of the limit that it exceeds."""
+    from mesh.work.objectives import ObjectiveUnfit
+
+    setting = LIMIT_SETTINGS.get(outcome.limit)
+    hint = f"robots with a higher {setting} take it" if setting else ""
+    return ObjectiveUnfit(cid, outcome.reason, printable(outcome.detail), hint=hint)
 
 
 @command.command("get", short_help="fetch a file by its CID")
@@ -98,9 +119,6 @@ async def get(settings: Settings, cid: str, out: Path, as_json: bool) -> None:
         print_json({"cid": cid, "file": str(out), "size": size})
     else:
         click.echo(f"{out}  {format_size(size)}")
-
-
-CHECK_SETTINGS = (*STORE_SETTINGS, "objective_size_limit", "objective_expanded_limit")
 
 
 @command.command("check", short_help="check whether a robot would accept it, or check the whole store")
@@ -128,10 +146,9 @@ def check(settings: Settings, objective: str | None, topics: str | None, as_json
 
 def _check(settings: Settings, store: Store, objective: str, *, topics: str | None, as_json: bool) -> bool:
     path, cid = _find_file(store, objective)
-    limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
     taken = None if topics is None else frozenset(name.strip() for name in topics.split(",") if name.strip())
     with progress(f"reading {path.name}") as tell:
-        outcome = preflight(path, limits, topics=taken, progress=tell)
+        outcome = preflight(path, limits_of(settings), topics=taken, progress=tell)
     if as_json:
         print_json(
             {"cid": cid, "file": str(path), "ok": outcome.ok, "reason": outcome.reason, "detail": outcome.detail}
@@ -142,6 +159,11 @@ def _check(settings: Settings, store: Store, objective: str, *, topics: str | No
     else:
         click.echo(f"{cid}  {outcome.reason}: {printable(outcome.detail)}")
     return outcome.ok
+
+
+def limits_of(settings: ContentSettings) -> Limits:
+    """How large an objective a robot with these settings accepts."""
+    return Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
 
 
 def _find_file(store: Store, objective: str) -> tuple[Path, str]:
@@ -188,7 +210,9 @@ def _convert(bag: Path, out: Path, *, as_json: bool) -> None:
             bag_to_mcap(bag, out, cid=source, limits=GENEROUS, progress=tell)
     except OSError as error:
         raise write_error(out, error) from None
-    converted, cid = open_objective(out, GENEROUS), cid_of_file(out)
+    with progress(f"checking {out.name}") as tell:
+        converted = open_objective(out, GENEROUS, progress=tell)
+    cid = cid_of_file(out)
     if as_json:
         facts = {
             "cid": cid,

@@ -16,7 +16,7 @@ import mesh
 from mesh.cli.errors import InvalidDestination, InvalidOptions, NothingRecorded
 from mesh.cli.files import require_new_file, require_readable, write_error
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import format_duration, format_size, plural, print_json, progress, run_sync
+from mesh.cli.output import format_duration, format_size, plural, print_json, progress, run_sync, said_by
 from mesh.errors import InvalidKey
 from mesh.log_context import log_event
 from mesh.recording import GENEROUS, Recorder, RecordingAbout, bag_to_mcap, messages_in, open_objective, pack
@@ -173,7 +173,8 @@ def key_expression(text: str) -> str:
         return str(zenoh.KeyExpr(text))
     except zenoh.ZError as error:
         raise InvalidDestination(
-            f"{text!r} is not a key expression: {error}", hint="`*` matches one chunk, `**` any number of chunks"
+            f"{text!r} is not a key expression: {said_by(error)}",
+            hint="`*` matches one chunk, `**` any number of chunks",
         ) from None
 
 

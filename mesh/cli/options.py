@@ -12,6 +12,7 @@ import click
 from mesh.errors import AiraError
 from mesh.running import fail, run_to_end
 from mesh.settings import MEANING, Settings, load
+from schemas.address import parse_address_or_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,6 +37,21 @@ CHAIN_SETTINGS: Final = (
 ACCOUNT_SETTINGS: Final = ("keyfile", "keyfile_password_file")
 TRANSACTION_SETTINGS: Final = ("data_dir", "max_fee_gwei", "confirmations", "poll_interval")
 """The settings for sending transactions."""
+
+
+class AddressText(click.ParamType[str]):
+    """An address, or an ENS name that the chain resolves later. Raises `InvalidAddress` for any other text."""
+
+    name = "address"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the text."""
+        if value:
+            parse_address_or_name(value)
+        return str(value)
+
+
+ADDRESS: Final = AddressText()
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

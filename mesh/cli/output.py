@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import time
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ import msgspec
 
 from mesh.cli.errors import OutputFailed
 from mesh.errors import AiraError
-from mesh.running import fail
+from mesh.running import INTERRUPTED, STOPPING, fail
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,11 +33,20 @@ PIPE_INTERVAL: Final = 0.5
 
 
 def run_sync(work: Callable[[], T]) -> T:
-    """Call `work`, which needs no event loop. Prints an `AiraError` and exits like `run_to_end`."""
+    """Call `work`, which needs no event loop. Prints an `AiraError` and exits like `run_to_end`.
+
+    Ctrl-C and SIGTERM raise `KeyboardInterrupt` in it, so that it removes unfinished files and restores the cursor.
+    """
+    before = {number: signal.signal(number, signal.default_int_handler) for number in STOPPING}
     try:
         return work()
     except AiraError as error:
         fail(error)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def print_line(text: str = "") -> None:
@@ -77,6 +87,11 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[object]], *, number
 def printable(text: str) -> str:
     """Text from others without control characters, which could control the terminal."""
     return "".join(letter if letter.isprintable() else "\ufffd" for letter in text)
+
+
+def said_by(error: Exception) -> str:
+    """What an error of Zenoh says, without the place in its source."""
+    return str(error).partition(" at /")[0]
 
 
 def plural(count: int, one: str) -> str:

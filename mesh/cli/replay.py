@@ -15,7 +15,7 @@ from mesh.cli.chain_client import open_chain, own_address
 from mesh.cli.errors import AccountMissing, InvalidDestination, NoRecording, UnknownTopic
 from mesh.cli.files import FETCH_SETTINGS, fetch, file_or_cid, opened_store, require_readable
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import format_duration, plural, print_json, progress
+from mesh.cli.output import format_duration, plural, print_json, progress, said_by
 from mesh.recording import GENEROUS, AtOnce, RecordedTimes, open_objective, play
 from mesh.settings import ChainSettings, options_of
 from schemas.agent_keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, topic_chunks
@@ -219,7 +219,7 @@ def destination_of(settings: Settings, to: str) -> Destination:
     try:
         prefix = str(zenoh.KeyExpr(to))
     except zenoh.ZError as error:
-        raise InvalidDestination(f"{to!r} is not a valid key prefix: {error}") from None
+        raise InvalidDestination(f"{to!r} is not a valid key prefix: {said_by(error)}") from None
     if "*" in prefix or "$" in prefix:
         raise InvalidDestination(f"{to!r} contains a wildcard", hint="give one key prefix")
     return KeyPrefix(prefix)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,6 +14,7 @@ from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import print_facts, print_json, print_line, print_table, printable
 from mesh.cli.status import describe_status
 from mesh.settings import NetworkSettings, options_of
+from mesh.suggestions import nearest
 from schemas import InvalidRecord, Record, parse_address
 from schemas.logs import LogsRead
 from schemas.records import UInt256
@@ -168,10 +168,9 @@ def argument_names(kind: type[Record]) -> list[str]:
 def request_of(service: str, arguments: Sequence[str]) -> Record:
     """The request to a service with these arguments. Raises `UnknownService`, `InvalidArgument`."""
     if service not in SERVICES:
-        near = difflib.get_close_matches(service, SERVICES, n=1, cutoff=0)[0]
-        raise UnknownService(
-            f"there is no service {service[:60]!r}", hint=f"did you mean {near}? --list shows all services"
-        )
+        near = nearest(service, SERVICES)
+        meant = f"did you mean {near}? " if near else ""
+        raise UnknownService(f"there is no service {service[:60]!r}", hint=f"{meant}--list shows all services")
     kind = SERVICES[service].request
     given = _given(arguments)
     _check_names(service, kind, given)
@@ -207,9 +206,9 @@ def _check_names(service: str, kind: type[Record], given: Mapping[str, Any]) -> 
     takes = f"{service} takes {', '.join(argument_names(kind)) or 'no arguments'}"
     for name in given:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
+            near = nearest(name, known)
             raise InvalidArgument(
-                f"{service} has no argument {name[:60]!r}", hint=f"did you mean {near[0]}? {takes}" if near else takes
+                f"{service} has no argument {name[:60]!r}", hint=f"did you mean {near}? {takes}" if near else takes
             )
     missing = [field.encode_name for field in _fields(kind) if field.required and field.encode_name not in given]
     if missing:

@@ -13,7 +13,7 @@ import msgspec
 from mesh.cli.chain_client import open_chain
 from mesh.cli.errors import InvalidOptions
 from mesh.cli.files import FETCH_SETTINGS, fetch, opened_store, require_readable
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.options import ADDRESS, with_json, with_settings
 from mesh.cli.output import plural, print_facts, print_json, print_table, printable, progress
 from mesh.errors import AiraError
 from mesh.evidence import Claim, Verdict, check_end, verify
@@ -29,7 +29,7 @@ MARKS: Final = {True: "holds", False: "FAILS", None: "open"}
 
 
 @click.command("verify")
-@click.argument("liability", required=False)
+@click.argument("liability", required=False, type=ADDRESS)
 @click.option("--objective", type=FILE, help="file of the objective [fetched by its CID]")
 @click.option("--result", type=FILE, help="file of the recording [fetched by its CID]")
 @click.option("--message", type=FILE, help="file with the Result message as it was sent (JSON)")

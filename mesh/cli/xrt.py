@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mesh.cli.amounts import AmountText
 from mesh.cli.chain_client import (
     FACTORY,
     account_of,
@@ -16,7 +17,7 @@ from mesh.cli.chain_client import (
     spender_of,
     unit_of,
 )
-from mesh.cli.options import with_chain_settings, with_json, with_signing_settings
+from mesh.cli.options import ADDRESS, with_chain_settings, with_json, with_signing_settings
 from mesh.cli.output import print_facts, print_json, print_line
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from mesh.cli.amounts import Unit
     from mesh.settings import Settings
 
-with_token = click.option("--token", help="ENS name or address of another ERC-20 token [XRT]")
+with_token = click.option("--token", type=ADDRESS, help="ENS name or address of another ERC-20 token [XRT]")
 
 
 @click.group("xrt")
@@ -37,7 +38,7 @@ def command() -> None:
 
 
 @command.command("balance", short_help="show an account's balance")
-@click.argument("account", required=False)
+@click.argument("account", required=False, type=ADDRESS)
 @with_token
 @with_json
 @with_chain_settings()
@@ -55,7 +56,7 @@ async def balance(settings: Settings, *, account: str | None, token: str | None,
 
 @command.command("allowance", short_help="show how much a spender may transfer from an account")
 @click.argument("spender", default=FACTORY)
-@click.option("--owner", help="address or ENS name of the owner [the settings' account]")
+@click.option("--owner", type=ADDRESS, help="address or ENS name of the owner [the settings' account]")
 @with_token
 @with_json
 @with_chain_settings()
@@ -76,7 +77,7 @@ async def allowance(settings: Settings, *, spender: str, owner: str | None, toke
 
 @command.command("approve", short_help="allow a spender to transfer up to an amount")
 @click.argument("spender")
-@click.argument("amount")
+@click.argument("amount", type=AmountText())
 @with_token
 @with_json
 @with_signing_settings()
@@ -97,8 +98,8 @@ async def approve(settings: Settings, *, spender: str, amount: str, token: str |
 
 
 @command.command("transfer", short_help="transfer an amount to another account")
-@click.argument("to")
-@click.argument("amount")
+@click.argument("to", type=ADDRESS)
+@click.argument("amount", type=AmountText())
 @with_token
 @with_json
 @with_signing_settings()

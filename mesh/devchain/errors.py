@@ -15,7 +15,8 @@ class PortUnavailable(ConfigurationError, code="port-unavailable"):
 
     def __init__(self, host: str, port: int, why: str) -> None:
         super().__init__(
-            f"can't listen on {host}:{port}: {why}", hint="another node may run there; choose another port"
+            f"can't listen on {host}:{port}: {why}",
+            hint="is another node running there? choose another with --port; 0 selects a free one",
         )
         self.host = host
         self.port = port

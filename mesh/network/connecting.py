@@ -27,6 +27,17 @@ CAUSE: Final = re.compile(r"\[\S+?: (?P<cause>.+?) at /")
 """The cause in Zenoh's error about a listener."""
 
 
+class ListenFailed(ConfigurationError, code="listen-failed"):
+    """A router can't listen on its endpoints: a port is taken, or this user may not have it."""
+
+    def __init__(self, listen: tuple[str, ...], why: str) -> None:
+        super().__init__(
+            f"can't listen at {', '.join(listen)}: {why}",
+            hint="is the port taken? choose another with --listen tcp/HOST:PORT",
+        )
+        self.listen = listen
+
+
 class NotAdmitted(RemoteError, code="not-admitted"):
     """A router answers, but it and this identity do not accept each other. `reasons` has a word for each locator."""
 
@@ -53,7 +64,7 @@ class SessionOpening:
         """Return the open session. With an infinite timeout, the wait for a router is logged once.
 
         Raises `NetworkUnavailable` when no router answers within the timeout, `NotAdmitted` when every router that
-        answers rejects this identity, `ConfigurationError` when it can't listen, `ClosedError` when it was abandoned.
+        answers rejects this identity, `ListenFailed`, `ClosedError` when it was abandoned.
         """
         ends = time.monotonic() + self._endpoints.timeout
         backoff = Backoff(RECONNECT)
@@ -110,10 +121,6 @@ class SessionOpening:
             refusals[locator] = refusal
         raise NotAdmitted(refusals)
 
-    def _not_listening(self, error: zenoh.ZError) -> ConfigurationError:
+    def _not_listening(self, error: zenoh.ZError) -> ListenFailed:
         found = CAUSE.search(str(error))
-        cause = found["cause"] if found else str(error).split(" at /", 1)[0]
-        return ConfigurationError(
-            f"can't listen at {', '.join(self._endpoints.listen)}: {cause}",
-            hint="is the port taken? choose another with --listen tcp/HOST:PORT",
-        )
+        return ListenFailed(self._endpoints.listen, found["cause"] if found else str(error).split(" at /", 1)[0])

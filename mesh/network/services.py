@@ -7,7 +7,6 @@ reply, which `call` raises as `ServiceFailed`.
 from __future__ import annotations
 
 import asyncio
-import difflib
 import logging
 import threading
 from collections import Counter
@@ -21,6 +20,7 @@ from mesh.background import call_in_loop
 from mesh.errors import AiraError, ClosedError, RemoteError
 from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
+from mesh.suggestions import nearest
 from schemas import InvalidRecord, Record, RpcKey
 from schemas.rpc import SERVICES, SPENDING
 
@@ -202,8 +202,9 @@ async def call(
 
 def _service(name: str) -> Service:
     if name not in SERVICES:
-        nearest = difflib.get_close_matches(name, SERVICES, n=1, cutoff=0)[0]
-        raise ServiceFailed(name, "no such service", reason="unknown-service", hint=f"did you mean {nearest!r}?")
+        similar = nearest(name, SERVICES)
+        hint = f"did you mean {similar!r}?" if similar else "`aira rpc --list` shows all services"
+        raise ServiceFailed(name, "no such service", reason="unknown-service", hint=hint)
     return SERVICES[name]
 
 

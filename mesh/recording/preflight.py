@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.errors import InvalidKey
-from mesh.recording.errors import RecordingError
+from mesh.recording.errors import RecordingError, RecordingTooLarge
 from mesh.recording.limits import Limits
 from mesh.recording.objective import Objective, open_source
 from schemas.agent_keys import topic_chunks
@@ -44,6 +44,8 @@ class Preflight:
 
     reason: str = ""
     detail: str = ""
+    limit: str = ""
+    """The field of `Limits` that the file exceeds, if that is the reason."""
     objective: Objective | None = None
 
     @property
@@ -70,7 +72,8 @@ def preflight(
     try:
         objective = Objective(open_source(path, limits, on_message=check.on_message, progress=progress))
     except RecordingError as error:
-        return Preflight(reason=error.reason, detail=str(error))
+        limit = error.limit if isinstance(error, RecordingTooLarge) else ""
+        return Preflight(reason=error.reason, detail=str(error), limit=limit)
     reason, detail = _recording_fault(objective, limits, topics)
     if not reason:
         reason, detail = check.reason, check.detail

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 RECOVERED: Final = "aira-recovered"
 """Name of the metadata record that marks a file, or its first part, as recovered."""
-PROGRESS_EVERY: Final = 1000
-"""Messages between two calls of `progress`."""
 
 _NO_LIMIT: Final = 1 << 62
 _UNLIMITED: Final = Limits(
@@ -107,7 +105,7 @@ def copy_content(source: RecordingSource, writer: McapWriter, *, progress: Progr
             publish_time_ns=publish_time,
             sequence=sequence,
         )
-        if progress is not None and (done % PROGRESS_EVERY == 0 or done == total):
+        if progress is not None:
             progress(done, total)
 
 

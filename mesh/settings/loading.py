@@ -13,6 +13,7 @@ import msgspec
 from mesh.errors import ConfigurationError
 from mesh.log_context import log_event
 from mesh.settings.groups import DEFAULTS, MEANING, OPTIONS, Settings
+from mesh.suggestions import nearest
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -32,11 +33,12 @@ NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO"
 class UnknownOption(ConfigurationError, code="unknown-option"):
     """A file, the environment or the flags (`where`) set an option that does not exist; `nearest` is a similar one."""
 
-    def __init__(self, name: str, where: str, nearest: str) -> None:
-        super().__init__(f"unknown option {name!r} in {where}", hint=f"did you mean {nearest!r}?")
+    def __init__(self, name: str, where: str, similar: str | None) -> None:
+        hint = f"did you mean {similar!r}?" if similar else "`aira settings` lists the options"
+        super().__init__(f"unknown option {name!r} in {where}", hint=hint)
         self.name = name
         self.where = where
-        self.nearest = nearest
+        self.nearest = similar
 
 
 class InvalidOption(ConfigurationError, code="invalid-option"):
@@ -120,10 +122,7 @@ def _checked(options: dict[str, Any], *, where: str) -> dict[str, Any]:
         elif name in OPTIONS:
             kept[name] = value
         else:
-            import difflib  # here, as an edge agent must stay small and rarely needs it
-
-            nearest = difflib.get_close_matches(name, OPTIONS, n=1, cutoff=0)[0]
-            raise UnknownOption(name, where, nearest)
+            raise UnknownOption(name, where, nearest(name, OPTIONS))
     return kept
 
 

@@ -49,8 +49,8 @@ MISSING_KEPT: Final = 4096
 class ObjectiveUnfit(InputError, code="objective-unfit"):
     """An objective can't be played here. `reason` is the word for programs that the check gave."""
 
-    def __init__(self, cid: str, reason: str, detail: str) -> None:
-        super().__init__(f"objective {cid} can't be played ({reason}): {detail}")
+    def __init__(self, cid: str, reason: str, detail: str, *, hint: str = "") -> None:
+        super().__init__(f"objective {cid} can't be played ({reason}): {detail}", hint=hint)
         self.cid = cid
         self.reason = reason
         self.detail = detail

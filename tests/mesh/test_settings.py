@@ -129,7 +129,6 @@ def test_a_file_has_typed_values(tmp_path: Path) -> None:
     [
         ("web3_http_providers", "web3_http_provider"),
         ("keyfile_pasword_file", "keyfile_password_file"),
-        ("ens", "listen"),
     ],
 )
 def test_an_unknown_option_in_the_file_suggests_the_nearest(tmp_path: Path, wrong: str, right: str) -> None:
@@ -140,6 +139,14 @@ def test_an_unknown_option_in_the_file_suggests_the_nearest(tmp_path: Path, wron
 
     assert (error.value.name, error.value.where, error.value.nearest) == (wrong, str(file), right)
     assert error.value.hint == f"did you mean {right!r}?"
+
+
+def test_an_option_near_no_other_suggests_none(tmp_path: Path) -> None:
+    with pytest.raises(UnknownOption) as error:
+        load(path=written(tmp_path, 'zebra = "x"\n'), environ=NOTHING)
+
+    assert error.value.nearest is None
+    assert "did you mean" not in error.value.hint
 
 
 def test_an_unknown_variable_suggests_the_nearest_option() -> None:

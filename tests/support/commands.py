@@ -40,7 +40,7 @@ def invoke(*arguments: str | Path, **variables: str) -> subprocess.CompletedProc
 
     words = [str(word) for word in arguments]
     inherited: dict[str, str | None] = {name: None for name in os.environ if name.startswith("AIRA_")}
-    done = CliRunner().invoke(main, words, env=inherited | variables, catch_exceptions=False)
+    done = CliRunner().invoke(main, words, env=inherited | variables, catch_exceptions=False, prog_name="aira")
     return subprocess.CompletedProcess(words, done.exit_code, done.stdout, done.stderr)
 
 

@@ -158,6 +158,16 @@ def test_a_file_that_is_not_a_keyfile_is_refused(tmp_path: Path, content: str) -
     assert (caught.value.code, caught.value.path) == ("not-a-keyfile", str(path))
 
 
+@pytest.mark.parametrize(("version", "says"), [(None, "it has no version"), (9, "it has version 9")])
+def test_a_keyfile_of_another_version_is_named(keyfile: Path, tmp_path: Path, version: int | None, says: str) -> None:
+    content = json.loads(keyfile.read_text())
+    del content["version"]
+    path = tmp_path / "key.json"
+    path.write_text(json.dumps(content if version is None else content | {"version": version}))
+    with pytest.raises(NotAKeyfile, match=says):
+        Account.from_keyfile(path, _password_file(tmp_path, "x"))
+
+
 def test_neither_key_nor_password_is_shown_or_logged(
     keyfile: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

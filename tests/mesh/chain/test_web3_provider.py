@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from aiohttp import web
 
-from mesh.chain import Chain, Node, NodeUnreachable, RequestRefused, WrongChain
+from mesh.chain import Chain, Node, NodeUnreachable, RequestRefused, Timing, WrongChain
 from mesh.chain.errors import InvalidEndpoint
 from mesh.devchain import EmbeddedChain, JsonRpcServer
 from mesh.errors import ClosedError, ConfigurationError, RemoteError
@@ -101,6 +101,20 @@ async def test_a_node_that_never_answers_times_out() -> None:
         with unreachable("no answer in time"):
             async with Node(url, timing=replace(QUICK, request_timeout=0.05)):
                 pass
+
+
+@pytest.mark.parametrize("scheme", ["http", "ws"])
+async def test_a_server_that_says_nothing_is_given_up_after_one_attempt(scheme: str) -> None:
+    attempts: list[asyncio.StreamWriter] = []
+    server = await asyncio.start_server(lambda reader, writer: attempts.append(writer), "127.0.0.1")
+    async with server:
+        port = server.sockets[0].getsockname()[1]
+        with unreachable("no answer in time"):
+            async with Node(f"{scheme}://127.0.0.1:{port}", timing=Timing(first_timeout=0.2, request_timeout=60)):
+                pass
+        for writer in attempts:
+            writer.close()
+    assert len(attempts) == 1
 
 
 async def test_a_json_rpc_error_with_an_http_status_is_reported() -> None:

@@ -142,7 +142,7 @@ def test_a_taken_port_is_one_clear_line(tmp_path: Path, engine: str, on_path: di
         port = taken.getsockname()[1]
         done = failing("--engine", engine, "--port", str(port), "--data-dir", tmp_path, **on_path)
         hint = refused(done, ConfigurationError, f"127.0.0.1:{port}", "Address already in use")
-        assert "choose another port" in hint
+        assert "--port" in hint
 
 
 def test_an_invalid_state_file_is_one_clear_line(tmp_path: Path) -> None:

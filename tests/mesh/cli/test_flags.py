@@ -46,7 +46,7 @@ def test_an_empty_flag_wins_over_a_variable() -> None:
 def test_an_error_of_an_invalid_number_names_its_flag(arguments: tuple[str, ...]) -> None:
     done = aira(*arguments)
     assert done.exit_code == 2
-    assert f"Invalid value for '{arguments[-2]}'" in done.stderr
+    assert arguments[-2] in done.stderr.splitlines()[0]
 
 
 @pytest.mark.parametrize("option", ["--connect-timeout", "--poll-interval", "--fetch-timeout"])

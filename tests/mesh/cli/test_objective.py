@@ -23,6 +23,7 @@ from mesh.extras import PackageMissing
 from mesh.recording import Recorder, RecordingAbout, open_objective
 from mesh.recording.errors import NotARecording, RecordingError, RecordingExists
 from mesh.recording.packing import InvalidLine
+from mesh.work.objectives import ObjectiveUnfit
 from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import JSON, STRING, Empty, String
 from tests.mesh.cli.calls import call
@@ -30,6 +31,7 @@ from tests.mesh.recording.files import T0, with_messages
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.commands import refused, run
 from tests.support.objectives import objective
+from tests.support.orders import LIGHTHOUSE
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -231,14 +233,26 @@ def test_added_files_are_stored_and_pinned(tmp_path: Path, sound: Path) -> None:
         assert store.pins()[cid_of_file(sound)] == {"user"}
 
 
-def test_a_file_that_robots_refuse_is_added_with_a_warning(tmp_path: Path) -> None:
+def test_a_file_that_robots_refuse_is_added_with_an_error(tmp_path: Path, sound: Path) -> None:
     (tmp_path / "text").write_bytes(b"hello")
-    done = call("add", tmp_path / "text", "--json")
-    assert done.exit_code == 0
-    assert done.stderr == (
-        "aira: robots would refuse this file (not-a-recording): text: it is neither an MCAP file nor a ROS 1 bag\n"
-    )
-    assert json.loads(done.stdout)[0]["reason"] == "not-a-recording"
+    done = call("add", tmp_path / "text", sound, "--json")
+    assert done.exit_code == 2
+    assert done.stderr.rstrip().endswith(f"[{ObjectiveUnfit.code}]")
+    assert [added["reason"] for added in json.loads(done.stdout)] == ["not-a-recording", ""]
+
+
+@pytest.mark.parametrize("setting", ["objective_size_limit", "objective_expanded_limit"])
+def test_a_file_over_a_limit_names_the_setting(sound: Path, setting: str) -> None:
+    done = call("add", sound, f"--{setting.replace('_', '-')}", "10")
+    assert done.exit_code == 2
+    assert setting in done.stderr.splitlines()[-1]
+
+
+def test_adding_without_an_account_says_that_no_agent_serves_the_file(tmp_path: Path, sound: Path) -> None:
+    assert "--keyfile" in call("add", sound).stderr
+    keyfile = tmp_path / "key.json"
+    keyfile.write_text(json.dumps({"version": 3, "address": LIGHTHOUSE[2:].lower(), "crypto": {}}))
+    assert call("add", sound, "--keyfile", keyfile).stderr == ""
 
 
 def test_a_playable_objective_passes_verification(sound: Path) -> None:

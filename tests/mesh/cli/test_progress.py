@@ -1,9 +1,10 @@
-"""Bars of long work: on a terminal, on its standard error, and nowhere else."""
+"""Bars of long work: on a terminal, on its standard error, and nowhere else; what is left after Ctrl-C."""
 
 from __future__ import annotations
 
 import os
 import pty
+import re
 import select
 import sys
 from typing import TYPE_CHECKING
@@ -11,12 +12,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.cli import main
+from mesh.running import INTERRUPTED
 from tests.support.bags import Bag, BagMessage, string
+from tests.support.commands import AIRA, SECONDS, environment
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+CURSOR_HIDDEN, CURSOR_SHOWN = "\x1b[?25l", "\x1b[?25h"
 COMMANDS = {
     "objective show FILE": "reading it.mcap",
     "objective check FILE": "reading it.mcap",
@@ -74,3 +78,61 @@ def test_without_a_terminal_there_is_no_progress_bar(
     silent.touch()
     call(folder, words, os.open(silent, os.O_WRONLY), monkeypatch)
     assert COMMANDS[words] not in silent.read_text() + capsys.readouterr().out
+
+
+class Terminal:
+    """`aira` with these arguments in a terminal of its own."""
+
+    def __init__(self, *words: str | Path) -> None:
+        self.shown = ""
+        self.pid, self._side = pty.fork()
+        if self.pid == 0:
+            os.execvpe(AIRA[0], [*AIRA, *map(str, words)], environment({"TERM": "xterm", "COLUMNS": "100"}))
+
+    def read(self) -> bool:
+        """Read what it writes next; False at its end."""
+        assert select.select([self._side], [], [], SECONDS)[0], self.shown
+        try:
+            written = os.read(self._side, 1 << 16)
+        except OSError:  # Linux: the other side is closed
+            return False
+        self.shown += written.decode()
+        return bool(written)
+
+    def press_ctrl_c(self) -> None:
+        os.write(self._side, b"\x03")
+
+    def end(self) -> int:
+        """Read to the end; the exit code."""
+        while self.read():
+            pass
+        os.close(self._side)
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+
+@pytest.fixture
+def large(tmp_path: Path) -> Path:
+    """A bag of few large messages."""
+    path = tmp_path / "large.bag"
+    path.write_bytes(
+        Bag([BagMessage("/go", string("x" * (1 << 20)), time) for time in range(1, 200)], per_chunk=10).encode()
+    )
+    return path
+
+
+def test_a_bar_of_few_large_messages_shows_what_is_between(large: Path) -> None:
+    terminal = Terminal("objective", "convert", large)
+    assert terminal.end() == 0
+    converting = terminal.shown[terminal.shown.index("converting") : terminal.shown.index("checking")]
+    shown = {int(share) for share in re.findall(r"(\d+)%", converting)}
+    assert shown - {0, 100}
+
+
+def test_ctrl_c_restores_the_cursor_and_leaves_no_file(large: Path) -> None:
+    terminal = Terminal("objective", "convert", large)
+    while "converting" not in terminal.shown:
+        assert terminal.read()
+    terminal.press_ctrl_c()
+    assert terminal.end() == INTERRUPTED
+    assert terminal.shown.rindex(CURSOR_SHOWN) > terminal.shown.rindex(CURSOR_HIDDEN)
+    assert os.listdir(large.parent) == [large.name]

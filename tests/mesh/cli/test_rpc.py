@@ -81,6 +81,13 @@ def test_an_unknown_service_suggests_the_nearest() -> None:
     assert "did you mean start?" in caught.value.hint
 
 
+def test_a_service_near_no_other_suggests_none() -> None:
+    with pytest.raises(UnknownService, match="'nosuch'") as caught:
+        request_of("nosuch", [])
+    assert "did you mean" not in caught.value.hint
+    assert "--list" in caught.value.hint
+
+
 def test_a_number_beyond_256_bits_is_refused() -> None:
     for value in (str(MOST + 1), "9" * 5000):
         with pytest.raises(InputError, match=r"^eth/transfer: "):
