@@ -1,7 +1,8 @@
 """Simulated boards: firmware in a simulated Arduino Uno, with its serial line on a pseudo-terminal.
 
 The simulator is a small C program of ours on libsimavr; it is compiled on first use and kept in the cache folder that
-the programs of the tests share. A board uses about two thirds of a core.
+the programs of the tests share. A board uses about two thirds of a core. As on a real line, bytes are garbage if host
+and firmware have different baud rates.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
+from bridges.serial.errors import InvalidPort, PortBusy
 from mesh.errors import ConfigurationError, InputError, RemoteError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-SOURCE: Final = Path(__file__).parent / "board" / "board.c"
+SOURCES: Final = Path(__file__).parent / "board"
 HEADER: Final = Path("/usr/include/simavr/sim_avr.h")
 START: Final = 30.0
 """Seconds that a board has to start."""
@@ -54,10 +56,29 @@ class PinChange:
     at: float
 
 
+@dataclass(frozen=True)
+class Dimming:
+    """A pin was dimmed by PWM: it is high for `value` of `top` counts; `at` is in seconds of the board's own time.
+
+    A pin that is no longer dimmed has a `PinChange`.
+    """
+
+    pin: int
+    value: int
+    top: int
+    at: float
+
+    @property
+    def duty(self) -> float:
+        """The share of the time for which the pin is high, 0 to 1."""
+        return self.value / self.top
+
+
 def simulator(header: Path = HEADER) -> Path:
     """The simulator's program, compiled if necessary. Raises `ConfigurationError` where libsimavr or gcc is missing."""
-    source = SOURCE.read_bytes()
-    program = cache_folder() / f"board-{hashlib.sha256(source).hexdigest()[:12]}"
+    sources = sorted(SOURCES.glob("*.[ch]"))
+    digest = hashlib.sha256(b"\0".join(source.read_bytes() for source in sources)).hexdigest()
+    program = cache_folder() / f"board-{digest[:12]}"
     if program.exists():
         return program
     hint = "on Debian: apt-get install libsimavr-dev gcc; `make peers` does it"
@@ -66,7 +87,8 @@ def simulator(header: Path = HEADER) -> Path:
     program.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=program.parent) as folder:
         made = Path(folder) / "board"
-        command = ["gcc", "-O2", str(SOURCE), "-o", str(made), "-lsimavr", "-lutil"]
+        units = [str(source) for source in sources if source.suffix == ".c"]
+        command = ["gcc", "-O2", *units, "-o", str(made), "-lsimavr", "-lutil"]
         try:
             done = subprocess.run(command, capture_output=True, text=True, check=False)
         except FileNotFoundError:
@@ -90,16 +112,35 @@ def check_firmware(path: Path) -> None:
         raise InvalidFirmware(path, "it is for another processor")
 
 
+def check_free(port: Path) -> None:
+    """Raise `PortBusy` if this port exists, `InvalidPort` if something else is there, or its folder is missing."""
+    if port.is_char_device():
+        raise PortBusy(f"the port {port} exists already", hint=f"if no other board uses it: rm {port}")
+    if port.exists() or not port.parent.is_dir():
+        raise InvalidPort(
+            f"{port} can't become the port of the board: {'it is a file' if port.exists() else 'no folder'}"
+        )
+
+
 class SimulatedBoard:
     """A board with the firmware `elf`: `with SimulatedBoard(elf) as board`, then open `board.port`.
 
-    `port` stays the same when the cable is pulled and plugged in again. With `resets`, opening the port resets the
-    board, as it does a real Uno. `watch` is called with each line of the simulator's output. Entering raises
-    `InvalidFirmware`, `ConfigurationError` if the simulator can't be compiled, and `BoardFailed`.
+    `port` is a path of one's own choice, or one in a new folder; it stays the same when the cable is pulled and plugged
+    in again. With `resets`, opening the port resets the board, as it does a real Uno. `watch` is called with each line
+    of the simulator's output. Entering raises `InvalidFirmware`, `PortBusy` or `InvalidPort` if the path is in use,
+    `ConfigurationError` if the simulator can't be compiled, and `BoardFailed`.
     """
 
-    def __init__(self, elf: Path, *, resets: bool = False, watch: Callable[[str], object] | None = None) -> None:
+    def __init__(
+        self,
+        elf: Path,
+        *,
+        resets: bool = False,
+        port: Path | None = None,
+        watch: Callable[[str], object] | None = None,
+    ) -> None:
         self._elf = elf
+        self._chosen = port
         self._resets = resets
         self._watch = watch
         self._folder: tempfile.TemporaryDirectory[str] | None = None
@@ -107,6 +148,8 @@ class SimulatedBoard:
         """The path to open while the board runs; it does not exist while the cable is pulled."""
         self.pins: list[PinChange] = []
         """The changes of all pins so far, in order."""
+        self.dimmings: list[Dimming] = []
+        """The duties that PWM gave to pins so far, in order."""
         self.output: list[str] = []
         """The lines that the simulator has printed."""
         self._changed = threading.Condition()
@@ -115,8 +158,12 @@ class SimulatedBoard:
     def __enter__(self) -> Self:
         check_firmware(self._elf)
         program = simulator()
-        self._folder = tempfile.TemporaryDirectory(prefix="aira-board-")
-        self.port = Path(self._folder.name) / "tty"
+        if self._chosen is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="aira-board-")
+            self.port = Path(self._folder.name) / "tty"
+        else:
+            self.port = self._chosen.absolute()
+            check_free(self.port)
         command = [str(program), str(self._elf), str(self.port), *(["reset"] if self._resets else [])]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
@@ -149,6 +196,10 @@ class SimulatedBoard:
     def set_voltage(self, channel: int, millivolts: int) -> None:
         """Put a voltage, 0 to 5000 mV, on the analog input A0 to A7 of that number."""
         self.send(f"adc {channel} {millivolts}")
+
+    def set_pin(self, pin: int, high: bool | None) -> None:
+        """Hold the input with this number (14 to 19 are A0 to A5) at a level; None lets go of it."""
+        self.send(f"pin {pin} {'free' if high is None else 'high' if high else 'low'}")
 
     def add_noise(self, rate: float, *, seed: int = 1) -> None:
         """From now on damage this share of the bytes on the line, in both directions."""
@@ -196,6 +247,8 @@ class SimulatedBoard:
                 match line.split():
                     case ["pin", pin, level, microseconds]:
                         self.pins.append(PinChange(int(pin), level == "1", int(microseconds) / 1e6))
+                    case ["pwm", pin, value, top, microseconds]:
+                        self.dimmings.append(Dimming(int(pin), int(value), int(top), int(microseconds) / 1e6))
                 self._changed.notify_all()
             if self._watch is not None:
                 self._watch(line.strip())
@@ -204,7 +257,7 @@ class SimulatedBoard:
         return sum(line.startswith(word) for line in self.output)
 
     def send(self, line: str) -> None:
-        """Send the simulator a command line: see `board.c`. Raises `BoardFailed` when it has stopped."""
+        """Send the simulator a command line: see docs/devices.md. Raises `BoardFailed` when it has stopped."""
         process = self._running()
         assert process.stdin is not None
         try:

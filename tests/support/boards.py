@@ -23,6 +23,8 @@ ROOT = Path(__file__).parents[2]
 LIBRARIES = ROOT / "examples" / "firmware"
 ECHO = "examples/firmware/AiraFrames/examples/Echo"
 COUNTER = "tests/support/firmware/counter"
+DIMMER = "tests/support/firmware/dimmer"
+TALKER = "tests/support/firmware/talker"
 ROSSERIAL_ECHO = "tests/support/firmware/rosserial_echo"
 
 

@@ -3,50 +3,27 @@
 //   board FIRMWARE.elf LINK [reset]
 //
 // LINK is made to point to the terminal; with `reset` each opening of the terminal resets the board, as a real one does.
-// Lines on stdin: adc CHANNEL MILLIVOLTS | noise RATE SEED | unplug | plug | reset | quit
-// Says on stdout: port PATH | pin NUMBER LEVEL MICROSECONDS | opened | closed | unplugged | crashed | unknown LINE
+// Lines on stdin: pin NUMBER high|low|free | adc CHANNEL MILLIVOLTS | send TEXT | monitor on|off | noise RATE SEED |
+//   unplug | plug | reset | quit
+// Says on stdout: port PATH | pin NUMBER LEVEL MICROSECONDS | pwm NUMBER VALUE TOP MICROSECONDS | serial TEXT | opened |
+//   closed | unplugged | crashed | unknown LINE
 #define _GNU_SOURCE
-#include <errno.h>
-#include <fcntl.h>
+#include "board.h"
+
 #include <poll.h>
-#include <pty.h>
 #include <signal.h>
-#include <stdbool.h>
 #include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 #include <sys/prctl.h>
-#include <termios.h>
 #include <time.h>
 #include <unistd.h>
 
 #include <simavr/avr_adc.h>
-#include <simavr/avr_ioport.h>
-#include <simavr/avr_uart.h>
-#include <simavr/sim_avr.h>
 #include <simavr/sim_elf.h>
 
 enum {
-  HERTZ = 16000000,
   SLICE = 1000000,     // nanoseconds that are simulated at a time
   LATE = 100 * SLICE,  // behind by more than this, the board gives up to catch up
-  BITS = 10,           // of a byte on the line
-  UCSR0A = 0xC0, UBRR0L = 0xC4, UBRR0H = 0xC5, U2X = 1 << 1,
-};
-
-struct board {
-  avr_t *avr;
-  const char *link;
-  bool resets;             // when the terminal is opened
-  avr_uart_t *uart;
-  int terminal;            // -1 while unplugged
-  bool open;               // somebody has the terminal open
-  uint8_t incoming[4096];  // on their way to the board
-  size_t begin, end;
-  bool sending;            // a byte to the board is on the line
-  double noise;            // how many of the bytes are damaged, each way
-  unsigned seed;
-  int8_t levels[20];
 };
 
 static volatile sig_atomic_t stopped;
@@ -62,147 +39,29 @@ static int64_t now(void) {
   return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec;
 }
 
-static uint8_t over_the_line(struct board *board, uint8_t byte) {
-  if (board->noise > 0 && rand_r(&board->seed) < board->noise * ((double)RAND_MAX + 1))
-    byte ^= 1 + rand_r(&board->seed) % 255;
-  return byte;
-}
-
-static avr_cycle_count_t byte_time(const struct board *board) {
-  const uint8_t *data = board->avr->data;
-  const unsigned divider = (data[UBRR0H] << 8 | data[UBRR0L]) + 1;
-  return (avr_cycle_count_t)BITS * (data[UCSR0A] & U2X ? 8 : 16) * divider;
-}
-
-// simavr counts eleven bits a byte, and resets that whenever the firmware sets the baud rate.
-static void keep_time(struct board *board) {
-  board->uart->cycles_per_byte = byte_time(board);
-}
-
-// A byte has reached the board; the next one is on the line.
-static avr_cycle_count_t arrive(avr_t *avr, avr_cycle_count_t when, void *context) {
-  struct board *board = context;
-  if (board->begin == board->end) {
-    board->sending = false;
-    return 0;
-  }
-  const uint8_t byte = over_the_line(board, board->incoming[board->begin]);
-  board->begin = (board->begin + 1) % sizeof board->incoming;
-  avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT), byte);
-  return when + byte_time(board);
-}
-
-static void say(struct avr_irq_t *irq, uint32_t value, void *context) {
-  struct board *board = context;
-  (void)irq;
-  if (!board->open) return;
-  const uint8_t byte = over_the_line(board, value);
-  // What the terminal has no room for is lost, as it is where nobody reads a real port.
-  if (write(board->terminal, &byte, 1) < 0 && errno != EAGAIN && errno != EIO) perror("write");
-}
-
-// The Arduino's number of the pin is in the order of PORTD, PORTB, PORTC.
-static void change(struct board *board, int pin, uint32_t level) {
-  if (pin >= 20 || board->levels[pin] == (int8_t)level) return;
-  board->levels[pin] = level;
-  printf("pin %d %u %llu\n", pin, level, (unsigned long long)(board->avr->cycle / (HERTZ / 1000000)));
-}
-
-#define PORT(name, first)                                                               \
-  static void change_##name(struct avr_irq_t *irq, uint32_t value, void *context) {     \
-    change(context, (first) + (int)irq->irq, value & 1);                                \
-  }
-PORT(d, 0)
-PORT(b, 8)
-PORT(c, 14)
-
-static void watch(struct board *board, char port, int pins, avr_irq_notify_t notify) {
-  for (int pin = 0; pin < pins; pin++)
-    avr_irq_register_notify(avr_io_getirq(board->avr, AVR_IOCTL_IOPORT_GETIRQ(port), pin), notify, board);
-}
-
-static int plug(struct board *board) {
-  int slave;
-  char path[64];
-  struct termios raw;
-  if (board->terminal >= 0) return 0;
-  if (openpty(&board->terminal, &slave, path, NULL, NULL)) return perror("openpty"), 1;
-  tcgetattr(slave, &raw);
-  cfmakeraw(&raw);
-  tcsetattr(slave, TCSANOW, &raw);
-  close(slave);
-  fcntl(board->terminal, F_SETFL, O_NONBLOCK);
-  unlink(board->link);
-  if (symlink(path, board->link)) return perror(board->link), 1;
-  printf("port %s\n", board->link);
-  return 0;
-}
-
-static void unplug(struct board *board) {
-  if (board->terminal < 0) return;
-  unlink(board->link);
-  close(board->terminal);
-  board->terminal = -1;
-  board->open = false;
-  board->begin = board->end;
-  puts("unplugged");
-}
-
-static void reset(struct board *board) {
-  avr_reset(board->avr);
-  avr_cycle_timer_cancel(board->avr, arrive, board);
-  board->sending = false;
-  board->begin = board->end;
-}
-
-// What the last one left unread is not for the next one to read.
-static void flush_terminal(struct board *board) {
-  const int slave = open(ptsname(board->terminal), O_RDWR | O_NOCTTY | O_NONBLOCK);
-  if (slave < 0) return;
-  tcflush(slave, TCIOFLUSH);
-  close(slave);
-}
-
-static void look_at_terminal(struct board *board) {
-  if (board->terminal < 0) return;
-  struct pollfd terminal = {board->terminal, POLLIN, 0};
-  poll(&terminal, 1, 0);
-  const bool open = !(terminal.revents & POLLHUP);
-  if (open != board->open) {
-    board->open = open;
-    puts(open ? "opened" : "closed");
-    if (open && board->resets) reset(board);
-    if (!open) flush_terminal(board);
-  }
-  if (!(terminal.revents & POLLIN)) return;
-  uint8_t bytes[256];
-  const size_t used = (board->end + sizeof board->incoming - board->begin) % sizeof board->incoming;
-  if (used + sizeof bytes >= sizeof board->incoming) return;  // the host's writes wait, as for a real line
-  const ssize_t count = read(board->terminal, bytes, sizeof bytes);
-  for (ssize_t index = 0; index < count; index++) {
-    board->incoming[board->end] = bytes[index];
-    board->end = (board->end + 1) % sizeof board->incoming;
-  }
-  if (count > 0 && !board->sending) {
-    board->sending = true;
-    avr_cycle_timer_register(board->avr, byte_time(board), arrive, board);
-  }
-}
+unsigned long long microseconds(const struct board *board) { return board->avr->cycle / (HERTZ / 1000000); }
 
 static void obey(struct board *board, char *line) {
-  unsigned channel, millivolts;
+  unsigned channel, millivolts, pin;
   double noise;
+  char level[8];
   line[strcspn(line, "\n")] = 0;
   if (sscanf(line, "adc %u %u", &channel, &millivolts) == 2 && channel < 8 && millivolts <= 5000) {
     avr_raise_irq(avr_io_getirq(board->avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_ADC0 + channel), millivolts);
   } else if (sscanf(line, "noise %lf %u", &noise, &board->seed) >= 1 && noise >= 0 && noise <= 1) {
     board->noise = noise;
+  } else if (sscanf(line, "pin %u %7s", &pin, level) == 2 && hold_pin(board, pin, level)) {
+  } else if (!strncmp(line, "send ", 5)) {
+    send_text(board, line + 5);
+  } else if (!strcmp(line, "monitor on") || !strcmp(line, "monitor off")) {
+    monitor(board, !strcmp(line, "monitor on"));
   } else if (!strcmp(line, "unplug")) {
     unplug(board);
   } else if (!strcmp(line, "plug")) {
     plug(board);
   } else if (!strcmp(line, "reset")) {
-    reset(board);
+    avr_reset(board->avr);
+    stop_sending(board);
   } else if (!strcmp(line, "quit")) {
     stopped = 1;
   } else if (*line) {
@@ -245,8 +104,8 @@ static void run(struct board *board) {
   avr_cycle_count_t cycles = avr->cycle;
   while (!stopped) {
     look_at_stdin(board);
-    look_at_terminal(board);
-    keep_time(board);
+    look_at_line(board);
+    look_at_pins(board);
     next += SLICE;
     const avr_cycle_count_t until = cycles + (next - begun) / 1000 * (HERTZ / 1000000);
     while (avr->cycle < until) {
@@ -288,14 +147,8 @@ int main(int count, char **words) {
   board.avr->sleep = dont_sleep;
   avr_load_firmware(board.avr, &firmware);
   board.avr->vcc = board.avr->avcc = board.avr->aref = 5000;
-  uint32_t flags = 0;
-  avr_ioctl(board.avr, AVR_IOCTL_UART_SET_FLAGS('0'), &flags);
-  avr_irq_register_notify(avr_io_getirq(board.avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), say, &board);
-  for (avr_io_t *io = board.avr->io_port; io; io = io->next)
-    if (!strcmp(io->kind, "uart")) board.uart = (avr_uart_t *)io;  // an Uno has one
-  watch(&board, 'D', 8, change_d);
-  watch(&board, 'B', 6, change_b);
-  watch(&board, 'C', 6, change_c);
+  watch_line(&board);
+  watch_pins(&board);
   if (plug(&board)) return 1;
   run(&board);
   unplug(&board);
