@@ -134,6 +134,8 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     if options.seed is None:
         options.seed = random.SystemRandom().getrandbits(32)  # `os.urandom` is simulated
         print(f"seed {options.seed}", file=sys.stderr)
+    if min(options.jobs, options.history_jobs, options.workers) < 1:
+        parser.error("--jobs, --history-jobs and --workers are at least 1")
     names = set(KINDS)
     only, without = (frozenset(filter(None, text.split(","))) for text in (options.only, options.without))
     if (only | without) - names - {"none"}:
