@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         Progress,
     )
     from mesh.agent.answers import Answer, Unanswered
+    from mesh.agent.own_model import ModelUnfit
     from mesh.chain import InsufficientTokens, NodeUnreachable, NotALiability
     from mesh.content import ContentUnavailable
     from mesh.errors import (
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
         Verified,
         cid_of_file,
     )
+    from schemas.model import InvalidDescription, ModelDescription, ModelLimits, ModelTopic
+    from schemas.value_schema import ValueSchema
 
     __version__: str
 
@@ -62,6 +65,7 @@ _NAMES: Final = {
     "mesh.agent.answers": "Answer Unanswered",
     "mesh.agent.contract": "Contract Outcome",
     "mesh.agent.errors": "Declined LiabilityReverted OrderClosed OrderExpired",
+    "mesh.agent.own_model": "ModelUnfit",
     "mesh.agent.orders": "Order OrderState",
     "mesh.agent.progress": "Progress",
     "mesh.chain": "InsufficientTokens NodeUnreachable NotALiability",
@@ -77,6 +81,8 @@ _NAMES: Final = {
     "mesh.work.ledger": "Phase WrongPhase",
     "mesh.work.objectives": "ObjectiveUnfit",
     "schemas": "Demand Empty InvalidPayload Liability Offer Result STRING String Verified ZERO_ADDRESS cid_of_file",
+    "schemas.model": "InvalidDescription ModelDescription ModelLimits ModelTopic",
+    "schemas.value_schema": "ValueSchema",
 }
 _load = on_demand(__name__, _NAMES)
 
@@ -114,11 +120,16 @@ __all__ = [
     "Empty",
     "InputError",
     "InsufficientTokens",
+    "InvalidDescription",
     "InvalidPayload",
     "Job",
     "JobFailed",
     "Liability",
     "LiabilityReverted",
+    "ModelDescription",
+    "ModelLimits",
+    "ModelTopic",
+    "ModelUnfit",
     "NetworkUnavailable",
     "NodeUnreachable",
     "NotALiability",
@@ -141,6 +152,7 @@ __all__ = [
     "Settings",
     "String",
     "Unanswered",
+    "ValueSchema",
     "Verified",
     "WrongPhase",
     "__version__",

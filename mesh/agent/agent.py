@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
 
 from mesh.agent.components import watching, working
 from mesh.agent.demands import HANDLED
 from mesh.agent.handlers import HandlerDecorators, check_model, dispatch, repeat
+from mesh.agent.own_model import derived, model_of, own_description
 from mesh.agent.reading_agent import ReadingAgent
 from mesh.agent.status import WatcherStatus
 from mesh.background import Background
@@ -19,32 +20,48 @@ from mesh.log_context import LogSource, log_event, source_context
 from mesh.starting import open_when_ready, wait_for_files
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
+from mesh.work.models import Models
 from mesh.work.outbox import RESEND
 from schemas import Demand, Result
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from contextlib import AsyncExitStack
+    from pathlib import Path
 
     from mesh.agent.runtime import AgentRuntime
     from mesh.chain import Account, Chain
     from mesh.retry import RetryPolicy
     from mesh.settings import Settings
+    from schemas.model import ModelDescription, ModelLimits
 
 log = logging.getLogger(__name__)
+
+
+class DescriptionFields(TypedDict, total=False):
+    """The optional arguments of `Agent.model_description`: the fields of `ModelDescription` that handlers don't say."""
+
+    description: str
+    success: str
+    price: str
+    seconds: float
+    limits: ModelLimits
 
 
 class Agent(HandlerDecorators, ReadingAgent):
     """A participant of the market: `agent = Agent(model)`, handlers, then `agent.run()` or `async with agent`.
 
-    `model` is the CID of the behaviour that it offers or demands ('' for any). With an account (`account`, or a keyfile
-    in the settings) it trades and works; without one it only watches the market. It opens nothing before `run` or
-    `async with`. Any number of agents can run in one event loop. `chain`, if given, is an open chain to use instead of
-    the one that the settings name; `resend` is how often messages without effect are sent again.
+    `model` is the CID of the behaviour that it offers or demands ('' for any), or the path of the model's file, which
+    it then serves. If the model has a description, the handlers must fit it, and objectives are checked against it.
+    With an account (`account`, or a keyfile in the settings) it trades and works; without one it only watches the
+    market. It opens nothing before `run` or `async with`. Any number of agents can run in one event loop. `chain`, if
+    given, is an open chain to use instead of the one that the settings name; `resend` is how often messages without
+    effect are sent again.
     """
 
     def __init__(
         self,
-        model: str = "",
+        model: str | Path = "",
         *,
         settings: Settings | None = None,
         account: Account | None = None,
@@ -53,7 +70,8 @@ class Agent(HandlerDecorators, ReadingAgent):
     ) -> None:
         check_model(model)
         HandlerDecorators.__init__(self)
-        ReadingAgent.__init__(self, model, settings)
+        ReadingAgent.__init__(self, model_of(model, missing=""), settings)
+        self._given_model = model
         self._account = account
         self._given_chain = chain
         self._resend = resend
@@ -61,6 +79,17 @@ class Agent(HandlerDecorators, ReadingAgent):
         """Serves its metrics and its health if the settings say where."""
         self.drops = Drops()
         """Counts what was dropped, of what strangers sent."""
+
+    def model_description(
+        self, title: str, *, result: Mapping[str, Any] | None = None, **fields: Unpack[DescriptionFields]
+    ) -> ModelDescription:
+        """A description of what the agent's handlers take, by the types of their messages.
+
+        `result` has the type of what they publish, by topic. Limits, titles and units are those of `msgspec.Meta`:
+        `Annotated[float, Meta(ge=0, le=2, title="Speed", extra_json_schema={"unit": "m/s"})]`. Its `cid` is the model.
+        Raises `InvalidDescription`.
+        """
+        return derived(self._handlers.topics, result or {}, {"title": title, **fields})
 
     def run(self) -> None:
         """Serve until Ctrl-C or SIGTERM. Prints errors that people can fix in one line, with exit code 1 or 2."""
@@ -77,6 +106,7 @@ class Agent(HandlerDecorators, ReadingAgent):
         stack.callback(self._closed)
         await stack.enter_async_context(self.telemetry)
         await wait_for_files(self.settings)
+        self.model = model_of(self._given_model)
         account = self._account
         if account is None and self.settings.keyfile:
             account = await asyncio.to_thread(load_account, self.settings)
@@ -130,7 +160,9 @@ class Agent(HandlerDecorators, ReadingAgent):
 
         make = partial(working, self.settings, account, self._given_chain, resend=self._resend, drops=self.drops)
         parts = await open_when_ready(stack, self.settings, make, role="agent", on_wait=self.telemetry.starting)
-        return await stack.enter_async_context(AgentRuntime(parts, self._handlers))
+        models = Models(parts.store, parts.exchange)
+        description = await own_description(parts, models, self._given_model, self._handlers.topics)
+        return await stack.enter_async_context(AgentRuntime(parts, self._handlers, models, description))
 
     def _closed(self) -> None:
         self._network = self._channel = self._runtime = None

@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from mesh.errors import AiraError
@@ -43,7 +44,7 @@ class InvalidPeriod(RegistrationError, code="invalid-period"):
 
 
 class InvalidModel(RegistrationError, code="invalid-model"):
-    """What an agent is given as its model is neither a CID nor an ENS name."""
+    """What an agent is given as its model is neither a CID, nor an ENS name, nor the path of a file."""
 
     def __init__(self, model: object) -> None:
         hint = 'the CID of a file is cid_of_file("model.md"), or what `aira cid model.md` prints'
@@ -54,6 +55,8 @@ class InvalidModel(RegistrationError, code="invalid-model"):
 def check_model(model: object) -> None:
     """Raise `InvalidModel` for what can't be a model. Empty stands for any model."""
     try:
+        if isinstance(model, Path):
+            return
         if not isinstance(model, str) or (model and not is_ens_name(model) and not parse_cid(model)):
             raise InvalidModel(model)
     except InvalidCid:

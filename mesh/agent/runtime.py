@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import Handler, Handlers
     from mesh.network import Subscription
     from mesh.telemetry.metrics import MetricFamily
+    from mesh.work.models import Models
     from schemas import Demand, Liability
+    from schemas.model import ModelDescription
 
 PUBLISHED: Final[dict[Phase, LiabilityEvent]] = {
     Phase.INCOMING: "incoming",
@@ -45,11 +47,14 @@ class AgentRuntime(Role):
 
     title = "agent"
 
-    def __init__(self, parts: AgentComponents, handlers: Handlers) -> None:
+    def __init__(
+        self, parts: AgentComponents, handlers: Handlers, models: Models, description: ModelDescription | None = None
+    ) -> None:
         topics = handlers.topics or None
         self.parts = parts
+        self.models = models
         self.trader = Trader(parts)
-        self.objectives = Objectives(parts.store, parts.exchange, parts.settings, topics)
+        self.objectives = Objectives(parts.store, parts.exchange, parts.settings, topics, description)
         self.playbacks = Playbacks(
             parts.network.session, parts.signer.address, parts.ledger, parts.settings, parts.recordings
         )
@@ -100,6 +105,12 @@ class AgentRuntime(Role):
             declines=DeclinePublisher(parts.channel, parts.signer, parts.drops),
             drops=parts.drops,
         ).run()
+
+    async def require_fit(self, objective: str, model: str) -> None:
+        """Raise `ObjectiveUnfit` if an objective does not fit the model's description, as far as both are available."""
+        description = await self.models.find(model)
+        if description is not None:
+            await self.objectives.require_fit(objective, description)
 
     async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[MetricFamily, ...]:
         """The metrics of its work, and of the `subscriptions` of its handlers."""

@@ -143,13 +143,15 @@ class TradingAgent(Lifecycle):
         `objective` is a CID, or the path of a file, which the agent then serves. The other terms are as for `offer`.
         The factory gets the allowance that they need. A restarted agent sends the order again.
 
-        Raises `InsufficientTokens`.
+        Raises `InsufficientTokens`, and `ObjectiveUnfit` if the model's description is available and excludes the
+        objective.
         """
         writer = self.runtime.trader.writer
         cid = objective if isinstance(objective, str) else await self.add(objective)
         terms = await writer.terms(
             model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
         )
+        await self.runtime.require_fit(cid, terms["model"])
         return await self.runtime.trader.post(Demand, terms, validator_fee=validator_fee)
 
     async def demand(

@@ -23,14 +23,13 @@ from mesh.cli.output import (
     run_sync,
 )
 from mesh.recording import Limits, preflight
+from mesh.work.models import description_in
 from schemas import cid_of_file
 from schemas.model import (
     MAX_MODEL_SIZE,
     ModelDescription,
     description_schema,
-    is_description,
     parse_description,
-    read_description,
 )
 from schemas.value_schema import ValueSchema
 
@@ -133,13 +132,6 @@ def show(settings: Settings, model: str, as_json: bool) -> None:
 def schema() -> None:
     """Print the JSON Schema of descriptions, with which editors check and complete them."""
     click.echo(description_schema(), nl=False)
-
-
-def description_in(path: Path) -> ModelDescription | None:
-    """The description in a model's file; None if it is another file. Raises `InvalidDescription`."""
-    with path.open("rb") as file:
-        data = file.read(MAX_MODEL_SIZE + 1)
-    return read_description(data) if is_description(data) else None
 
 
 def _print_description(description: ModelDescription) -> None:

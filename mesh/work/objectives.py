@@ -19,6 +19,7 @@ from mesh.flood import BoundedDict, Rate, RateLimiter
 from mesh.recording import Limits, preflight
 from mesh.retry import RetryPolicy
 from mesh.settings import LONGEST
+from mesh.work.models import PATIENCE
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from mesh.recording import Objective
     from mesh.settings import ContentSettings
     from mesh.work.topic_handlers import TopicHandlers
+    from schemas.model import ModelDescription
 
 FETCHES: Final = 32
 """Objectives fetched at once for jobs: one that nobody has must not delay the others."""
@@ -74,15 +76,21 @@ class Buyer(NamedTuple):
 
 
 class Objectives:
-    """The objectives of jobs and of demands. With `handlers`, an objective must fit them."""
+    """The objectives of jobs and of demands. They must fit the `handlers`, and the description of the `model`."""
 
     def __init__(
-        self, store: Store, exchange: Exchange, settings: ContentSettings, handlers: TopicHandlers | None = None
+        self,
+        store: Store,
+        exchange: Exchange,
+        settings: ContentSettings,
+        handlers: TopicHandlers | None = None,
+        model: ModelDescription | None = None,
     ) -> None:
         self._store = store
         self._exchange = exchange
         self._settings = settings
         self._handlers = handlers
+        self._model = model
         self._budget = FetchBudget()
         self._fetching = asyncio.Semaphore(FETCHES)
         self._checking = asyncio.Semaphore(PREFLIGHTS)
@@ -97,18 +105,33 @@ class Objectives:
         if path is None:
             async with self._fetching if buyer is None else self._budget.spend(cid, buyer):
                 path = await self._fetch(cid, patience)
-        return await self._check(cid, path)
+        return await self._check(cid, path, self._handlers, self._model)
+
+    async def require_fit(self, cid: str, model: ModelDescription) -> None:
+        """Raise `ObjectiveUnfit` if an objective does not fit a model that is to be ordered.
+
+        One that is neither in the store nor served by others now is not checked.
+        """
+        path = await asyncio.to_thread(self._store.checked, cid)
+        try:
+            if path is None:
+                path = await self._fetch(cid, PATIENCE)
+        except ContentError:
+            return
+        await self._check(cid, path, None, model)
 
     async def _fetch(self, cid: str, patience: float) -> Path:
         limit, timeout = self._settings.objective_size_limit, min(patience, self._settings.fetch_timeout)
         return await self._exchange.fetch(cid, size_limit=limit, timeout=timeout, sync=False)
 
-    async def _check(self, cid: str, path: Path) -> Objective:
-        settings, handlers = self._settings, self._handlers
+    async def _check(
+        self, cid: str, path: Path, handlers: TopicHandlers | None, model: ModelDescription | None
+    ) -> Objective:
+        settings = self._settings
         limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
         topics, obstacle = (None, None) if handlers is None else (handlers.topics, handlers.obstacle)
         async with self._checking:
-            outcome = await asyncio.to_thread(preflight, path, limits, topics=topics, obstacle=obstacle)
+            outcome = await asyncio.to_thread(preflight, path, limits, topics=topics, obstacle=obstacle, model=model)
         if outcome.objective is None or not outcome.ok:
             raise ObjectiveUnfit(cid, outcome.reason, outcome.detail)
         return outcome.objective

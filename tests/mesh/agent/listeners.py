@@ -17,6 +17,7 @@ from mesh.agent.token_events import TokenEvents
 from mesh.background import Background
 from mesh.flood import Drops
 from mesh.work import Ledger
+from mesh.work.models import Models
 from schemas import Demand, Offer, Result
 from tests.support.orders import RECORDING, terms
 from tests.support.waiting import until_found
@@ -55,7 +56,7 @@ class RecordingListener(ChainListener):
     """A listener that writes down what happens on the chain, and does nothing about it."""
 
     def __init__(self, parts: AgentComponents) -> None:
-        runtime = AgentRuntime(parts, Handlers())
+        runtime = AgentRuntime(parts, Handlers(), Models(parts.store, parts.exchange))
         super().__init__(parts, runtime.trader, runtime.executor, on_phase=ignore)
         self.liabilities: list[tuple[Liability, bytes, bytes]] = []
         self.ends: list[tuple[str, bool, str]] = []

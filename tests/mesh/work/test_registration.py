@@ -8,7 +8,6 @@ import threading
 from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
@@ -238,7 +237,7 @@ def of_nobody(job: Job, message: Nobody) -> None: ...  # type: ignore[name-defin
 
 MISTAKES: dict[str, tuple[Callable[[], object], type[RegistrationError], str]] = {
     "model": (lambda: Agent("model.md", settings=Settings()), InvalidModel, "invalid-model"),
-    "path": (lambda: Agent(Path("model.md"), settings=Settings()), InvalidModel, "invalid-model"),  # type: ignore[arg-type]
+    "bytes": (lambda: Agent(b"model.md", settings=Settings()), InvalidModel, "invalid-model"),  # type: ignore[arg-type]
     "topic": (lambda: agent().on("blink"), InvalidTopic, "invalid-topic"),
     "selector": (lambda: agent().on("/blink/**"), InvalidTopic, "invalid-topic"),
     "no topic": (lambda: agent().on(job_and_message), InvalidTopic, "invalid-topic"),  # type: ignore[call-overload]
