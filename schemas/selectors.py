@@ -90,6 +90,11 @@ def device_selector(agent: str, device: str = "*") -> str:
     return f"aira/agent/{address_chunk(agent)}/device/{_any_or(name_chunk, device)}/**"
 
 
+def any_topic_selector(agent: str, topic: str) -> str:
+    """A topic of an agent's devices and jobs. Other keys of the agent that end in it are matched, too."""
+    return f"aira/agent/{address_chunk(agent)}/*/*/**{topic_chunks(topic)}"
+
+
 def reading_selector(agent: str = "*", topic: str = "/**") -> str:
     """What an agent, or any, publishes outside any job: on all topics, or on one."""
     of_topic = topic if topic == "/**" else topic_chunks(topic)

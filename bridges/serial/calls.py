@@ -30,6 +30,10 @@ ABOUT: Final = "/about"
 """The topic on which the edge agent reports which device it serves."""
 LOG: Final = "/log"
 """The topic on which the edge agent answers as the service `logs` does."""
+PUT_BY_EDGE: Final = b"edge"
+"""What the attachment of everything that an edge agent puts begins with."""
+ANSWER: Final = "/answer"
+"""The topic below a called one on which a job's recording has what the board answered."""
 PATIENCE: Final = 30.0
 """Seconds that a command waits for a board that is absent or busy, by default."""
 MAX_PATIENCE: Final = 3600.0
@@ -41,6 +45,11 @@ class PendingCalls:
     def __init__(self, counters: EdgeCounters) -> None:
         self._counters = counters
         self._queries: dict[Command, zenoh.Query] = {}
+
+    def key_of(self, command: Command) -> str:
+        """The key on which a command was called; empty if it is no call."""
+        query = self._queries.get(command)
+        return "" if query is None else str(query.key_expr)
 
     def submit(self, query: zenoh.Query, topic: BoardTopic, payload: bytes, dialect: Dialect, patience: float) -> bool:
         """Submit a call as a command; `finish` replies to it. False if it is refused, which is its reply."""
@@ -71,6 +80,16 @@ class PendingCalls:
         for query in self._queries.values():
             query.drop()  # type: ignore[no-untyped-call]
         self._queries.clear()
+
+
+def said_by(device: str) -> bytes:
+    """The attachment of what a board says."""
+    return PUT_BY_EDGE + b" " + device.encode()
+
+
+def is_put_by_edge(attachment: zenoh.ZBytes | None) -> bool:
+    """Whether an edge agent has put something with this attachment."""
+    return attachment is not None and attachment.to_bytes().startswith(PUT_BY_EDGE)
 
 
 def is_for_device(query: zenoh.Query, device: str) -> bool:

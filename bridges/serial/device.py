@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 import zenoh
 
-from bridges.serial.calls import PATIENCE, PRESENT
-from bridges.serial.dialect import CallStatus
-from bridges.serial.errors import CALL_ERRORS, CallFailed, CallInDoubt, CallNotDone, DeviceSilent
+from bridges.serial.calls import ABOUT, PATIENCE, PRESENT, said_by
+from bridges.serial.dialect import CallStatus, Flow
+from bridges.serial.errors import CALL_ERRORS, CallFailed, CallInDoubt, CallNotDone, DeviceSilent, NoSuchTopic
 from mesh.network import Pump
 from mesh.retry import Backoff, RetryPolicy
 from schemas import DeviceTopicKey, LiabilityTopicKey, payload_type
-from schemas.errors import InvalidPayload
+from schemas.agent_keys import parse_agent_key
+from schemas.errors import InvalidKey, InvalidPayload
 from schemas.payloads import Empty, decode_value, encode_value
+from schemas.selectors import any_topic_selector
 
 if TYPE_CHECKING:
     from mesh.agent import Agent
@@ -35,6 +37,17 @@ class _Failure(msgspec.Struct, frozen=True):
 
     reason: str
     detail: str
+
+
+class _Topic(msgspec.Struct, frozen=True):
+    name: str
+    flow: Flow
+
+
+class _About(msgspec.Struct, frozen=True):
+    """What is used of a device's description."""
+
+    topics: tuple[_Topic, ...]
 
 
 @dataclass(frozen=True)
@@ -73,11 +86,12 @@ class Device:
         self._presence_poll = presence_poll
 
     async def call(self, topic: str, message: object = Empty(), *, job: Job | None = None) -> CallReply:
-        """Call a topic of the device, and return when it is done. With a `job`, its recording has message and answer.
+        """Call a topic of the device, and return when it is done.
 
-        `message` is anything that `Job.publish` accepts. Takes at most `patience` and a few seconds. Raises
-        `CallNotDone` (it certainly was not done), `CallRefused` (the device refused it, or can't do it) and
-        `CallInDoubt` (it may have been done). Cancelling stops the waiting, not the device.
+        With a `job`, its recording has the message, and what the device answered on `{topic}/answer`. `message` is
+        anything that `Job.publish` accepts. Takes at most `patience` and a few seconds. Raises `CallNotDone` (it
+        certainly was not done), `CallRefused` (the device refused it, or can't do it; `NoSuchTopic` if it has no such
+        topic) and `CallInDoubt` (it may have been done). Cancelling stops the waiting, not the device.
         """
         payload, kind = encode_value(message)
         key = self._key(topic, job)
@@ -96,11 +110,12 @@ class Device:
         return await asyncio.to_thread(self._has_token)
 
     def listen(self, topic: str) -> Pump[Any]:
-        """What the device publishes on a topic outside any job: `async with device.listen("/x") as messages`.
+        """What the device publishes on a topic, in jobs and outside: `async with device.listen("/x") as messages`.
 
-        Messages are decoded; those that are not of their type are left out.
+        Messages are decoded; those that are not of their type are left out. A handler that wants those of its own job
+        only uses `job.listen`.
         """
-        return Pump(self._session, self._key(topic), _decode)
+        return Pump(self._session, any_topic_selector(self._agent.address, topic), partial(self._heard, topic))
 
     async def next(self, topic: str) -> Any:
         """The next message that the device publishes on a topic. Raises `DeviceSilent` after `patience` seconds."""
@@ -109,6 +124,19 @@ class Device:
                 return await anext(messages)
         except TimeoutError:
             raise DeviceSilent(self.name, topic, self._patience) from None
+
+    def _heard(self, topic: str, sample: zenoh.Sample) -> Any:
+        """The message in a sample; None if it is not one that the device said on the topic."""
+        try:
+            key = parse_agent_key(str(sample.key_expr))
+            if isinstance(key, DeviceTopicKey):
+                is_said = (key.device, key.topic) == (self.name, topic)
+            else:
+                by = sample.attachment.to_bytes() if sample.attachment is not None else b""
+                is_said = isinstance(key, LiabilityTopicKey) and key.topic == topic and by == said_by(self.name)
+            return decode_value(sample.payload.to_bytes(), payload_type(str(sample.encoding))) if is_said else None
+        except (InvalidKey, InvalidPayload):
+            return None
 
     @property
     def _session(self) -> zenoh.Session:
@@ -138,6 +166,7 @@ class Device:
         finally:
             token.cancel()  # type: ignore[no-untyped-call]
         if reply is None:
+            await asyncio.to_thread(self._check_topic, topic)
             raise CallInDoubt(topic, "doubt", "the device's edge agent stopped before it reported the outcome")
         if reply.ok is None:
             raise _error_of(topic, b"" if reply.err is None else reply.err.payload.to_bytes())
@@ -146,12 +175,14 @@ class Device:
         value = decode_value(reply.ok.payload.to_bytes(), payload_type(str(reply.ok.encoding)))
         return CallReply(value if value != b"" else None, CallStatus.READ if is_read else CallStatus.DONE)
 
-
-def _decode(sample: zenoh.Sample) -> Any:
-    try:
-        return decode_value(sample.payload.to_bytes(), payload_type(str(sample.encoding)))
-    except InvalidPayload:
-        return None
+    def _check_topic(self, topic: str) -> None:
+        """Raise `NoSuchTopic` if the device says that it has no such topic to call."""
+        reply = next(iter(self._session.get(self._key(ABOUT), timeout=GRACE)), None)
+        if reply is not None and reply.ok is not None:
+            topics = msgspec.json.decode(reply.ok.payload.to_bytes(), type=_About).topics
+            callable_ = [one.name for one in topics if one.flow in (Flow.SUBSCRIBES, Flow.SERVES)]
+            if topic not in callable_:
+                raise NoSuchTopic(self.name, topic, callable_)
 
 
 def _error_of(topic: str, payload: bytes) -> CallFailed:

@@ -19,7 +19,19 @@ from typing import TYPE_CHECKING, Any, Final
 import zenoh
 
 from bridges.serial import dialect as events
-from bridges.serial.calls import ABOUT, PATIENCE, PRESENT, PendingCalls, convert, is_for_device, reply_about
+from bridges.serial.calls import (
+    ABOUT,
+    ANSWER,
+    PATIENCE,
+    PRESENT,
+    PUT_BY_EDGE,
+    PendingCalls,
+    convert,
+    is_for_device,
+    is_put_by_edge,
+    reply_about,
+    said_by,
+)
 from bridges.serial.dialect import BoardTopic, Command, Flow
 from bridges.serial.errors import BoardBusy, InvalidBoardMessage
 from bridges.serial.line import SerialLine
@@ -34,7 +46,7 @@ from schemas.agent_keys import (
     parse_agent_key,
     topic_chunks,
 )
-from schemas.payloads import STRING, String, payload_type
+from schemas.payloads import EMPTY, STRING, String, payload_type
 from schemas.selectors import event_selector, topic_selector
 
 if TYPE_CHECKING:
@@ -46,8 +58,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PUT_BY_EDGE: Final = b"edge"
-"""The attachment of everything that an edge agent puts."""
 CONNECTION: Final = "/aira/device"
 """The topic of a job, followed by the device's name, that records when the device was absent and present."""
 
@@ -149,6 +159,7 @@ class Edge:
                 case events.MessageReceived(topic, payload):
                     self._publish(topic, payload)
                 case events.CommandFinished():
+                    self._record_answer(event)
                     self._calls.finish(event)
                 case events.BoardLogged(level, text):
                     log.log(level, "the board says: %s", text, extra=log_event("board-logged"))
@@ -206,8 +217,7 @@ class Edge:
         self._line.call_soon(partial(self._jobs.handle_event, str(sample.key_expr)))
 
     def _on_command(self, sample: zenoh.Sample) -> None:
-        by_edge = sample.attachment is not None and sample.attachment.to_bytes() == PUT_BY_EDGE
-        if sample.kind == zenoh.SampleKind.PUT and not by_edge:
+        if sample.kind == zenoh.SampleKind.PUT and not is_put_by_edge(sample.attachment):
             given = payload_type(str(sample.encoding))
             self._line.call_soon(partial(self._command, str(sample.key_expr), sample.payload.to_bytes(), given))
 
@@ -239,7 +249,7 @@ class Edge:
         payload = b"" if query.payload is None else query.payload.to_bytes()
         payload = convert(payload, payload_type(str(query.encoding or "")), topic.type)
         if self._calls.submit(query, topic, payload, self._line.dialect, self._patience) and job:
-            self._put(key, payload, topic.type)
+            self._put(key, payload, topic.type if payload else EMPTY)  # nothing is no JSON
 
     def _topic_of(self, key: str) -> tuple[BoardTopic | None, str]:
         """The topic that a key names, and its job if it has one; that job becomes the current one."""
@@ -264,7 +274,8 @@ class Edge:
             self._request(topic, self._key(name), payload)
             return
         job = self._jobs.current
-        self._put(self._job_key(job, name) if job else self._key(name), payload, topic.type)
+        key = self._job_key(job, name) if job else self._key(name)
+        self._put(key, payload, topic.type, attachment=said_by(self._name))
 
     def _request(self, topic: BoardTopic, key: str, payload: bytes) -> None:
         """Query the mesh for the board, which gets each answer."""
@@ -281,6 +292,15 @@ class Edge:
         if job := self._jobs.current:
             self._put(self._job_key(job, f"{CONNECTION}/{self._name}"), String(text).encode(), STRING)
 
+    def _record_answer(self, finished: events.CommandFinished) -> None:
+        """Add what the board answered to a call to the recording of the call's job; nothing and null are left out."""
+        if finished.type is None or finished.payload in (b"", b"null"):
+            return
+        if key := self._calls.key_of(finished.command):
+            called = parse_agent_key(key)
+            if isinstance(called, LiabilityTopicKey):
+                self._put(self._job_key(called.liability, called.topic + ANSWER), finished.payload, finished.type)
+
     def _reply_about(self, query: zenoh.Query) -> None:
         reply_about(query, self._line.dialect, self._name_of, port=str(self._line.name), job=self._jobs.current)
 
@@ -292,5 +312,5 @@ class Edge:
         """The key of a topic of the job at `liability` (address), which all devices of the agent share."""
         return str(LiabilityTopicKey(self._agent, liability, topic))
 
-    def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
-        sending.put(self._session, key, payload, encoding=kind.zenoh_encoding, attachment=PUT_BY_EDGE)
+    def _put(self, key: str, payload: bytes, kind: PayloadType, *, attachment: bytes = PUT_BY_EDGE) -> None:
+        sending.put(self._session, key, payload, encoding=kind.zenoh_encoding, attachment=attachment)

@@ -88,7 +88,7 @@ class DeviceSilent(RemoteError, code="device-silent"):
 
 
 class CallFailed(AiraError, code="call-failed"):
-    """A call to a device failed; `reason` is a short word for programs, a key of `CALL_ERRORS`."""
+    """A call to a device failed; `reason` is a short word for programs: a key of `CALL_ERRORS`, or `no-such-topic`."""
 
     def __init__(self, topic: str, reason: str, detail: str) -> None:
         super().__init__(f"{topic}: {detail} ({reason})")
@@ -99,6 +99,15 @@ class CallFailed(AiraError, code="call-failed"):
 
 class CallRefused(CallFailed, code="call-refused"):
     """The device or its edge agent refused the call, and would refuse it again."""
+
+
+class NoSuchTopic(CallRefused, code="no-such-topic"):
+    """The device has no topic of that name to call; `topics` are those that it has."""
+
+    def __init__(self, device: str, topic: str, topics: Sequence[str]) -> None:
+        super().__init__(topic, "no-such-topic", f"no such topic to call; {device} has {', '.join(topics) or 'none'}")
+        self.device = device
+        self.topics = tuple(topics)
 
 
 class CallNotDone(CallFailed, code="call-not-done"):

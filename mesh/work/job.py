@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -9,7 +10,8 @@ import msgspec
 from mesh.errors import AiraError, ClosedError
 from mesh.network import sending
 from mesh.recording import json_type
-from schemas.agent_keys import LiabilityTopicKey
+from mesh.work.listening import JobMessages
+from schemas.agent_keys import LiabilityTopicKey, topic_chunks
 from schemas.payloads import JSON, PayloadType, encode_value
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ class Job:
         self._agent = agent
         self._types: dict[tuple[str, str], PayloadType] = {}
         self._subscriber: Any = None
+        self._listening: tuple[weakref.ref[JobMessages], ...] = ()
         self.liability = liability
         """The contract that this job is for."""
         self.topics: frozenset[str] = frozenset()
@@ -50,14 +53,39 @@ class Job:
         `message` is `Empty`, `String`, a str, bytes, a msgspec Struct or plain JSON data. Raises `InvalidPayload` for
         anything else, and `ClosedError` before the job runs and after it has ended.
         """
-        if self._subscriber is None:
-            raise ClosedError(f"the job {self.liability.address} is not running")
+        self._check_running()
         payload, kind = encode_value(message)
         key = str(LiabilityTopicKey(self._agent, self.liability.address, topic))
         if kind == JSON and isinstance(message, msgspec.Struct):
             kind = json_type(type(message))
             self._types[topic, kind.zenoh_encoding] = kind
         self._put(key, payload, kind)
+
+    def listen(self, topic: str) -> JobMessages:
+        """What is published on a topic of the job from now on: `async for message in job.listen("/measurements")`.
+
+        That is what a device says, decoded, and what `publish` puts there. The iteration ends with the job. Raises
+        `InvalidKey` for an invalid topic, and `ClosedError` before the job runs and after it has ended.
+        """
+        self._check_running()
+        messages = JobMessages(topic_chunks(topic))
+        self._listening = (*(one for one in self._listening if one() is not None), weakref.ref(messages))
+        return messages
+
+    def _deliver(self, topic: str, payload: bytes, kind: PayloadType) -> None:
+        """Pass a received message on to those who listen to its topic. On any thread."""
+        for reference in self._listening:
+            if (messages := reference()) is not None and messages.topic == topic:
+                messages.deliver(payload, kind)
+
+    def _end_listening(self) -> None:
+        for reference in self._listening:
+            if (messages := reference()) is not None:
+                messages.end()
+
+    def _check_running(self) -> None:
+        if self._subscriber is None:
+            raise ClosedError(f"the job {self.liability.address} is not running")
 
     def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
         sending.put(self._session, key, payload, encoding=kind.zenoh_encoding)

@@ -147,6 +147,7 @@ class JobRun(Job):
             self._queue.put_nowait(None)
         if self._subscriber is not None:
             await asyncio.to_thread(self._unsubscribe)
+        self._end_listening()
         if note:
             self._recorder.record(NOTE_TOPIC, String(note).encode(), STRING, role="agent")
         return await asyncio.to_thread(self._recorder.close, sync=sync)
@@ -189,9 +190,11 @@ class JobRun(Job):
             return
         try:
             key = parse_agent_key(str(sample.key_expr))
-            if isinstance(key, LiabilityTopicKey) and self._is_recorded(key.topic):
-                kind = self._type_of(key.topic, encoding)
-                self._recorder.record(key.topic, sample.payload.to_bytes(), kind, role="device")
+            if isinstance(key, LiabilityTopicKey):
+                kind, payload = self._type_of(key.topic, encoding), sample.payload.to_bytes()
+                self._deliver(key.topic, payload, kind)
+                if self._is_recorded(key.topic):
+                    self._recorder.record(key.topic, payload, kind, role="device")
         except Exception as error:
             # Nothing catches what a callback raises: count and log it, and record the next message.
             self.unrecordable += 1

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 from bridges.serial.device import Device
+from bridges.serial.errors import NoSuchTopic
 from mesh.agent import Agent
 from mesh.chain import Account, Chain
 from mesh.recording import open_objective
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bridges.serial.boards import SimulatedBoard
+    from mesh.network import Pump
     from mesh.work.job import Job
     from tests.support.market import Place
 
@@ -104,6 +108,63 @@ async def test_a_ros_bag_is_an_objective_for_a_board(place: Place) -> None:
             assert (await device.call("/sum")).value == 5
     assert recorded(recording, "/work") == [String("2"), String("3")]
     assert recorded(recording, "/added") == [2, 3]
+
+
+async def first_heard(device: Device, heard: Pump[Any]) -> None:
+    """Return once `heard` has what the device says: declarations take their time to get around."""
+    async with asyncio.timeout(LONG):
+        while True:
+            await device.call("/add", 0)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(0.5):
+                    assert await anext(heard) == 0
+                    return
+
+
+async def test_a_board_is_heard_in_a_job_and_what_it_answers_to_calls_is_recorded(place: Place) -> None:
+    robot = offering(place.agent("robot"))
+    device, namesake = Device(robot, patience=LONG), Device(robot, "other", patience=LONG)
+    said: list[Any] = []
+
+    @robot.on("/work")
+    async def work(job: Job, message: object) -> None:
+        added = job.listen("/added")
+        await device.call("/add", 5, job=job)
+        said.append(await asyncio.wait_for(anext(added), LONG))
+        await device.call("/sum", job=job)
+
+    source = place.save(objective(("/work", Empty())))
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
+        async with (
+            place.at_work(robot) as person,
+            device.listen("/added") as heard,
+            namesake.listen("/added") as never,
+        ):
+            await first_heard(device, heard)
+            contract = await person.demand(source, cost=1)
+            assert (await contract.outcome()).success
+            recording = await contract.recording()
+            async with asyncio.timeout(LONG):
+                while (number := await anext(heard)) == 0:
+                    """One of those that were called until the board was heard."""
+                assert number == 5
+            assert never.take_ready() is None
+    assert said == [5]
+    assert (recorded(recording, "/add"), recorded(recording, "/added")) == ([5], [5])
+    assert (recorded(recording, "/sum"), recorded(recording, "/sum/answer")) == ([Empty()], [5])
+    assert recorded(recording, "/add/answer") == [5]
+
+
+async def test_a_call_of_a_topic_that_the_board_lacks_names_those_that_it_has(place: Place) -> None:
+    async with place.agent("robot") as robot:
+        device = Device(robot, patience=LONG, in_doubt="again")
+        with board(COUNTER) as uno, edge(uno.port, robot.address, place.endpoint):
+            for topic in ("/nosuch", "/added"):
+                with pytest.raises(NoSuchTopic) as caught:
+                    await device.call(topic)
+                assert {"/add", "/sum", "/slow"} <= set(caught.value.topics)
+                assert "/added" not in caught.value.topics
+                assert (caught.value.reason, caught.value.topic) == ("no-such-topic", topic)
 
 
 async def test_among_devices_with_the_same_topics_a_call_reaches_the_one_it_names(place: Place) -> None:

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.errors import ClosedError
+from mesh.errors import ClosedError, InvalidKey
 from mesh.recording import RecordedTimes
 from mesh.work.job import HandlerCancelled, Job
+from mesh.work.listening import WAITING
 from mesh.work.notes import NOTE_TOPIC
 from mesh.work.run import QUEUED
-from schemas import InvalidPayload, String
-from tests.mesh.work.runs import Making, making, session
+from schemas import InvalidPayload, LiabilityTopicKey, String
+from tests.mesh.work.runs import AGENT, Making, making, session
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
@@ -187,3 +188,38 @@ async def test_closing_works_when_the_session_has_broken(making: Making) -> None
     await asyncio.to_thread(making.session.close)
     async with asyncio.timeout(10):
         await run.close("the network is gone")
+
+
+async def test_a_handler_hears_what_comes_on_a_topic_until_the_job_ends(making: Making) -> None:
+    run = making.run(objective(("/go", "a"), ("/go", "b")))
+    with pytest.raises(ClosedError):
+        run.listen("/answers")
+    run.open()
+    with pytest.raises(InvalidKey):
+        run.listen("answers")
+    heard = run.listen("/answers")
+    key = str(LiabilityTopicKey(AGENT, run.liability.address, "/answers"))
+
+    async def answer(job: Job, message: Played) -> None:
+        run.publish("/others", "not listened to")
+        making.session.put(key, b"{", encoding="application/json")
+        making.session.put(key, b'{"to": 1}', encoding="application/json")
+        assert await asyncio.wait_for(anext(heard), 30) == {"to": 1}
+
+    await run.play(answer)
+    run.publish("/answers", "the last")
+    await run.close()
+    assert [message async for message in heard] == [String("the last")]
+    with pytest.raises(ClosedError):
+        run.listen("/answers")
+
+
+async def test_of_too_many_messages_that_nobody_takes_the_oldest_are_left_out(making: Making) -> None:
+    run = making.run(objective(("/go", "a")))
+    run.open()
+    heard = run.listen("/count")
+    for number in range(WAITING + 10):
+        run.publish("/count", number)
+    await run.close()
+    assert [message async for message in heard] == list(range(10, WAITING + 10))
+    assert heard.dropped == 10
