@@ -25,6 +25,10 @@ class FileExists(InputError, code="file-exists"):
     """A file would be overwritten."""
 
 
+class ProgramUnusable(InputError, code="program-unusable"):
+    """A Python program can't be run, or has no agent, or several."""
+
+
 class FolderMissing(InputError, code="folder-missing"):
     """The folder of a file to write does not exist."""
 

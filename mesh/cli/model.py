@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from mesh.cli.errors import FileExists
-from mesh.cli.files import FETCH_SETTINGS, require_readable, write_error
+from mesh.cli.files import FETCH_SETTINGS, write_error
+from mesh.cli.model_source import description_from
 from mesh.cli.objective_show import local_file
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import (
@@ -29,7 +30,6 @@ from schemas.model import (
     MAX_MODEL_SIZE,
     ModelDescription,
     description_schema,
-    parse_description,
 )
 from schemas.value_schema import ValueSchema
 
@@ -53,12 +53,15 @@ def command() -> None:
 @click.option("--replace", is_flag=True, help="replace the file if it exists; the model then has another CID")
 @with_json
 def new(source: Path, out: Path | None, replace: bool, as_json: bool) -> None:
-    """Write the description in SOURCE, a JSON file as people write it, in the only form that models have; print its
-    CID. docs/models.md explains the fields."""
+    """Write a description in the only form that models have, and print its CID.
+
+    SOURCE is a JSON file as people write it (docs/models.md explains the fields), or a Python program with an agent
+    (NAME.py). The program is run, but its agent is not: the types of its handlers' messages say what the model takes.
+    """
 
     def work() -> None:
         path = out or source.with_name("model.json")
-        description = parse_description(require_readable(source).read_bytes())
+        description = description_from(source)
         if path.exists() and not replace and not path.samefile(source):
             raise FileExists(f"{path} already exists", hint="give --replace, or another name with --out")
         try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from mesh.cli.errors import FileExists
+from mesh.cli.errors import FileExists, ProgramUnusable
 from schemas import cid_of_file
 from schemas.model import InvalidDescription, ModelDescription, read_description
 from tests.support.commands import invoke, refused
@@ -137,3 +137,85 @@ def test_the_schema_in_the_docs_is_that_of_the_source(tmp_path: Path) -> None:
 def test_the_description_in_the_docs_is_canonical() -> None:
     (block,) = re.findall(r"```json\n(.*?)```", (ROOT / "docs" / "models.md").read_text(), re.DOTALL)
     assert read_description(block.encode()).title == "Blink with arguments"
+
+
+PROGRAM = '''"""Drive: a robot on wheels."""
+
+from msgspec import Struct
+
+from helper import LIMIT
+from mesh import Agent, Job
+
+agent = Agent()
+
+
+class Move(Struct):
+    speed: float
+
+
+@agent.on("/drive")
+async def drive(job: Job, move: Move) -> None: ...
+
+
+agent.run()
+'''
+
+
+def program(folder: Path, text: str) -> Path:
+    path = folder / "robot.py"
+    path.write_text(text)
+    (folder / "helper.py").write_text("LIMIT = 5\n")
+    return path
+
+
+def new_model(source: Path) -> ModelDescription:
+    done = model("new", source, "--replace", folder=source.parent)
+    assert done.returncode == 0, done.stderr
+    return read_description(source.with_name("model.json").read_bytes())
+
+
+def test_new_describes_the_agent_of_a_program_without_running_it(tmp_path: Path) -> None:
+    description = new_model(program(tmp_path, PROGRAM))
+    assert (description.title, description.description) == ("Drive", "Drive: a robot on wheels.")
+    (topic,) = description.objective
+    assert topic.value is not None
+    assert (topic.topic, topic.value.required) == ("/drive", ("speed",))
+
+
+def test_new_takes_the_description_that_a_program_has(tmp_path: Path) -> None:
+    text = PROGRAM + 'MODEL = agent.model_description("Wheels", price="5 XRT")\n'
+    description = new_model(program(tmp_path, text))
+    assert (description.title, description.price, len(description.objective)) == ("Wheels", "5 XRT", 1)
+
+
+def test_new_describes_an_agent_whose_model_is_the_file_to_write(tmp_path: Path) -> None:
+    text = PROGRAM.replace("Agent()", 'Agent(Path(__file__).with_name("model.json"))')
+    source = program(tmp_path, text.replace("from msgspec", "from pathlib import Path\n\nfrom msgspec"))
+    first = new_model(source)
+    assert new_model(source) == first
+
+
+def test_new_describes_the_robot_of_the_docs(tmp_path: Path) -> None:
+    (text,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "models.md").read_text(), re.DOTALL)
+    description = new_model(program(tmp_path, text))
+    assert (description.title, description.success, description.seconds) == ("Drive", "It stands.", 60)
+    (topic,) = description.objective
+    assert topic.value is not None
+    assert topic.value.properties["speed"].unit == "m/s"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("import helper\nraise RuntimeError('no\\nmotor')", "robot.py:2: RuntimeError: no motor"),
+        ("import nothing_of_that_name", "ModuleNotFoundError"),
+        ("def broken(", "SyntaxError"),
+        ("import sys; sys.exit(3)", "SystemExit"),
+        ("x = 1", "no agent"),
+        ("from mesh import Agent; left = Agent(); right = Agent()", "left, right"),
+    ],
+)
+def test_new_refuses_a_program_without_one_agent(tmp_path: Path, text: str, said: str) -> None:
+    done = model("new", program(tmp_path, text), folder=tmp_path)
+    refused(done, ProgramUnusable, said, exit_code=2)
+    assert not (tmp_path / "model.json").exists()
