@@ -4,31 +4,36 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import sys
-import threading
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from mesh.agent.errors import OrderExpired
+from mesh.background import Background
 from mesh.cli.amounts import XRT, AmountText
-from mesh.cli.errors import DemandExists, InvalidOptions, JobNotDone, OutputFailed
+from mesh.cli.chain_client import check_balance, unit_of
+from mesh.cli.errors import InvalidOptions, JobNotDone, OutputFailed
+from mesh.cli.existing import take_existing
 from mesh.cli.files import file_or_cid, require_model, require_readable, require_writable
 from mesh.cli.options import ADDRESS, with_json, with_settings
-from mesh.cli.output import plural, print_json, print_line, printable
+from mesh.cli.order import withdraw_orders, withdrawal_lines
+from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress
+from mesh.cli.waiting import JobPrinter, print_connection_changes
 from mesh.errors import AiraError
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent, Contract, Order, Progress
+    from mesh.agent import Agent, Contract, Order
+    from mesh.cli.amounts import Unit
+    from mesh.recording import Objective
     from mesh.settings import Settings
-
-CHOICES: Final = {
-    "wait": "wait for it",
-    "withdraw": "withdraw it, and post a new one",
-    "new": "post another one beside it",
-}
+HELD_TIMEOUT: Final = 3.0
+"""Seconds in which somebody on the mesh may say that it has the objective."""
+SILENCE: Final = 5.0
+"""Seconds without an offer and a decline after which the command says who is present."""
 
 
 @click.command("demand")
@@ -55,7 +60,10 @@ CHOICES: Final = {
     type=click.Choice(["wait", "withdraw", "new"]),
     help="what to do if an equal demand is open: wait for it, withdraw it first, or post another [ask]",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="file to write the recording to")
+@click.option("--out", type=click.Path(path_type=Path), help="file to copy the recording to")
+@click.option(
+    "--withdraw-on-exit", is_flag=True, help="withdraw the demand if the command is interrupted before the contract"
+)
 @with_json
 @with_settings(
     *options_of(NetworkSettings),
@@ -66,14 +74,18 @@ CHOICES: Final = {
     *options_of(ChainSettings),
 )
 async def command(settings: Settings, **order: Any) -> None:
-    """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting, but does not withdraw
-    the demand (`aira order withdraw` does) or cancel the contract.
+    """Publish a demand and wait for the contract, the work and the payment. The objective is checked first, as `aira
+    objective check` does. What happens is printed as it happens: offers, robots that decline and why, the contract, the
+    playback, the result. The recording is kept in the account's store, so that `aira verify` and `aira objective show`
+    need no robot.
 
-    A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks what to do;
-    without a terminal it needs --existing.
+    Ctrl-C stops waiting, but does not withdraw the demand (--withdraw-on-exit or `aira order withdraw` does) or cancel
+    the contract. A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks
+    what to do; without a terminal it needs --existing.
 
-    The exit code is 1 if the work was not done and the cost was returned, or if the recording (--out) is not
-    available. --json prints one object when the contract has ended; it has an `error` if the exit code is 1.
+    The exit code is 1 if the work was not done and the cost was returned, or if --out can't be written. --json prints
+    an object for each thing that happens, with its `kind`, and one when the contract has ended; that has an `error` if
+    the exit code is 1.
     """
     await demand(settings, **order)
 
@@ -86,6 +98,7 @@ async def demand(
     out: Path | None,
     as_json: bool,
     existing: str | None = None,
+    withdraw_on_exit: bool = False,
     **terms: Any,
 ) -> None:
     from mesh.agent import Agent
@@ -98,159 +111,142 @@ async def demand(
         raise InvalidOptions("--validator-fee needs --validator", hint="give --validator, or omit the fee")
     if out is not None:
         await asyncio.to_thread(require_writable, out)
+    checked = await asyncio.to_thread(_check_objective, settings, source) if isinstance(source, Path) else None
     # A server with the same settings may run beside this and serve metrics at the same port.
-    async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent:
-        contract = await _contract(agent, source, validator_fee=fee, existing=existing, quiet=as_json, **terms)
-        await _wait_for_end(contract, out, as_json=as_json)
+    async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
+        tasks.start(print_connection_changes(agent.parts.network), "network losses")
+        unit = await unit_of(agent.parts.chain, agent.settings.erc20_token)
+        with closing(JobPrinter(unit, as_json=as_json)) as printer:
+            printer.line(f"demand by {agent.address} for {agent.model}")
+            cid = source if isinstance(source, str) else await agent.add(source)
+            if (examined := checked or await _check_held(agent, cid)) is not None:
+                size = f"{plural(examined.count, 'message')}, {format_duration(examined.duration_ns)}"
+                printer.line(f"objective {cid}: {size}")
+            order = await _post(agent, cid, unit, printer, validator_fee=fee, existing=existing, **terms)
+            contract = await _contract(agent, order, printer, withdraw_on_exit=withdraw_on_exit)
+            await _wait_for_end(agent, contract, printer, out)
 
 
-async def _contract(
+def _check_objective(settings: Settings, path: Path) -> Objective:
+    """Check a file as robots do. Raises `ObjectiveUnfit`."""
+    from mesh.recording import Limits, preflight
+    from mesh.work.objectives import ObjectiveUnfit
+
+    limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
+    with progress(f"checking {path.name}") as tell:
+        outcome = preflight(path, limits, progress=tell)
+    if outcome.objective is None or not outcome.ok:
+        raise ObjectiveUnfit(str(path), outcome.reason, printable(outcome.detail))
+    return outcome.objective
+
+
+async def _check_held(agent: Agent, cid: str) -> Objective | None:
+    """Check the objective with a CID, if it is in the store or somebody has it; else warn. Raises `ObjectiveUnfit`."""
+    parts = agent.parts
+    if await asyncio.to_thread(parts.store.checked, cid) or await parts.exchange.is_held(cid, timeout=HELD_TIMEOUT):
+        return await agent.examine(cid)
+    warning = f"nobody here has the objective {cid}: no robot can offer before somebody serves it"
+    click.echo(f"aira: {warning}; `aira objective add FILE` prints a file's CID", err=True)
+    return None
+
+
+async def _post(
     agent: Agent,
-    source: str | Path,
+    objective: str,
+    unit: Unit,
+    printer: JobPrinter,
     *,
     cost: str,
     validator_fee: int,
     existing: str | None,
-    quiet: bool,
     **terms: Any,
-) -> Contract:
-    """Publish the demand, or take one that is open, and wait for its contract. Prints both unless `quiet`."""
-    from mesh.cli.chain_client import check_balance, unit_of
-
-    unit = await unit_of(agent.parts.chain, agent.settings.erc20_token)
-    if not quiet:
-        print_line(f"demand by {agent.address} for {agent.model}")
-    cid = source if isinstance(source, str) else await agent.add(source)
+) -> Order | Contract:
+    """Publish the demand, or take one that is open, or its contract. Prints which."""
     terms |= {"cost": unit.parse(cost), "validator_fee": validator_fee}
-    existing_one = await _take_existing(agent, cid, existing, quiet=quiet, **terms)
-    if existing_one is None:
-        await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
-        existing_one = await agent.order(cid, **terms)
-        if not quiet:
-            print_line(f"posted {existing_one.hash}, valid until block {existing_one.deadline:,}")
-    contract = await _wait_for_contract(existing_one)
-    if not quiet:
-        print_line(f"contract {contract.address} with {contract.liability.promisor}")
-    return contract
+    found = await take_existing(agent, objective, existing, quiet=printer.as_json, **terms)
+    if found is not None:
+        return found
+    await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
+    order = await agent.order(objective, **terms)
+    printer.line(f"posted {order.hash}, valid until block {order.deadline:,}")
+    return order
 
 
-async def _take_existing(
-    agent: Agent, objective: str, existing: str | None, *, quiet: bool, lifetime: int | None = None, **terms: Any
-) -> Order | Contract | None:
-    """What to wait for instead of a new demand: the open one with these terms, or its contract. None: post a new one.
-
-    `existing` is the choice; without one, the user is asked in a terminal. Raises `DemandExists` without a terminal.
-    """
-    demands, contract = await _equal(agent, objective, **terms)
-    if demands:  # perhaps one became a contract while nothing of the account ran
-        await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
-        demands, contract = await _equal(agent, objective, **terms)
-    if others := len(agent.orders()) - len(demands):
-        also = f"{plural(others, 'other order')} of this account may become contracts"
-        click.echo(f"{also}, and are sent again; see `aira order list`", err=True)
-    if not demands and contract is None:
-        return None
-    for order in demands:
-        click.echo(f"the equal demand {order.hash} is open until block {order.deadline:,}", err=True)
-    if contract is not None:
-        click.echo(f"an equal demand became the contract {contract.address}, which has not ended", err=True)
-    if existing is None and (quiet or not sys.stdin.isatty()):
-        choices = ", ".join(f"--existing {choice} ({meaning})" for choice, meaning in CHOICES.items())
-        raise DemandExists("an equal demand is open; a second one would be paid too", hint=f"choose: {choices}")
-    choice = existing or await _ask()
-    if choice == "wait":
-        return contract or demands[0]
-    for order in demands if choice == "withdraw" else ():
-        await order.withdraw()
-        click.echo(f"withdrew {order.hash}; a provider that is creating its contract now may still finish", err=True)
-    return None
-
-
-async def _equal(
-    agent: Agent, objective: str, *, cost: int, validator: str = "", validator_fee: int
-) -> tuple[list[Order], Contract | None]:
-    """The open demands with these terms, and the latest contract of one if it has not ended."""
-    from mesh.agent.orders import is_repeated
-    from schemas import Demand, decode
-
-    fields: dict[str, Any] = {"model": agent.model, "objective": objective, "cost": cost, "validator": validator}
-    wanted = await agent.runtime.trader.writer.terms(**fields, token="", lifetime=1)
-
-    def is_equal(message: object) -> bool:
-        return isinstance(message, Demand) and is_repeated(message, wanted, validator_fee=validator_fee)
-
-    contracts = await agent.parts.ledger.contracts("demand")
-    latest = next((address for payload, address in contracts if is_equal(decode(payload))), "")
-    demands = [order for order in agent.orders() if is_equal(order.message)]
-    liabilities = agent.parts.chain.liabilities
-    if not latest or not await liabilities.exists(latest) or (await liabilities.get(latest)).is_finalized:
-        return demands, None
-    return demands, await agent.contract(latest)
-
-
-async def _ask() -> str:
-    """Ask in the terminal what to do, in a thread that does not keep an interrupted program alive."""
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[str] = loop.create_future()
-
-    def ask() -> None:
-        click.echo("\n".join(f"  {choice}: {meaning}" for choice, meaning in CHOICES.items()), err=True)
-        try:
-            given = click.prompt("what now?", type=click.Choice(list(CHOICES)), err=True)
-        except click.Abort:
-            loop.call_soon_threadsafe(answer.cancel)
-        else:
-            loop.call_soon_threadsafe(answer.set_result, given)
-
-    threading.Thread(target=ask, name="prompt", daemon=True).start()
-    return await answer
-
-
-async def _wait_for_contract(order: Order | Contract) -> Contract:
-    """Wait until an order is a contract. Prints which providers can't use it meanwhile."""
-    from mesh.agent import Contract
+async def _contract(agent: Agent, order: Order | Contract, printer: JobPrinter, *, withdraw_on_exit: bool) -> Contract:
+    """Wait until an order is a contract. When that is interrupted, say what becomes of the order, or withdraw it."""
+    from mesh.agent import Contract, Order, Progress
 
     if isinstance(order, Contract):
+        printer(Progress(kind="contract", agent=order.liability.promisor, detail=order.address))
         return order
-    withdraw = f"withdraw it with `aira order withdraw {order.hash[:16]}`"
-    stays = f"the demand stays valid until block {order.deadline:,}; {withdraw}"
-
-    def report(progress: Progress) -> None:
-        if progress.kind == "rejected":
-            why = f"{progress.detail} ({progress.code})"
-            click.echo(f"provider {progress.agent} can't use the demand now: {why}\n{stays}", err=True)
-
     try:
-        return await order.contract(on_progress=report)
+        async with Background() as tasks:
+            tasks.start(_say_who_is_present(agent, printer), "silence")
+            return await order.contract(on_progress=printer)
     except asyncio.CancelledError:
-        click.echo(stays, err=True)
+        if withdraw_on_exit and isinstance(order, Order):
+            for line in withdrawal_lines(await withdraw_orders(agent.parts, [order], on_chain=False)):
+                click.echo(line, err=True)
+        else:
+            click.echo(await _stays(agent, order), err=True)
+        raise
+    except OrderExpired:
+        click.echo(printer.summary(), err=True)
         raise
 
 
-async def _wait_for_end(contract: Contract, out: Path | None, *, as_json: bool) -> None:
-    """Wait for the end, fetch the recording, and print both. Then raises what failed."""
-    outcome = await contract.outcome()
+async def _say_who_is_present(agent: Agent, printer: JobPrinter) -> None:
+    """If no robot offers or declines for a while, say who is there to do so."""
+    await asyncio.sleep(SILENCE)
+    if printer.is_silent:
+        present = {role: await agent.channel.present(role) for role in ("agent", "provider")}
+        agents = [key for key in present["agent"] if key.agent != agent.address.lower()]
+        who = f"{plural(len(agents), 'other agent')} and {plural(len(present['provider']), 'provider')} are present"
+        click.echo(f"no robot has offered or declined yet; {who} on {agent.channel.lighthouse}", err=True)
+
+
+async def _stays(agent: Agent, order: Order) -> str:
+    """Until when an order stays open, and how to withdraw it."""
+    until = f"the demand stays valid until block {order.deadline:,}"
+    try:
+        blocks = order.deadline - await agent.parts.chain.block_number()
+        seconds = blocks * (await agent.parts.chain.node.heads.block_time(blocks) or 0)
+    except AiraError:
+        seconds = 0
+    about = f", for about {plural(round(seconds / 60) or 1, 'minute')}" if seconds > 0 else ""
+    return f"{until}{about}; withdraw it with `aira order withdraw {order.hash[:16]}`"
+
+
+async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, out: Path | None) -> None:
+    """Wait for the end, keep the recording, and print both. Then raises what failed."""
+    try:
+        outcome = await contract.outcome(on_progress=printer)
+    except asyncio.CancelledError:
+        goes_on = f"the contract goes on; `aira liability watch {contract.address}` waits for its end"
+        click.echo(f"{goes_on}, `aira liability cancel` tells how to cancel it", err=True)
+        raise
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
-    if not as_json:
-        print_line(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
+    printer.close()
+    printer.line(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
     failure: AiraError | None = None
     if not outcome.success:
         why = f"{printable(outcome.reason)} ({outcome.code})" if outcome.reason else "nothing says why"
         hint = _failure_hint(contract, outcome.result)
         failure = JobNotDone(f"the job was not done: {why}; the cost was returned", hint=hint)
         facts |= {"error": str(failure), "reason": outcome.reason, "code": outcome.code}
-    if out is not None:
+    try:
+        facts["recording"] = None if not outcome.result else str(await _keep_recording(contract, out))
+    except AiraError as error:
         facts["recording"] = None
-        try:
-            if outcome.result:
-                await _save_recording(contract, out)
-                facts["recording"] = str(out)
-        except AiraError as error:
+        if out is not None:
             failure, facts["error"] = error, str(error)
-    if as_json:
+        elif outcome.success:
+            later = f"`aira objective get {outcome.result}` fetches it when the robot is present"
+            click.echo(f"aira: {error}\n      {later}", err=True)
+    if printer.as_json:
         print_json(facts)
-    elif facts.get("recording"):
-        print_line(f"recording {out}")
+    elif facts["recording"]:
+        print_line(f"recording {facts['recording']}")
     if failure is not None:
         raise failure
 
@@ -268,12 +264,15 @@ def _failure_hint(contract: Contract, result: str) -> str:
     return f"it ended without a result; see `aira liability show {contract.address}`"
 
 
-async def _save_recording(contract: Contract, out: Path) -> None:
-    """Write the recording to a file. Raises `ContentError` if it can't be fetched, `OutputFailed` if not written."""
+async def _keep_recording(contract: Contract, out: Path | None) -> Path:
+    """Where the recording is: in the account's store, or its copy. Raises `ContentError`, `OutputFailed`."""
     recording = await contract.recording()
+    if out is None:
+        return recording
     try:
         await asyncio.to_thread(shutil.copyfile, recording, out)
     except OSError as error:
         raise OutputFailed(
             f"can't write the recording to {out}: {error.strerror}", hint=f"the store has it: {recording}"
         ) from None
+    return out

@@ -17,7 +17,7 @@ from mesh.settings import ChainSettings, NetworkSettings, options_of
 from schemas import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from mesh.agent import Order
     from mesh.agent.components import AgentComponents
@@ -138,19 +138,25 @@ async def _withdraw(
         orders = trader.orders(OrderState.OPEN, OrderState.WITHDRAWN)
         parts.outbox.hold(order.hash for order in orders if order.state is OrderState.OPEN)
         chosen = orders if everything else [_named(orders, digits) for digits in hashes]
-        facts = await _withdraw_orders(parts, chosen, on_chain=on_chain)
+        facts = await withdraw_orders(parts, chosen, on_chain=on_chain)
     if as_json:
         print_json(facts)
         return
-    for fact in facts:
-        print_line(f"{fact['kind']} {fact['hash']} is withdrawn\n  {_what_it_means(fact)}")
-        for provider in fact["honouredBy"]:
-            print_line(f"  provider {provider} honours it")
+    for line in withdrawal_lines(facts):
+        print_line(line)
     if not facts:
         print_line("no open orders")
 
 
-async def _withdraw_orders(parts: AgentComponents, orders: Sequence[Order], *, on_chain: bool) -> list[dict[str, Any]]:
+def withdrawal_lines(facts: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """What people read of withdrawn orders."""
+    for fact in facts:
+        yield f"{fact['kind']} {fact['hash']} is withdrawn\n  {_what_it_means(fact)}"
+        for provider in fact["honouredBy"]:
+            yield f"  provider {provider} honours it"
+
+
+async def withdraw_orders(parts: AgentComponents, orders: Sequence[Order], *, on_chain: bool) -> list[dict[str, Any]]:
     """Withdraw orders, and wait a moment for providers to confirm it; returns what is printed of each."""
     from mesh.agent.orders import OrderState
     from mesh.agent.statements import received_rejections

@@ -17,6 +17,7 @@ from mesh.background import Background
 from mesh.cli.amounts import XRT, Unit
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
+from mesh.cli.waiting import print_connection_changes
 from mesh.network import Reading
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
@@ -137,7 +138,7 @@ async def _report_beside(network: Network, seen: MarketWatch) -> AsyncIterator[B
     loop.add_signal_handler(signal.SIGUSR1, print_counters)
     try:
         async with Background() as tasks:
-            tasks.start(_print_connection_changes(network), "network losses")
+            tasks.start(print_connection_changes(network), "network losses")
             tasks.start(wait_for_broken_pipe(), "readers of stdout")
             yield tasks
     except asyncio.CancelledError:  # by Ctrl-C; a closed pipe ends quietly
@@ -153,12 +154,6 @@ def format_counters(counters: MarketCounters) -> str:
     invalid = f"{sum(counters.refused.values()):,} invalid" + (f" ({reasons})" if reasons else "")
     lost = f", {counters.lost:,} lost because this reader was too slow" if counters.lost else ""
     return f"{plural(counters.received, 'message')} received, {counters.duplicate:,} duplicate, {invalid}{lost}"
-
-
-async def _print_connection_changes(network: Network) -> None:
-    async for _ in network.changes():
-        words = "connected to the router again" if network.connected else "lost the router; waiting for it"
-        click.echo(f"aira: {words}", err=True)
 
 
 async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> str | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -15,7 +15,7 @@ from mesh.cli.order import _list, _withdraw
 from mesh.network import Endpoints, Network
 from schemas import RejectKey, verify
 from schemas.signing import Rejection
-from tests.mesh.operations.site import MODEL, Site
+from tests.mesh.operations.site import MODEL, Site, settings_of
 from tests.support.commands import invoke
 from tests.support.waiting import until
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.settings import Settings
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
@@ -32,13 +31,6 @@ if TYPE_CHECKING:
 @pytest.fixture
 async def site(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path) -> Site:
     return await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
-
-
-def settings_of(site: Site, role: str) -> Settings:
-    """A role's settings, with its keyfile."""
-    variables = site.variables(role)
-    keyfile, password = variables["AIRA_KEYFILE"], variables["AIRA_KEYFILE_PASSWORD_FILE"]
-    return site.settings(role, keyfile=keyfile, keyfile_password_file=password)
 
 
 async def test_an_account_without_a_ledger_has_no_orders(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,7 +102,13 @@ def test_withdraw_needs_hashes_or_all() -> None:
 
 async def test_a_rejection_is_told_with_what_it_means(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     settings = settings_of(site, "person")
-    order = {"model": MODEL, "objective": str(site.job("word")), "cost": "7wn", "validator_fee": "0", "validator": ""}
+    order: dict[str, Any] = {
+        "model": MODEL,
+        "objective": str(site.job("word")),
+        "cost": "7wn",
+        "validator_fee": "0",
+        "validator": "",
+    }
     async with site.agent("person") as person:
         another = await person.order(site.job("another"), cost=3)
     waiting = asyncio.create_task(demand(settings, **order, out=None, as_json=True, lifetime=100))
@@ -128,18 +126,21 @@ async def test_a_rejection_is_told_with_what_it_means(site: Site, capsys: pytest
         key = str(RejectKey(site.lighthouse, site.accounts["person"].address))
         network.session.put(key, unsigned.signed_by(provider.signer).encode())
         said: list[str] = []
+        notes: list[str] = []
 
         def is_told() -> bool:
-            said.append(capsys.readouterr().err)
+            captured = capsys.readouterr()
+            said.append(captured.out)
+            notes.append(captured.err)
             return "not today" in "".join(said)
 
         await until(is_told)
-    text = "".join(said)
-    assert f"provider {provider.address} can't use the demand now" in text
-    assert "stays valid until block" in text
-    assert "1 other order of this account" in text
-    assert f"aira order withdraw {orders[0][:16]}" in text
+    facts = {"kind": "rejected", "agent": provider.address, "code": "Unwanted", "detail": "not today"}
+    assert facts in map(json.loads, "".join(said).splitlines())
+    assert "1 other order of this account" in "".join(notes)
     assert not waiting.done()
     waiting.cancel()
     await asyncio.wait([waiting])
-    assert "stays valid" in capsys.readouterr().err
+    text = capsys.readouterr().err
+    assert "stays valid until block" in text
+    assert f"aira order withdraw {orders[0][:16]}" in text

@@ -85,21 +85,34 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
     async with offering(moving(Agent(MODEL, settings=robot, account=load_account(robot)))), asyncio.timeout(60):
         await demand(person, objective=str(path), out=out, as_json=False, **order)
         assert f"paid, result {cid_of_file(out)}\nrecording {out}\n" in printed
-        assert f"demand by {load_account(person).address} for {MODEL}\nposted " in printed
+        assert f"demand by {load_account(person).address} for {MODEL}\nobjective " in printed
+        assert f"objective {cid_of_file(path)}: 1 message, 0 s\nposted " in printed
         assert "\ncontract 0x" in printed
         printed.text = ""
         await demand(person, objective=cid_of_file(path), out=None, as_json=True, **order)
-        assert "}\n" in printed
-        assert set(json.loads(printed.text)) == {"liability", "success", "result"}
+        assert '"liability"' in printed
+        kinds, end = progress_and_end(printed.text)
+        assert [kind for kind in kinds if kind not in ("offer", "gone", "back")] == [
+            "contract", "ready", "playing", "result", "paid",
+        ]  # fmt: skip
+        assert set(end) == {"liability", "success", "result", "recording"}
+        assert cid_of_file(Path(end["recording"])) == end["result"]
+        assert str(tmp_path) in end["recording"]
         printed.text = ""
         full = Path("/dev/full")
         with pytest.raises(OutputFailed, match="/dev/full") as caught:
             await demand(person, objective=cid_of_file(path), out=full, as_json=True, **order)
-        assert "}\n" in printed
-        summary = json.loads(printed.text)
+        assert '"liability"' in printed
+        _, summary = progress_and_end(printed.text)
         assert (summary["success"], summary["recording"], summary["error"]) == (True, None, str(caught.value))
         assert cid_of_file(Path(caught.value.hint.split()[-1])) == summary["result"]
     await stopped(up)
+
+
+def progress_and_end(text: str) -> tuple[list[str], dict[str, Any]]:
+    """The kinds of what happened, without repetitions, and the object that is printed at the end."""
+    *progress, end = map(json.loads, text.splitlines())
+    return list(dict.fromkeys(one["kind"] for one in progress)), end
 
 
 def moving(robot: Agent) -> Agent:

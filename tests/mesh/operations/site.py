@@ -146,3 +146,10 @@ def has_event(server: Serving, name: str, **facts: str) -> bool:
 def has_traceback(server: Serving) -> bool:
     """Whether a process that logs in JSON has logged or printed a traceback."""
     return "Traceback" in server.log()
+
+
+def settings_of(site: Site, role: str) -> Settings:
+    """A role's settings, with its keyfile."""
+    variables = site.variables(role)
+    keyfile, password = variables["AIRA_KEYFILE"], variables["AIRA_KEYFILE_PASSWORD_FILE"]
+    return site.settings(role, keyfile=keyfile, keyfile_password_file=password)

@@ -1,0 +1,157 @@
+"""`aira demand`: what a person sees of the objective, of robots that decline, of failures, and of an interruption."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh import Declined, JobFailed, Progress
+from mesh.cli.amounts import XRT
+from mesh.cli.demand import demand
+from mesh.cli.errors import JobNotDone
+from mesh.cli.waiting import JobPrinter
+from mesh.work.objectives import ObjectiveUnfit
+from schemas import cid_of_file
+from tests.mesh.operations.site import MODEL, Site, settings_of
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from schemas import Demand, Verified
+    from tests.support.nodes import Anvil
+    from tests.support.routers import EmbeddedRouter
+
+AGENT = "0x70997970C51812dc3A010C7d01b50e0d17dc79C8"
+TERMS: dict[str, Any] = {"model": MODEL, "cost": "7wn", "validator": "", "validator_fee": "0", "lifetime": 500}
+
+
+@pytest.fixture
+async def site(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path) -> Site:
+    return await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+
+
+class Output:
+    """What a command has printed so far."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+        self._out = self._err = ""
+
+    @property
+    def out(self) -> str:
+        captured = self._capsys.readouterr()
+        self._out, self._err = self._out + captured.out, self._err + captured.err
+        return self._out
+
+    @property
+    def err(self) -> str:
+        self.out  # reads both  # noqa: B018
+        return self._err
+
+
+@pytest.fixture
+def output(capsys: pytest.CaptureFixture[str]) -> Output:
+    return Output(capsys)
+
+
+async def test_an_objective_that_no_robot_takes_is_an_error_before_anything_is_sent(tmp_path: Path, site: Site) -> None:
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(b"no recording")
+    with pytest.raises(ObjectiveUnfit) as caught:
+        await demand(settings_of(site, "person"), objective=str(path), out=None, as_json=False, **TERMS)
+    assert (caught.value.reason, caught.value.cid) == ("not-a-recording", str(path))
+    async with site.agent("person") as person:
+        assert person.orders() == []
+
+
+async def test_a_robot_that_declines_is_shown_with_its_reason(site: Site, output: Output) -> None:
+    robot = site.agent("robot")
+
+    @robot.on_demand
+    async def weigh(demand: Verified[Demand]) -> None:
+        raise Declined("too-cheap", "costs at least 5 XRT")
+
+    async with site.provider(), robot:
+        waiting = asyncio.create_task(
+            demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=False, **TERMS)
+        )
+        line = f"declined by {robot.address}: costs at least 5 XRT (too-cheap)\n"
+        await until(lambda: line in output.out, seconds=60)
+        waiting.cancel()
+        await asyncio.wait([waiting])
+    assert "the demand stays valid until block" in output.err
+
+
+async def test_a_failed_job_is_shown_with_its_reason_and_its_recording_is_kept(site: Site, output: Output) -> None:
+    robot = site.agent("robot")
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand)
+
+    @robot.on("/say")
+    async def say(job: object, message: object) -> None:
+        raise JobFailed("the lamp is broken")
+
+    async with site.provider(), robot:
+        with pytest.raises(JobNotDone):
+            await demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=True, **TERMS)
+    *progress, end = map(json.loads, output.out.splitlines())
+    assert {
+        "kind": "refunded",
+        "agent": site.address("robot"),
+        "code": "job-failed",
+        "detail": "the lamp is broken",
+    } in progress
+    assert (end["reason"], end["code"]) == ("the lamp is broken", "job-failed")
+    assert cid_of_file(Path(end["recording"])) == end["result"]
+
+
+async def test_an_interrupted_demand_is_withdrawn_if_asked_for(site: Site, output: Output) -> None:
+    settings, options = settings_of(site, "person"), TERMS | {"withdraw_on_exit": True}
+    async with site.provider():
+        waiting = asyncio.create_task(
+            demand(settings, objective=str(site.job("word")), out=None, as_json=False, **options)
+        )
+        await until(lambda: "posted " in output.out, seconds=60)
+        identity = output.out.split("posted ")[1].split(",")[0]
+        waiting.cancel()
+        await asyncio.wait([waiting])
+    assert f"demand {identity} is withdrawn" in output.err
+    async with site.agent("person") as person:
+        assert person.orders() == []
+
+
+def test_progress_without_a_terminal_is_a_line_for_each_tenth(output: Output) -> None:
+    printer = JobPrinter(XRT, as_json=False)
+    for position in range(101):
+        printer(Progress(kind="playing", agent=AGENT, position=position, total=100))
+    lines = output.out.splitlines()
+    assert len(lines) == 11
+    assert lines[-1] == "playing: 100 %, 100 of 100 messages"
+
+
+def test_what_strangers_write_does_not_control_the_terminal(output: Output) -> None:
+    printer = JobPrinter(XRT, as_json=False)
+    for kind in ("declined", "rejected"):
+        printer(Progress(kind=kind, agent=AGENT, code="busy\x1b[2J", detail="\x1b[2Jlater"))
+    assert "\x1b" not in output.out
+
+
+def test_an_offer_for_another_cost_is_shown_with_its_unit(output: Output) -> None:
+    printer = JobPrinter(XRT, as_json=False)
+    printer(Progress(kind="offer", agent=AGENT, code="other-cost", detail="5000000000"))
+    silent = [printer.is_silent]
+    printer(Progress(kind="offer", agent=AGENT))
+    assert [*silent, printer.is_silent] == [True, False]
+    assert output.out == f"offer by {AGENT} for other terms: cost 5 XRT\noffer by {AGENT}\n"
+
+
+def test_the_summary_counts_offers_and_declines() -> None:
+    printer = JobPrinter(XRT, as_json=True)
+    for agent, code in ((AGENT, "busy"), ("0x1", "too-cheap"), ("0x2", "too-cheap"), (AGENT, "too-cheap")):
+        printer(Progress(kind="declined", agent=agent, code=code))
+    assert printer.summary() == "0 robots offered, 3 robots declined (3 too-cheap)"
