@@ -50,6 +50,8 @@ if TYPE_CHECKING:
         InvalidPayload,
         Liability,
         Offer,
+        Payload,
+        PayloadType,
         Result,
         String,
         Verified,
@@ -80,7 +82,10 @@ _NAMES: Final = {
     "mesh.work.job": "Job JobFailed",
     "mesh.work.ledger": "Phase WrongPhase",
     "mesh.work.objectives": "ObjectiveUnfit",
-    "schemas": "Demand Empty InvalidPayload Liability Offer Result STRING String Verified ZERO_ADDRESS cid_of_file",
+    "schemas": (
+        "Demand Empty InvalidPayload Liability Offer Payload PayloadType Result STRING String Verified ZERO_ADDRESS"
+        " cid_of_file"
+    ),
     "schemas.model": "InvalidDescription ModelDescription ModelLimits ModelTopic",
     "schemas.value_schema": "ValueSchema",
 }
@@ -141,6 +146,8 @@ __all__ = [
     "OrderExpired",
     "OrderState",
     "Outcome",
+    "Payload",
+    "PayloadType",
     "Phase",
     "Played",
     "Progress",

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
         names_in,
         resolve_names,
     )
-    from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, payload_type
+    from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, Payload, PayloadType, String, payload_type
     from schemas.records import Liability, PlaybackPosition, Record
     from schemas.selectors import (
         cid_selector,
@@ -111,7 +111,7 @@ _NAMES: Final = {
         "Demand Message Offer Order OrderFeedback Result SignedMessage TransactionFeedback Withdrawal names_in "
         "resolve_names"
     ),
-    "schemas.payloads": "EMPTY Empty JSON PayloadType RAW STRING String payload_type",
+    "schemas.payloads": "EMPTY Empty JSON Payload PayloadType RAW STRING String payload_type",
     "schemas.records": "Liability PlaybackPosition Record",
     "schemas.selectors": (
         "cid_selector device_selector event_selector lighthouse_selector market_selector objective_selector "

@@ -12,7 +12,7 @@ from bridges.serial.dialect import CallStatus, Command
 from bridges.serial.errors import CALL_ERRORS, BoardBusy, InvalidBoardMessage
 from mesh.log_context import log_event
 from schemas.errors import InvalidPayload
-from schemas.payloads import EMPTY, JSON, STRING, PayloadType, String
+from schemas.payloads import Empty, PayloadType, decode_value, encode_as
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -107,17 +107,18 @@ def timeout_of(query: zenoh.Query, default: float) -> float:
 
 
 def convert(payload: bytes, given: PayloadType, wanted: PayloadType) -> bytes:
-    """A text or nothing, converted from the caller's type to the topic's; any other payload is returned unchanged."""
+    """A payload converted from the caller's type to the topic's: a text, a number, a list, or nothing.
+
+    Returned unchanged if that can't be done; the check against the topic's type then reports it.
+    """
+    if given.zenoh_encoding == wanted.zenoh_encoding:
+        return payload
     try:
-        if (given, wanted) == (STRING, JSON):
-            return msgspec.json.encode(String.decode(payload).data)
-        if (given, wanted) == (JSON, STRING) and isinstance(text := msgspec.json.decode(payload), str):
-            return String(text).encode()
-        if (given, wanted) == (JSON, EMPTY) and msgspec.json.decode(payload) is None:
-            return b""
-    except (InvalidPayload, msgspec.DecodeError, UnicodeDecodeError):
-        pass  # it is not of the type it claims; the check against the topic's type will report that
-    return payload
+        value = decode_value(payload, given)
+        converted = payload if isinstance(value, bytes | Empty) else encode_as(value, wanted)
+    except InvalidPayload:
+        return payload
+    return payload if converted is None else converted
 
 
 def reply(query: zenoh.Query, finished: CommandFinished) -> None:

@@ -9,13 +9,13 @@ from mesh.recording.errors import (
     RecordingTooLarge,
     Unrecordable,
 )
+from mesh.recording.json_schemas import JsonSchemas, is_described, json_type
 from mesh.recording.limits import GENEROUS, Limits
 from mesh.recording.objective import (
     ChannelMessage,
     Objective,
     Played,
     TopicRates,
-    json_type,
     open_objective,
     rates_of,
 )

@@ -176,10 +176,12 @@ class McapWriter:
         self._stream.write(summary + _bytes_of(footer) + MAGIC)
 
     def _schema(self, type: PayloadType) -> int:
-        """The number of a type's schema. Every channel gets one: some viewers refuse channels without."""
+        """The number of a type's schema; 0, which means none, for bytes of no known type."""
         key = (type.schema_name, type.schema_encoding, type.schema_data)
         if type.encoding == "json" and not type.schema_data:
             key = (type.schema_name, "jsonschema", _JSON_SCHEMA)
+        elif not any(key):
+            return 0
         known = self._known_schemas.get(key)
         if known is not None:
             return known

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
-from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-import msgspec
 from msgspec import Struct
 
 from mesh.recording import bag_records, mcap_records
@@ -15,7 +13,7 @@ from mesh.recording.bag_source import open_bag
 from mesh.recording.errors import NotARecording, RecordingTooLarge
 from mesh.recording.limits import Limits
 from mesh.recording.mcap_source import open_mcap
-from schemas.payloads import JSON, PayloadType
+from schemas.payloads import PayloadType
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -149,24 +147,6 @@ def rates_of(messages: Iterable[Played], *, start_ns: int, duration_ns: int, spa
             counted = counts[message.topic] = [0] * spans
         counted[(message.log_time_ns - start_ns) // span] += 1
     return TopicRates(span, counts)
-
-
-@lru_cache(maxsize=1024)
-def json_type(kind: type[msgspec.Struct]) -> PayloadType:
-    """The payload type of `kind` as JSON: its name, and its JSON Schema, so that viewers can read the recording.
-
-    Plain `JSON` if `kind` has no schema, or is not an object in JSON.
-    """
-    try:
-        (root,), definitions = msgspec.json.schema_components((kind,), ref_template="#/$defs/{name}")
-    except TypeError:
-        return JSON
-    schema = definitions.get(root.get("$ref", "").rpartition("/")[2], root)
-    if schema.get("type") != "object":
-        return JSON
-    alone = msgspec.json.encode(schema, order="sorted")
-    data = msgspec.json.encode({**schema, "$defs": definitions}, order="sorted") if b'"$ref"' in alone else alone
-    return PayloadType("json", kind.__name__, "jsonschema", data)
 
 
 def _played(channel: RecordingChannel, payload: bytes, log_time: int, publish_time: int, sequence: int) -> Played:

@@ -5,8 +5,8 @@ Fields of a JSON line:
 - `topic`: the topic, `/blink`; required.
 - `time`: seconds from the beginning, not negative, to the nanosecond; by default that of the line before (0 at first).
   Lines may be in any order.
-- `data`: the content. Without it, or null, the message is a std_msgs/Empty; a text is a std_msgs/String; anything else
-  is JSON.
+- `data`: the content. Without it, or null, the message is a std_msgs/Empty; a text is a std_msgs/String, a number a
+  std_msgs/Int64 or Float64, a list of numbers an array of these; anything else is JSON.
 - `type`: to override that. `std_msgs/Empty` and `std_msgs/String`; `json`, or `json;NAME` to name
   the type; or any other Zenoh encoding (`application/octet-stream`, `ros1;my_msgs/Move`,
   `application/cdr;my_msgs/msg/Move`), whose payload is then `data` in base64.
@@ -24,6 +24,7 @@ import msgspec
 
 from mesh.content.files import atomic_file
 from mesh.errors import InputError, InvalidKey
+from mesh.recording.json_schemas import JsonSchemas
 from mesh.recording.limits import Limits
 from mesh.recording.mcap_writer import MAX_TIME, McapWriter
 from mesh.recording.objective import Played, open_source
@@ -100,6 +101,7 @@ def pack(
     """
     first = last = 0
     topics: set[str] = set()
+    schemas = JsonSchemas()
     with atomic_file(target) as stream:
         writer = McapWriter(stream)
         for name, values in (metadata or {}).items():
@@ -108,7 +110,7 @@ def pack(
             writer.add(
                 message.topic,
                 message.payload,
-                message.type,
+                schemas.describe(message.topic, message.payload, message.type),
                 metadata={},
                 log_time_ns=message.log_time_ns,
                 publish_time_ns=message.publish_time_ns,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Literal, Self, TypeAlias, get
 from mesh.content.files import sync_directory
 from mesh.private_files import make_missing_folders, open_private
 from mesh.recording.errors import NotARecording, RecordingExists, Unrecordable
+from mesh.recording.json_schemas import JsonSchemas
 from mesh.recording.mcap_writer import McapWriter
 from mesh.recording.recovery import RECOVERED, copy_content, last_time, readable_part
 from schemas.payloads import EMPTY, PayloadType
@@ -84,6 +85,7 @@ class PartialFile:
         self._stream = _locked(self._part)
         self._writer = McapWriter(self._stream)
         self._channels: dict[str, tuple[PayloadType, MessageRole, WriterChannel]] = {}
+        self._schemas = JsonSchemas()
         """The channel of the last message on each topic: the next one most likely has the same type and role."""
         self._unsynced_since: float | None = None
         self._has_name = False
@@ -136,6 +138,8 @@ class PartialFile:
         refused: list[tuple[PendingMessage, Unrecordable]] = []
         for message in messages:
             topic, payload, type, role, log_time_ns, publish_time_ns = message
+            if type.encoding == "json" and role != "objective":  # what was played keeps the type that it has
+                type = self._schemas.describe(topic, payload, type)
             known = self._channels.get(topic)
             if known is None or known[0] is not type or known[1] != role:
                 try:

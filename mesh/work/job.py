@@ -5,14 +5,12 @@ from __future__ import annotations
 import weakref
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from mesh.errors import AiraError, ClosedError
 from mesh.network import sending
-from mesh.recording import json_type
+from mesh.recording import is_described, json_type
 from mesh.work.listening import JobMessages
 from schemas.agent_keys import LiabilityTopicKey, topic_chunks
-from schemas.payloads import JSON, PayloadType, encode_value
+from schemas.payloads import JSON, PayloadType, encode_value, payload_type
 
 if TYPE_CHECKING:
     import zenoh
@@ -50,14 +48,17 @@ class Job:
     def publish(self, topic: str, message: object) -> None:
         """Publish on a topic of the job, as a device does. The message becomes part of the recording.
 
-        `message` is `Empty`, `String`, a str, bytes, a msgspec Struct or plain JSON data. Raises `InvalidPayload` for
-        anything else, and `ClosedError` before the job runs and after it has ended.
+        `message` is a number, a bool, a str, bytes, None, a list, a dict, a msgspec Struct, a dataclass, `Empty`,
+        `String`, a number or array of numpy, or a `Payload`. Raises `InvalidPayload` for anything else (also for NaN in
+        a dict or Struct, which become JSON), and `ClosedError` before the job runs and after it has ended.
         """
         self._check_running()
         payload, kind = encode_value(message)
         key = str(LiabilityTopicKey(self._agent, self.liability.address, topic))
-        if kind == JSON and isinstance(message, msgspec.Struct):
-            kind = json_type(type(message))
+        declared: Any = type(message)
+        if kind == JSON and is_described(declared):
+            kind = json_type(declared)
+        if payload_type(kind.zenoh_encoding) != kind:  # only its name travels
             self._types[topic, kind.zenoh_encoding] = kind
         self._put(key, payload, kind)
 

@@ -17,6 +17,7 @@ from mesh.cli.errors import (
     InvalidOptions,
     NotAFileOrCid,
 )
+from mesh.cli.output import format_size
 from mesh.content import Store
 from mesh.errors import AiraError, InvalidCid
 from mesh.extras import PackageMissing
@@ -61,7 +62,7 @@ def test_lines_become_an_objective(tmp_path: Path) -> None:
     done = call("pack", tmp_path / "lines", "--out", tmp_path / "it.mcap")
     assert done.exit_code == 0, done.output
     made = tmp_path / "it.mcap"
-    assert done.stdout == f"{cid_of_file(made)}  {made}  3 messages, 2 s, {made.stat().st_size:,} bytes\n"
+    assert done.stdout == f"{cid_of_file(made)}  {made}  3 messages, 2 s, {format_size(made.stat().st_size)}\n"
     assert [(one.topic, one.log_time_ns) for one in open_objective(tmp_path / "it.mcap").messages()] == [
         ("/blink", 0),
         ("/blink", 500_000_000),

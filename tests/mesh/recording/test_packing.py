@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 
 from mesh.recording import CorruptRecording, InvalidLine, PackSummary, bag_to_mcap, messages_in, open_objective, pack
-from schemas.payloads import EMPTY, JSON, RAW, STRING, PayloadType, String
+from schemas.payloads import EMPTY, JSON, RAW, STRING, PayloadType, String, payload_type
 from tests.mesh.recording.files import SECOND, T0
 from tests.support.bags import Bag, BagMessage, Compression, string
 
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
         ({"data": "blå", "type": "std_msgs/String"}, String("blå").encode(), STRING),
         ({"data": {"x": 1}}, b'{"x":1}', JSON),
         ({"data": [1, 2.5, True]}, b"[1,2.5,true]", JSON),
-        ({"data": 0}, b"0", JSON),
+        ({"data": 0}, b"\0" * 8, payload_type("ros1;std_msgs/Int64")),
+        ({"data": 0, "type": "json"}, b"0", JSON),
         ({"data": "text", "type": "json"}, b'"text"', JSON),
         ({"data": {}, "type": "json;Pose"}, b"{}", PayloadType("json", "Pose", "jsonschema", JSON.schema_data)),
         ({"data": "AAE=", "type": "application/octet-stream"}, b"\0\1", RAW),

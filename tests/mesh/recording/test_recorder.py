@@ -75,8 +75,15 @@ def test_every_channel_has_schema_times_and_role(tmp_path: Path) -> None:
             recorder.record("/a", b"{}", kind, role="objective")
             recorder.record("/a", b"{}", kind)
     found = read_by_the_package(path)
-    described = [(channel.message_encoding, schema.name, schema.encoding, schema.data) for schema, channel, _ in found]
-    assert described[::2] == described[1::2]
+    described = [
+        (channel.message_encoding, *((schema.name, schema.encoding, schema.data) if schema else ("", "", b"")))
+        for schema, channel, _ in found
+    ]
+    assert described[1::2] == [  # what a device says is described by what it says
+        ("json", name or "a", "jsonschema", b'{"properties":{},"type":"object"}') if encoding == "json" else kind
+        for kind in described[::2]
+        for encoding, name, *_ in [kind]
+    ]
     assert described[::2] == [
         ("ros1", "std_msgs/Empty", "ros1msg", b""),
         ("ros1", "std_msgs/String", "ros1msg", b"string data\n"),

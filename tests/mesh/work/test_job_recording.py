@@ -51,7 +51,7 @@ async def test_messages_of_the_agent_are_recorded_with_their_type(making: Making
     assert making.recorded() == [
         ("/led", String("on").encode(), "ros1;std_msgs/String"),
         ("/camera/left", b"\x01", "application/octet-stream"),
-        ("/pose", b'{"x":1}', "application/json"),
+        ("/pose", b'{"x":1}', "application/json;pose"),
         ("/tick", b"", "ros1;std_msgs/Empty"),
     ]
 
@@ -133,7 +133,7 @@ async def test_messages_of_another_session_before_the_end_are_recorded(making: M
         await until(lambda: arrived)
     await run.close()
     recorded = making.recorded()
-    assert recorded[:500] == [("/wheel", b"%d" % number, "application/json") for number in range(500)]
+    assert recorded[:500] == [("/wheel", b"%d" % number, "application/json;wheel") for number in range(500)]
     assert recorded[500] == ("/unknown/type", b"?", "ros1;wheels/Wheel")
 
 

@@ -1,0 +1,141 @@
+"""JSON Schemas of messages, so that viewers can plot them: from a message's type, or from the messages of a topic."""
+
+from __future__ import annotations
+
+from dataclasses import is_dataclass
+from functools import lru_cache, reduce
+from typing import Any, Final
+
+import msgspec
+
+from schemas.payloads import JSON, PayloadType
+
+LONGEST: Final = 64 << 10
+"""Bytes of a message from which a schema is inferred."""
+TOPICS: Final = 1024
+"""Topics that get an inferred schema."""
+CHANGES: Final = 32
+"""How often the schema of a topic changes; messages that don't fit the last one get none."""
+DEPTH: Final = 8
+PROPERTIES: Final = 256
+_DECODER: Final = msgspec.json.Decoder()
+
+
+@lru_cache(maxsize=1024)
+def json_type(kind: type[Any]) -> PayloadType:
+    """The payload type of `kind`, a msgspec Struct or a dataclass, as JSON: its name and its JSON Schema.
+
+    The name is that of the class, or its `schema_name`. Plain `JSON` if `kind` has no schema, or is not an object in
+    JSON.
+    """
+    try:
+        (root,), definitions = msgspec.json.schema_components((kind,), ref_template="#/$defs/{name}")
+    except TypeError:
+        return JSON
+    schema = definitions.get(root.get("$ref", "").rpartition("/")[2], root)
+    if schema.get("type") != "object":
+        return JSON
+    alone = _encoded(schema)
+    data = _encoded({**schema, "$defs": definitions}) if b'"$ref"' in alone else alone
+    return PayloadType("json", getattr(kind, "schema_name", kind.__name__), "jsonschema", data)
+
+
+def is_described(kind: type[Any]) -> bool:
+    """Whether `kind` is a class with named fields: a msgspec Struct or a dataclass."""
+    return issubclass(kind, msgspec.Struct) or is_dataclass(kind)
+
+
+class JsonSchemas:
+    """Describes the JSON messages of one recording whose types have no schema, by those seen on the same topic.
+
+    A schema only ever widens, so that it matches the earlier messages, too. It names all properties seen, and requires
+    none. Its name is that of the type, or of the topic.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, str], _TopicSchema] = {}
+
+    def describe(self, topic: str, payload: bytes, type: PayloadType) -> PayloadType:
+        """The type of a message with a schema that fits; the same type if it has one already, or none is found."""
+        if type.encoding != "json" or (type.schema_data and type.schema_data != JSON.schema_data):
+            return type
+        key = (topic, type.schema_name)
+        if len(payload) > LONGEST or (key not in self._known and len(self._known) >= TOPICS):
+            return type
+        try:
+            found = _schema_of(_DECODER.decode(payload))
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            return type
+        known = self._known.get(key)
+        if known is None:
+            name = type.schema_name or topic.strip("/").replace("/", ".")
+            known = self._known[key] = _TopicSchema(name, found)
+        return known.type if known.widen(found) else type
+
+
+class _TopicSchema:
+    """What is known of the messages of a topic."""
+
+    def __init__(self, name: str, schema: dict[str, Any]) -> None:
+        self._name = name
+        self._schema = schema
+        self._changes = 0
+        self.type = self._type()
+
+    def widen(self, found: dict[str, Any]) -> bool:
+        """Make the schema fit a message with that one. False if it has changed too often for that."""
+        merged = _merged(self._schema, found)
+        if merged != self._schema:
+            if self._changes == CHANGES:
+                return False
+            self._changes += 1
+            self._schema = merged
+            self.type = self._type()
+        return True
+
+    def _type(self) -> PayloadType:
+        return PayloadType("json", self._name, "jsonschema", _encoded(self._schema))
+
+
+def _schema_of(value: Any, depth: int = DEPTH) -> dict[str, Any]:
+    """A schema that fits JSON data; what is nested too deep fits any."""
+    if not depth:
+        return {}
+    match value:
+        case bool():
+            return {"type": "boolean"}
+        case int() | float():
+            return {"type": "number"}
+        case str():
+            return {"type": "string"}
+        case list() if value:
+            return {"type": "array", "items": reduce(_merged, (_schema_of(one, depth - 1) for one in value))}
+        case list():
+            return {"type": "array"}
+        case dict():
+            members = list(value.items())[:PROPERTIES]
+            return {"type": "object", "properties": {name: _schema_of(one, depth - 1) for name, one in members}}
+    return {"type": "null"}
+
+
+def _merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """A schema that fits what either fits."""
+    if one == other:
+        return one
+    match one.get("type"), other.get("type"):
+        case "object", "object":
+            both = dict(one["properties"])
+            for name, schema in other["properties"].items():
+                if name in both:
+                    both[name] = _merged(both[name], schema)
+                elif len(both) < PROPERTIES:
+                    both[name] = schema
+            return {"type": "object", "properties": both}
+        case "array", "array":
+            items = [schema["items"] for schema in (one, other) if "items" in schema]
+            return {"type": "array", "items": reduce(_merged, items)}
+    return {}
+
+
+def _encoded(schema: dict[str, Any]) -> bytes:
+    return msgspec.json.encode(schema, order="sorted")
