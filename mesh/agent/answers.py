@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.background import Background
 from mesh.errors import AiraError, RemoteError
 from mesh.flood import FairQueue
-from mesh.recording import ABOUT, Played, RecordingAbout, open_objective, pack
+from mesh.recording import ABOUT, Played, RecordingAbout, open_objective
 from mesh.retry import Backoff, RetryPolicy
 from mesh.watching.readings import LARGEST, LIMITS
 from schemas import Demand, Result, Verified, message_hash
-from schemas.payloads import decode_value, encode_value
+from schemas.payloads import decode_value
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -74,13 +73,10 @@ class Answer:
         return self.values[0]
 
 
-def record_answer(path: Path, demand: Verified[Demand], value: object, *, agent: str, topic: str) -> None:
-    """Write the recording of an answer to `path`. Blocks on the disk. Raises `InvalidPayload`."""
-    payload, kind = encode_value(value)
-    now = time.time_ns()
+def metadata_of_answer(demand: Verified[Demand], agent: str) -> dict[str, dict[str, str]]:
+    """The metadata records of the recording with which `agent` (address) answers a demand."""
     about = RecordingAbout(agent=agent, lighthouse=demand.message.lighthouse, objective=demand.message.objective)
-    metadata = {ABOUT: asdict(about), ANSWERED: {"demand": demand.hash.hex()}}
-    pack([Played(topic, payload, now, now, 0, kind)], path, metadata=metadata)
+    return {ABOUT: asdict(about), ANSWERED: {"demand": demand.hash.hex()}}
 
 
 def read_answer(path: Path, result: Verified[Result]) -> tuple[Answer, str]:

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import tempfile
-from functools import partial
-from pathlib import Path
+import time
 from typing import TYPE_CHECKING, Final
 
-from mesh.agent.answers import Answer, Question, Unanswered, record_answer
-from mesh.agent.trading_agent import TradingAgent
+from mesh.agent.answers import Answer, Question, Unanswered, metadata_of_answer
+from mesh.agent.trading_agent import Messages, TradingAgent, put_values
 from mesh.errors import InputError
 from mesh.log_context import log_event
 from mesh.network import ReadingSubscription, sending
 from mesh.network.readings import LARGEST_READING
 from schemas import Result, parse_address
-from schemas.agent_keys import ReadingKey, topic_chunks
+from schemas.agent_keys import ReadingKey
 from schemas.payloads import encode_value
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.flood import Drops
     from schemas import Demand, Verified
     from schemas.payloads import PayloadType
@@ -71,28 +71,25 @@ class ReadingAgent(TradingAgent):
         market once; who asks with `ask` asks again if it is lost. Raises as `publish` does.
         """
         _encoded(topic, value)
-        with tempfile.TemporaryDirectory(prefix="aira-answer-") as folder:
-            path = Path(folder) / "answer.mcap"
-            write = partial(record_answer, path, demand, value, agent=self.address, topic=topic_chunks(topic))
-            await asyncio.to_thread(write)
-            cid = await self.add(path)
+        options = {"time_ns": time.time_ns(), "metadata": metadata_of_answer(demand, self.address)}
+        cid = await asyncio.to_thread(put_values, self.parts.store, [(topic, value)], **options)
         self.send(Result(liability=demand.signer, result=cid, success=True))
         facts = log_event("demand-answered", demand=demand.hash.hex(), signer=demand.signer, result=cid)
         log.info("answered %s without a contract: %s", demand.signer, cid, extra=facts)
         return cid
 
     async def ask(
-        self, model: str = "", objective: str | Path = "", *, agent: str = "", timeout: float = ASK_SECONDS
+        self, model: str = "", objective: str | Path | Messages = "", *, agent: str = "", timeout: float = ASK_SECONDS
     ) -> Answer:
         """Ask the agents of a model, by default this agent's, and return the first answer: `(await agent.ask()).value`.
 
-        The question is a demand that pays nothing, asked again until an answer comes. Its `objective` (a CID, or the
-        path of a file) says what is asked, if the model needs that. With an `agent` (address) only its answer counts.
+        The question is a demand that pays nothing, asked again until an answer comes. Its `objective`, as that of
+        `order`, says what is asked, if the model needs that. With an `agent` (address) only its answer counts.
         Anybody can answer: who did is `Answer.agent`. Legacy answers don't say which question they are for.
 
         Raises `Unanswered` after `timeout` seconds. A robot may make a contract of a question, one that costs nothing.
         """
-        cid = await self.add(objective) if isinstance(objective, Path) else objective
+        cid = await self._cid_of(objective)
         writer = self.runtime.trader.writer
         by = parse_address(agent) if agent else ""
         try:

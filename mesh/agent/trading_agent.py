@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 import asyncio
+import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, TypedDict, Unpack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypedDict, Unpack
 
 from mesh.agent.demands import current_buyer
 from mesh.agent.errors import OrderClosed
 from mesh.agent.orders import Order, OrderState
 from mesh.agent.progress import nothing
 from mesh.errors import ClosedError, ConfigurationError
+from mesh.recording import pack_values
 from mesh.role import Lifecycle
 from mesh.settings import load
 from schemas import Demand, Offer, Result, Verified
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
     from mesh.agent.progress import OnProgress
     from mesh.agent.runtime import AgentRuntime
+    from mesh.content import Store
     from mesh.network import Channel, Network
     from mesh.recording import Objective
     from mesh.settings import Settings
 
 FETCH_PATIENCE: Final = 10.0
 """Seconds without a new block of an objective after which no offer is made for it."""
+
+
+Messages: TypeAlias = Sequence[tuple[str, object]]
+"""Topics with what is published on them: anything that `Job.publish` accepts."""
 
 
 class DemandTerms(TypedDict, total=False):
@@ -129,7 +136,7 @@ class TradingAgent(Lifecycle):
 
     async def order(
         self,
-        objective: str | Path,
+        objective: str | Path | Messages,
         *,
         cost: int = 0,
         model: str = "",
@@ -140,14 +147,15 @@ class TradingAgent(Lifecycle):
     ) -> Order:
         """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
 
-        `objective` is a CID, or the path of a file, which the agent then serves. The other terms are as for `offer`.
-        The factory gets the allowance that they need. A restarted agent sends the order again.
+        `objective` is a CID, the path of a file, or messages that are played one after the other, such as
+        `[("/blink", "red"), ("/stop", Empty())]`; the agent serves it. The other terms are as for `offer`. The factory
+        gets the allowance that they need. A restarted agent sends the order again.
 
         Raises `InsufficientTokens`, and `ObjectiveUnfit` if the model's description is available and excludes the
         objective.
         """
         writer = self.runtime.trader.writer
-        cid = objective if isinstance(objective, str) else await self.add(objective)
+        cid = await self._cid_of(objective)
         terms = await writer.terms(
             model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
         )
@@ -155,7 +163,7 @@ class TradingAgent(Lifecycle):
         return await self.runtime.trader.post(Demand, terms, validator_fee=validator_fee)
 
     async def demand(
-        self, objective: str | Path, *, on_progress: OnProgress = nothing, **terms: Unpack[DemandTerms]
+        self, objective: str | Path | Messages, *, on_progress: OnProgress = nothing, **terms: Unpack[DemandTerms]
     ) -> Contract:
         """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
 
@@ -200,7 +208,24 @@ class TradingAgent(Lifecycle):
         """Copy a file to the agent's store, which serves it to others; returns its CID."""
         return await asyncio.to_thread(self.parts.store.put_file, path)
 
+    async def _cid_of(self, objective: str | Path | Messages) -> str:
+        """The CID of an objective, once the agent's store has it."""
+        match objective:
+            case str():
+                return objective
+            case Path():
+                return await self.add(objective)
+        return await asyncio.to_thread(put_values, self.parts.store, objective)
+
     async def fetch(self, cid: str) -> Path:
         """The file with that CID, from the store or fetched from others and checked. Raises a `ContentError`."""
         limit, timeout = self.settings.objective_expanded_limit, self.settings.fetch_timeout
         return await self.parts.exchange.fetch(cid, size_limit=limit, timeout=timeout)
+
+
+def put_values(store: Store, values: Messages, **options: Any) -> str:
+    """Put a recording of values into a store; returns its CID. Blocks on the disk. `options` are of `pack_values`."""
+    with tempfile.TemporaryDirectory(prefix="aira-values-") as folder:
+        path = Path(folder) / "values.mcap"
+        pack_values(values, path, **options)
+        return store.put_file(path)

@@ -19,7 +19,7 @@ from mesh.recording.objective import (
     open_objective,
     rates_of,
 )
-from mesh.recording.packing import InvalidLine, PackSummary, bag_to_mcap, messages_in, pack
+from mesh.recording.packing import InvalidLine, PackSummary, bag_to_mcap, messages_in, pack, pack_values
 from mesh.recording.partial import ABOUT, CLOSED, RecordingAbout
 from mesh.recording.playback import (
     AtOnce,

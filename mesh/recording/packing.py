@@ -122,6 +122,19 @@ def pack(
     return PackSummary(messages=writer.messages, topics=len(topics), duration_ns=last - first)
 
 
+def pack_values(
+    values: Iterable[tuple[str, object]],
+    target: Path,
+    *,
+    time_ns: int = 0,
+    metadata: Mapping[str, Mapping[str, str]] | None = None,
+) -> PackSummary:
+    """Write values on topics to an MCAP file, in their order, all at one time. Raises also as `encode_value` does."""
+    encoded = ((topic_chunks(topic), encode_value(value)) for topic, value in values)
+    messages = (Played(topic, payload, time_ns, time_ns, 0, kind) for topic, (payload, kind) in encoded)
+    return pack(messages, target, metadata=metadata)
+
+
 def bag_to_mcap(
     bag: Path, target: Path, *, cid: str = "", limits: Limits = _DEFAULT, progress: Progress | None = None
 ) -> Path:

@@ -17,6 +17,7 @@ SECONDS: Final[dict[str, int]] = {
     "tests/bridges/ipfs/test_channel.py": 55,
     "tests/contracts/test_money.py": 50,
     "tests/examples/test_air_pollution.py": 45,
+    "tests/examples/test_greenhouse.py": 25,
     "tests/mesh/operations/test_unfit_at_the_start.py": 55,
     "tests/bridges/serial/test_firmware.py": 50,
     "tests/mesh/cli/test_chain_up.py": 50,

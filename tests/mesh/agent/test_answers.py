@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,10 +14,11 @@ from schemas import cid_of_bytes, verify_message
 from tests.support.market import MODEL
 from tests.support.objectives import objective
 from tests.support.orders import demand as someones_demand
-from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from mesh import Agent, Answer
+    from collections.abc import Callable
+
+    from mesh import Agent
     from tests.support.market import Place
 
 ARGUMENTS = cid_of_bytes(b"what is asked")
@@ -59,12 +59,13 @@ async def test_an_answer_that_is_too_large_is_refused_at_once(place: Place) -> N
             await robot.answer(verify_message(someones_demand()), bytes(LARGEST_READING + 1))
 
 
-async def answer_from(robot: Agent, person: Agent, *results: str, answered: asyncio.Task[Answer]) -> None:
-    """Send these results to the asker again and again, as a stranger or a legacy robot may, until it has an answer."""
-    while not answered.done():
-        for result in results:
-            robot.send(Result(liability=person.address, result=result, success=True))
-        await asyncio.sleep(0.1)
+async def answer_from(robot: Agent, person: Agent, *results: str, until: Callable[[], bool]) -> None:
+    """Send these results to the asker again and again, as a stranger or a legacy robot may."""
+    async with asyncio.timeout(30):
+        while not until():
+            for result in results:
+                robot.send(Result(liability=person.address, result=result, success=True))
+            await asyncio.sleep(0.1)
 
 
 async def test_what_is_no_answer_is_passed_over_and_a_legacy_answer_is_taken(place: Place) -> None:
@@ -73,9 +74,10 @@ async def test_what_is_no_answer_is_passed_over_and_a_legacy_answer_is_taken(pla
         unreadable = await robot.add(place.save(b"no recording"))
         legacy = await robot.add(place.save(objective(("/measurements", "0.5 1.0"))))
         asking = asyncio.create_task(person.ask())
-        await answer_from(robot, person, ARGUMENTS, unreadable, to_another_question, legacy, answered=asking)
+        wrong, counted = (ARGUMENTS, unreadable, to_another_question), person.drops.totals
+        await answer_from(robot, person, *wrong, until=lambda: "answer-unreadable" in counted())
+        await answer_from(robot, person, *wrong, legacy, until=asking.done)
         answer = await asking
-        await until(lambda: "answer-unreadable" in person.drops.totals(), what="the count")
     assert (answer.value, answer.result) == (String("0.5 1.0"), legacy)
 
 
@@ -83,7 +85,6 @@ async def test_only_the_named_agent_is_believed(place: Place) -> None:
     async with place.agent("robot") as robot, place.agent("provider") as other, place.agent("person") as person:
         cid = await other.add(place.save(objective(("/said", "by another"))))
         asking = asyncio.create_task(person.ask(agent=robot.address, timeout=2))
-        with suppress(Unanswered):
-            await answer_from(other, person, cid, answered=asking)
+        await answer_from(other, person, cid, until=asking.done)
         with pytest.raises(Unanswered):
             await asking
