@@ -17,7 +17,16 @@ from msgspec.structs import force_setattr
 from schemas.agent_keys import topic_chunks
 from schemas.errors import InputError, InvalidKey
 from schemas.unixfs import cid_of_bytes
-from schemas.value_schema import Length, Prose, Title, ValueSchema, normal_number, require_plain_text
+from schemas.value_schema import (
+    Effort,
+    Length,
+    Prose,
+    Title,
+    TooManyValues,
+    ValueSchema,
+    normal_number,
+    require_plain_text,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -87,14 +96,17 @@ class ModelTopic(_Described, frozen=True):
         except InvalidKey as error:
             raise ValueError(str(error)) from None
 
-    def fault(self, kind: PayloadType, value: Any) -> str:
-        """Why a message does not fit: one line, empty if it fits. `value` is its decoded payload."""
+    def fault(self, kind: PayloadType, value: Any, effort: Effort | None = None) -> str:
+        """Why a message does not fit: one line, empty if it fits. `value` is its decoded payload.
+
+        Raises `TooManyValues` if the `effort` is used up.
+        """
         actual = kind.zenoh_encoding
         if self.encoding and actual != self.encoding and not actual.startswith(f"{self.encoding};"):
-            return f"{self.topic} must be {self.encoding}, not {actual}"
+            return f"its encoding must be {self.encoding}, not {actual}"
         if self.value is None or (self.encoding and isinstance(value, bytes)):  # a type that nobody here decodes
             return ""
-        return self.value.fault(json_value(value), self.topic)
+        return self.value.fault(json_value(value), effort=effort)
 
 
 class ModelLimits(_Described, frozen=True):
@@ -155,12 +167,20 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
         """The description of a topic of objectives."""
         return next((topic for topic in self.objective if topic.topic == name), None)
 
-    def message_fault(self, topic: str, kind: PayloadType, value: Any) -> ModelFault | None:
-        """Why an objective must not play a message; None if it may. `value` is its decoded payload."""
+    def message_fault(
+        self, topic: str, kind: PayloadType, value: Any, effort: Effort | None = None
+    ) -> ModelFault | None:
+        """Why an objective must not play a message; None if it may. `value` is its decoded payload.
+
+        `effort` is for all messages of the objective.
+        """
         described = self.topic(topic)
         if described is None:
             return None if self.other_topics else ModelFault("unknown-topic", f"the model has no topic {topic}")
-        why = described.fault(kind, value)
+        try:
+            why = described.fault(kind, value, effort)
+        except TooManyValues as error:
+            return ModelFault("expands-too-much", str(error))
         return ModelFault("unfit-message", why) if why else None
 
     def objective_fault(self, counts: Mapping[str, int], *, duration_ns: int, size: int) -> ModelFault | None:

@@ -13,6 +13,8 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import force_setattr
 
+from schemas.errors import InputError
+
 MAX_DEPTH: Final = 8
 """How deep schemas may be nested."""
 SAFE_INTEGER: Final = 2**53 - 1
@@ -29,7 +31,7 @@ Choice: TypeAlias = Annotated[str, Meta(max_length=200)] | int
 _JSON_TYPES: Final[dict[str, tuple[type, ...]]] = {
     "null": (type(None),),
     "boolean": (bool,),
-    "integer": (int,),
+    "integer": (int, float),  # without a fraction
     "number": (int, float),
     "string": (str,),
     "array": (list, tuple),
@@ -49,6 +51,23 @@ _KEYWORDS: Final = {
     "required": ("object",),
 }
 """Which types have which keywords; those not named here are for all."""
+
+
+class TooManyValues(InputError, code="too-many-values"):
+    """A stranger's values are too many to be checked one by one."""
+
+
+class Effort:
+    """How many values of arrays and objects may be checked: a stranger's compressed file may have millions."""
+
+    def __init__(self, values: int) -> None:
+        self._left = values
+
+    def spend(self, values: int) -> None:
+        """Count values. Raises `TooManyValues`."""
+        self._left -= values
+        if self._left < 0:
+            raise TooManyValues("there are more values than are checked")
 
 
 class ValueSchema(
@@ -116,8 +135,11 @@ class ValueSchema(
         inner = [*self.properties.values(), *([self.items] if self.items is not None else [])]
         return 1 + max((schema.depth for schema in inner), default=0)
 
-    def fault(self, value: Any, name: str = "value") -> str:
-        """Why a value of JSON does not fit, in one line that calls it `name`; an empty text if it fits."""
+    def fault(self, value: Any, name: str = "value", effort: Effort | None = None) -> str:
+        """Why a value of JSON does not fit, in one line that calls it `name`; an empty text if it fits.
+
+        With an `effort`, raises `TooManyValues` when that is used up.
+        """
         if not self.type:
             return ""
         if type(value) not in _JSON_TYPES[self.type]:
@@ -126,8 +148,8 @@ class ValueSchema(
         if why:
             return f"{name} {why}"
         if self.type == "array":
-            return self._items_fault(value, name)
-        return self._properties_fault(value, name) if self.type == "object" else ""
+            return self._items_fault(value, name, effort)
+        return self._properties_fault(value, name, effort) if self.type == "object" else ""
 
     def _own_fault(self, value: Any) -> str:
         """The same for a value of the right type, without what is in it."""
@@ -147,6 +169,8 @@ class ValueSchema(
     def _number_fault(self, value: Number) -> str:
         if not _is_finite(value):
             return f"must be a finite number, not {value}"
+        if self.type == "integer" and isinstance(value, float) and not value.is_integer():
+            return f"must be an integer, not {value}"
         unit = f" {self.unit}" if self.unit else ""
         for allowed, limit, words in (
             (self.minimum is None or value >= self.minimum, self.minimum, "at least"),
@@ -158,29 +182,35 @@ class ValueSchema(
                 return f"must be {words} {limit}{unit}, not {value}{unit}"
         return ""
 
-    def _items_fault(self, values: list[Any] | tuple[Any, ...], name: str) -> str:
+    def _items_fault(self, values: list[Any] | tuple[Any, ...], name: str, effort: Effort | None) -> str:
         items = self.items
-        if items is None or not items.type or items.holds_numbers(values):
+        if items is None or not items.type or items._holds(values):
             return ""
+        if effort is not None:
+            effort.spend(len(values))
         for number, value in enumerate(values):
-            if why := items.fault(value, f"{name}[{number}]"):
+            if why := items.fault(value, f"{name}[{number}]", effort):
                 return why
         return ""
 
-    def holds_numbers(self, values: list[Any] | tuple[Any, ...]) -> bool:
+    def _holds(self, values: list[Any] | tuple[Any, ...]) -> bool:
         """Whether all values are numbers that fit; False also if that takes a look at each. For long arrays."""
-        if not values or self.enum or not set(map(type, values)) <= set(_JSON_TYPES[self.type]) <= {int, float}:
+        if self.type not in ("integer", "number") or self.enum or not values:
+            return False
+        if not set(map(type, values)) <= ({int} if self.type == "integer" else {int, float}):
             return False
         if not _is_finite(sum(values)):  # one of them is not, or the sum is too large
             return False
         return not self._number_fault(min(values)) and not self._number_fault(max(values))
 
-    def _properties_fault(self, values: dict[str, Any], name: str) -> str:
+    def _properties_fault(self, values: dict[str, Any], name: str, effort: Effort | None) -> str:
+        if effort is not None:
+            effort.spend(len(self.properties) + len(self.required))
         for required in self.required:
             if required not in values:
                 return f"{name} lacks {required}"
         for key, schema in self.properties.items():
-            if key in values and (why := schema.fault(values[key], f"{name}.{key}")):
+            if key in values and (why := schema.fault(values[key], f"{name}.{key}", effort)):
                 return why
         return ""
 
@@ -220,7 +250,8 @@ def _article(kind: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    text = "null" if value is None else "bytes" if isinstance(value, bytes) else str(value)[:80]
+    names = {type(None): "null", bytes: "bytes", dict: "an object", list: "an array", tuple: "an array"}
+    text = names.get(type(value)) or str(value)[:80]
     return text if len(text) <= 40 else text[:39] + "…"
 
 

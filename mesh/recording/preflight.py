@@ -13,6 +13,7 @@ from mesh.recording.objective import Objective, open_source
 from schemas.agent_keys import topic_chunks
 from schemas.errors import InvalidPayload
 from schemas.payloads import decode_value
+from schemas.value_schema import Effort
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 _DEFAULT: Final = Limits()
 _LONGEST_JSON: Final = 4 << 20
 """Bytes of the longest JSON message that is decoded: as objects it takes twenty times as much."""
+_MOST_VALUES: Final = 1_000_000
+"""Values in arrays and objects that are compared with a model, which takes about a second; numbers in arrays are
+compared faster, and not counted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,8 +109,9 @@ class _MessageCheck:
     def __init__(self, limits: Limits, obstacle: Obstacle | None, model: ModelDescription | None) -> None:
         self.reason = self.detail = ""
         self.counts: Counter[str] = Counter()
-        """Messages by topic, until one has failed."""
+        """Messages by topic, until one has failed; only counted for a `model`."""
         self._model = model
+        self._effort = Effort(_MOST_VALUES)
         self._most_json = limits.json
         self._obstacle = obstacle
         self._messages = 0
@@ -126,13 +131,15 @@ class _MessageCheck:
         except InvalidPayload as error:
             self._fail("unreadable-message", channel, str(error))
             return
-        fault = None if self._model is None else self._model.message_fault(channel.topic, channel.type, said)
+        fault = None
+        if self._model is not None:
+            fault = self._model.message_fault(channel.topic, channel.type, said, self._effort)
+            self.counts[channel.topic] += 1
         if fault is not None:
             self._fail(fault.reason, channel, fault.detail)
         elif self._obstacle is not None and (why := self._obstacle(channel.topic, said)):
             self._fail("unfit-message", channel, why)
         self._messages += 1
-        self.counts[channel.topic] += 1
 
     def _fail(self, reason: str, channel: RecordingChannel, why: str) -> None:
         self.reason, self.detail = reason, f"message {self._messages} on {channel.topic}: {why}"

@@ -20,7 +20,7 @@ from schemas.model import (
     parse_description,
     read_description,
 )
-from schemas.value_schema import MAX_DEPTH, SAFE_INTEGER, ValueSchema
+from schemas.value_schema import MAX_DEPTH, SAFE_INTEGER, Effort, ValueSchema
 
 SPEED = ValueSchema(type="number", title="Speed", unit="m/s", minimum=0, maximum=2, default=0.5)
 DRIVE = ModelDescription(
@@ -224,3 +224,23 @@ def test_a_file_that_says_it_is_a_description_is_one_or_is_refused() -> None:
     assert is_description(b'{"format":"aira-model/1", "title": 5}')
     assert not is_description(b"# A model of a lamp")
     assert not is_description(b'{"title": "x"}')
+
+
+@pytest.mark.parametrize(("value", "fits"), [(5, True), (5.0, True), (5.5, False), (True, False), ("5", False)])
+def test_an_integer_may_be_written_as_a_float(value: Any, fits: bool) -> None:
+    schema = ValueSchema(type="integer", minimum=1)
+    assert (schema.fault(value) == "") is fits
+    assert (ValueSchema(type="array", items=schema).fault([2, value]) == "") is fits
+
+
+def test_only_so_many_values_are_checked() -> None:
+    inner = ValueSchema(type="object", properties={"a": ValueSchema(type="number")})
+    topic = ModelTopic(topic="/a", value=ValueSchema(type="array", items=inner))
+    model, value = ModelDescription(title="x", objective=(topic,)), [{"a": 1}] * 100
+    effort = Effort(250)
+    assert model.message_fault("/a", JSON, value, effort) is None
+    fault = model.message_fault("/a", JSON, value, effort)
+    assert fault is not None
+    assert fault.reason == "expands-too-much"
+    numbers = ModelTopic(topic="/a", value=ValueSchema(type="array", items=ValueSchema(type="number")))
+    assert numbers.fault(JSON, [1.5] * 1000, Effort(0)) == ""
