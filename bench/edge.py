@@ -124,7 +124,6 @@ def round_trips(protocol: str, baud: int, elf: Path, calls: int) -> dict[str, fl
         line = SerialLine(
             PortName(str(board.port)),
             dialect,
-            baud=baud,
             on_event=lambda event: arrived.put((event, time.perf_counter())),
         )
         thread = threading.Thread(target=line.run, name="line")

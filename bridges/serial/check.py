@@ -8,9 +8,10 @@ import pwd
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from bridges.serial.dialect import BoardReady, dialect_names, load_dialect
+from bridges.serial.detection import AUTO, BAUDS, make_dialect
+from bridges.serial.dialect import BoardReady
 from bridges.serial.errors import LineError, PortBusy, PortForbidden
 from bridges.serial.line import PortName, SerialLine, SerialPort
 from mesh.doctor.checks import Check, CheckResult, failed, in_thread, passed
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.doctor.context import DoctorContext, SerialSettings
-
-ANSWER_TIMEOUT: Final = 5.0
-"""Seconds within which a board must answer. Opening the port resets it, which takes almost two."""
 
 
 def checks(context: DoctorContext) -> list[Check]:
@@ -40,40 +38,42 @@ def check_port(settings: SerialSettings) -> CheckResult:
         )
     path = PortName(settings.port).find()
     try:
-        SerialPort(path, baud=settings.baud).close()
+        SerialPort(path, baud=settings.baud or BAUDS[0]).close()
     except LineError as error:
         return _unusable(path, error)
     return passed(
-        f"{path} opens at {settings.baud:,} baud"
+        f"{path} opens"
+        + (f" at {settings.baud:,} baud" if settings.baud else "")
         + (f", found as {settings.port}" if settings.port != str(path) else "")
     )
 
 
-def check_board(settings: SerialSettings, *, timeout: float = ANSWER_TIMEOUT) -> CheckResult:
-    """Whether a board answers in the protocol. Opening the port resets most boards."""
-    dialect = load_dialect(settings.protocol)(baud=settings.baud)
+def check_board(settings: SerialSettings, *, timeout: float | None = None) -> CheckResult:
+    """Whether a board answers in `timeout` seconds; as many as the search takes. Opening the port resets most."""
+    dialect = make_dialect(settings.protocol, settings.baud)
     ready = threading.Event()
     line = SerialLine(
         PortName(settings.port),
         dialect,
-        baud=settings.baud,
         on_event=lambda event: ready.set() if isinstance(event, BoardReady) else None,
     )
     thread = threading.Thread(target=line.run, name="line of the doctor", daemon=True)
     began = time.monotonic()
     thread.start()
-    answered = ready.wait(timeout)
+    answered = ready.wait(dialect.silence if timeout is None else timeout)
     line.stop()
-    thread.join(timeout)
+    thread.join()
     if answered and (info := dialect.info) is not None:
         name = " ".join(filter(None, (info.name, info.version))) or "a sketch"
         took = time.monotonic() - began
-        return passed(f"{name} answered in {settings.protocol} after {took:.1f} s, with {len(info.topics)} topics")
-    others = " or ".join(f"--protocol {name}" for name in dialect_names() if name != settings.protocol)
+        speaks = f"{dialect.protocol} at {dialect.baud} baud"
+        return passed(f"{name} answered in {speaks} after {took:.1f} s, with {len(info.topics)} topics")
+    protocol = "a known protocol" if settings.protocol == AUTO else settings.protocol
+    speed = f"{settings.baud:,} baud" if settings.baud else "a usual baud rate"
     return failed(
-        f"no board answers in {settings.protocol} at {settings.baud:,} baud",
+        f"no board answers in {protocol} at {speed}",
         code="board-silent",
-        hint=f"check that the firmware is loaded, --baud, and the protocol: {others}",
+        hint="check that the firmware is loaded; without --protocol and --baud both are searched for",
     )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from bridges.serial.detection import AUTO
 from bridges.serial.dialect import dialect_names
 from mesh.cli.options import with_settings
 from mesh.errors import AiraError, InputError
@@ -27,6 +28,17 @@ def _renaming(context: click.Context, option: click.Parameter, given: tuple[str,
         if not topic.startswith("/") or not name.startswith("/"):
             raise click.BadParameter(f"{text!r} is not /TOPIC=/NAME")
     return pairs
+
+
+class BaudRate(click.IntRange):
+    """Bits per second; 0, which users write as `auto`, is for those that have to be found."""
+
+    def __init__(self) -> None:
+        super().__init__(300, 4_000_000)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """The number that a text states."""
+        return 0 if value in (0, AUTO) else int(super().convert(value, param, ctx))
 
 
 class TopicNames:
@@ -88,12 +100,13 @@ def _number(text: str) -> int | float | str:
 @click.option("--name", default="board", show_default=True, help="name of the device in the agent's keys")
 @click.option(
     "--protocol",
-    type=click.Choice(dialect_names()),
-    default="frames",
+    type=click.Choice([AUTO, *dialect_names()]),
+    default=AUTO,
     show_default=True,
-    help="protocol of the firmware: frames (this project's), rosserial (version 2), or an installed one",
+    help="protocol of the firmware: frames (this project's), rosserial (version 2), or an installed one; auto finds "
+    "one of the first two",
 )
-@click.option("--baud", type=click.IntRange(300, 4_000_000), default=57_600, show_default=True, help="bits per second")
+@click.option("--baud", type=BaudRate(), default=AUTO, show_default=True, help="bits per second; auto finds them")
 @click.option(
     "--patience",
     type=click.FloatRange(0, 3600),
@@ -130,6 +143,9 @@ def command(
     renamed: tuple[tuple[str, str], ...],
 ) -> None:
     """Connect the device at PORT to its agent. Ctrl-C stops it.
+
+    Protocol and baud rate are found by trying, which takes a few seconds: the board gets questions in several protocols
+    and at several speeds. If it has firmware of another kind, state both.
 
     PORT is a path (/dev/ttyACM0, or a stable one under /dev/serial/by-id) or a USB id (usb:2341:0043, with a serial
     number appended if there are several such devices). If the port is missing or unplugged, the command waits for it.

@@ -158,11 +158,18 @@ class Dialect(ABC):
 
     info: DeviceInfo | None = None
     """What the board has reported about itself; None while it is not ready."""
+    protocol: str = ""
+    """The name under which the dialect is installed."""
+    silence: float = 5.0
+    """Seconds on an open port without an answer of a board, after which a warning is logged."""
 
     def __init__(self, *, baud: int, parameters: Mapping[str, object] | None = None) -> None:
         """`baud` is the speed of the line in bits per second, `parameters` are values that firmware may request."""
+        self.baud = baud
+        """The speed that the line has to have now, in bits per second."""
+        self.attempt = f"at {baud} baud: do --baud and --protocol match the firmware?"
+        """What to report if no board answers: how it was asked."""
         self.counters = LineCounters()
-        self._baud = baud
         self._parameters = dict(parameters or {})
         self._queue: list[Command] = []
         self._events: list[LineEvent] = []

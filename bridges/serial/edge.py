@@ -110,7 +110,6 @@ class Edge:
         *,
         agent: str,
         name: str,
-        baud: int,
         patience: float = PATIENCE,
         rename: Callable[[str], str] = str,
     ) -> None:
@@ -120,7 +119,7 @@ class Edge:
         self._rename = rename
         self._patience = patience
         self._jobs = JobTracker()
-        self._line = SerialLine(port, dialect, baud=baud, on_event=self._on_event)
+        self._line = SerialLine(port, dialect, on_event=self._on_event)
         self.counters = EdgeCounters(self._line)
         self._calls = PendingCalls(self.counters)
         self._declared: dict[str, list[Any]] = {}

@@ -282,7 +282,7 @@ class FramesDialect(Dialect):
     def _send(self, frame: Frame, now: float, command: Command | None = None) -> Request:
         """Send a request, in place of the one that is pending."""
         data = encode_frame(frame)
-        delay = (len(data) + ANSWER_BYTES) * 10 / self._baud + ANSWER_TIME
+        delay = (len(data) + ANSWER_BYTES) * 10 / self.baud + ANSWER_TIME
         self._pending = Request(frame, now + delay, delay, command)
         self._out += data
         self.counters.sent += 1

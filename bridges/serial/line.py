@@ -32,8 +32,6 @@ log = logging.getLogger(__name__)
 
 USB: Final = re.compile(r"usb:(?P<vendor>[0-9a-fA-F]{4}):(?P<product>[0-9a-fA-F]{4})(?::(?P<serial>.+))?")
 READ_SIZE: Final = 4096
-SILENCE: Final = 5.0
-"""Seconds on an open port without an answer of a board, after which a warning is logged."""
 PORT_POLL: Final = 0.25
 """Seconds between two attempts to find a port that is not plugged in."""
 
@@ -75,6 +73,7 @@ class SerialPort:
 
     def __init__(self, path: Path, *, baud: int) -> None:
         self.path = path
+        self.baud = baud
         try:
             self._serial = serial.Serial(str(path), baud, timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # pyserial's errors are OSErrors
@@ -107,6 +106,12 @@ class SerialPort:
         except OSError as error:
             raise LineError(f"{self.path} is unplugged: {error.strerror}") from None
 
+    def set_baud(self, baud: int) -> None:
+        """Change the speed. At one that the port does not have, nobody will answer."""
+        self.baud = baud
+        with contextlib.suppress(OSError, ValueError, termios.error):
+            self._serial.baudrate = baud
+
     def close(self) -> None:
         """Close the port."""
         with contextlib.suppress(OSError):  # a port that was unplugged can't be closed properly
@@ -125,13 +130,11 @@ class SerialLine:
         name: PortName,
         dialect: Dialect,
         *,
-        baud: int,
         on_event: Callable[[LineEvent], None],
         poll: float = PORT_POLL,
     ) -> None:
         self.name = name
         self.dialect = dialect
-        self._baud = baud
         self._on_event = on_event
         self._poll = poll
         self._tasks: SimpleQueue[Callable[[], object]] = SimpleQueue()
@@ -187,6 +190,9 @@ class SerialLine:
         now = time.monotonic()
         if self._port is None and self._next_attempt <= now:
             self._open_port(now)
+        if self._port is not None and self._port.baud != self.dialect.baud:
+            self._unsent.clear()
+            self._port.set_baud(self.dialect.baud)
         self._unsent += self.dialect.outgoing()
         if self._port is not None and self._unsent:
             del self._unsent[: self._port.write(bytes(self._unsent))]
@@ -229,17 +235,17 @@ class SerialLine:
         if self.dialect.info is None:
             seen = f"{self._bytes_received} bytes arrived that can't be decoded" if self._bytes_received else "no bytes"
             log.warning(
-                "no board answers on %s at %d baud (%s): do --baud and --protocol match the firmware?",
+                "no board answers on %s (%s) %s",
                 self.name,
-                self._baud,
                 seen,
-                extra=log_event("board-silent", port=self.name, baud=self._baud, bytes=self._bytes_received),
+                self.dialect.attempt,
+                extra=log_event("board-silent", port=self.name, baud=self.dialect.baud, bytes=self._bytes_received),
             )
 
     def _open_port(self, now: float) -> None:
         self._next_attempt = now + self._poll
         try:
-            self._port = SerialPort(self.name.find(), baud=self._baud)
+            self._port = SerialPort(self.name.find(), baud=self.dialect.baud)
         except LineError as error:
             if str(error) != self._last_error:
                 self._last_error = str(error)
@@ -251,9 +257,9 @@ class SerialLine:
         self._last_error = ""
         self.openings += 1
         self._unsent.clear()
-        opened = log_event("port-opened", port=self.name, baud=self._baud)
-        log.info("%s is open at %d baud", self.name, self._baud, extra=opened)
-        self._silence_ends, self._bytes_received = time.monotonic() + SILENCE, 0
+        opened = log_event("port-opened", port=self.name, baud=self.dialect.baud)
+        log.info("%s is open at %d baud", self.name, self.dialect.baud, extra=opened)
+        self._silence_ends, self._bytes_received = time.monotonic() + self.dialect.silence, 0
         self.dialect.opened(time.monotonic())
 
     def _close_port(self, error: LineError) -> None:

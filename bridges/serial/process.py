@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from bridges.serial.calls import LOG
-from bridges.serial.dialect import load_dialect
+from bridges.serial.detection import AUTO, make_dialect
 from bridges.serial.edge import Edge
 from bridges.serial.line import PortName
 from mesh.cli.output import announce
@@ -43,8 +43,8 @@ log = logging.getLogger(__name__)
 class EdgeOptions:
     """A board: its agent's address and its name in the mesh, how it is reached, and the protocol that it speaks.
 
-    `baud` is in bits per second, `patience` in seconds; `parameters` are values that firmware may request; `rename`
-    returns the name in the mesh of a topic of the board.
+    `baud` is in bits per second, 0 if it has to be found, as is the `protocol` "auto"; `patience` is in seconds;
+    `parameters` are values that firmware may request; `rename` returns the name in the mesh of a topic of the board.
     """
 
     agent: str
@@ -88,7 +88,7 @@ def run_edge(options: EdgeOptions, *, endpoints: Endpoints, metrics: EdgeMetrics
     device.
     """
     agent, name, port = options.agent, options.name, PortName(options.port)
-    dialect = load_dialect(options.protocol)(baud=options.baud, parameters=options.parameters)
+    dialect = make_dialect(options.protocol, options.baud, options.parameters)
     log_key = str(DeviceTopicKey(agent, name, LOG))
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
     with SessionOpening(endpoints).run() as session:
@@ -98,13 +98,14 @@ def run_edge(options: EdgeOptions, *, endpoints: Endpoints, metrics: EdgeMetrics
             dialect,
             agent=agent,
             name=name,
-            baud=options.baud,
             patience=options.patience,
             rename=options.rename,
         )
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: edge.stop())
-        words = f"edge of {agent}: {name} on {port}, {options.protocol}, Zenoh id {session.zid()}"
+        protocol = "any protocol" if options.protocol == AUTO else options.protocol
+        speed = f"{options.baud} baud" if options.baud else "any baud rate"
+        words = f"edge of {agent}: {name} on {port}, {protocol} at {speed}, Zenoh id {session.zid()}"
         if metrics is not None:
             metrics.attach(edge.counters, session)
         set_process_source(LogSource("edge", parse_address(agent)))

@@ -41,6 +41,8 @@ ASK_INTERVAL: Final = 0.5
 """Seconds between two requests for the topics while a board starts."""
 SETTLE_TIME: Final = 0.1
 """Seconds without another announcement after which a board has announced all."""
+ANNOUNCEMENT: Final = 300
+"""Bytes for whose time on the line a board may be silent between two announcements, if that takes longer."""
 QUIET: Final = 3.0
 """Seconds of silence after which the topics are requested again: a board asks for the time every 2.5."""
 LOST: Final = 10.0
@@ -80,7 +82,8 @@ class RosserialDialect(Dialect):
     ) -> None:
         super().__init__(baud=baud, parameters=parameters)
         self._clock = clock
-        self._settle_time = settle_time
+        self._ready_time = max(SETTLE_TIME, ANNOUNCEMENT * 10 / baud)
+        self._settle_time = max(settle_time, self._ready_time)
         self._decoder = RosserialDecoder(self.counters)
         self._topics = TopicTable(rosserial.longest_frame(baud))
         self._last_announced: tuple[int, int] | None = None
@@ -180,7 +183,7 @@ class RosserialDialect(Dialect):
             self._settled_at, self._answers_expected = now + self._settle_time, self._active.requests
             self._finish(CallStatus.READ, "", "", now)
         if self.info is None or self._settled_at is not None:
-            self._settled_at = now + (SETTLE_TIME if self.info is None else self._settle_time)
+            self._settled_at = now + (self._ready_time if self.info is None else self._settle_time)
             self._answers_expected -= (kind, info.id) == self._last_announced
             if self.info is not None and self._answers_expected <= 0:
                 self._settle(now)

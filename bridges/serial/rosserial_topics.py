@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from hashlib import md5
 from typing import TYPE_CHECKING, Final
 
 from bridges.serial import rosserial
@@ -17,7 +16,7 @@ from bridges.serial.errors import InvalidBoardMessage
 from mesh.log_context import log_event
 from schemas.agent_keys import topic_chunks
 from schemas.errors import InvalidKey, InvalidPayload
-from schemas.payloads import EMPTY, STRING, Empty, PayloadType, String
+from schemas.payloads import EMPTY, STRING, PayloadType
 
 if TYPE_CHECKING:
     from bridges.serial.dialect import Command
@@ -58,8 +57,14 @@ class RosType:
     """A type whose definition is known. `size` is the size of every payload in bytes, None if it varies."""
 
     payload: PayloadType
-    md5: str
     size: int | None
+
+    @property
+    def md5(self) -> str:
+        """The digest with which boards announce it."""
+        from hashlib import md5  # OpenSSL, which an edge agent needs for nothing else
+
+        return md5(self.payload.schema_data.strip(), usedforsecurity=False).hexdigest()
 
     def check(self, payload: bytes) -> None:
         """Raise `InvalidPayload` if these bytes are not of this type."""
@@ -74,14 +79,14 @@ def _primitive(name: str, size: int) -> RosType:
     definition = f"{name} data"
     type_name = f"std_msgs/{_NAMES.get(name, name.capitalize())}"
     kind = PayloadType("ros1", type_name, "ros1msg", f"{definition}\n".encode())
-    return RosType(kind, md5(definition.encode(), usedforsecurity=False).hexdigest(), size)
+    return RosType(kind, size)
 
 
 _KNOWN: Final = {
     known.payload.schema_name: known
     for known in (
-        RosType(EMPTY, Empty.md5, 0),
-        RosType(STRING, String.md5, None),
+        RosType(EMPTY, 0),
+        RosType(STRING, None),
         *(_primitive(name, size) for name, size in _SIZES.items()),
     )
 }

@@ -40,12 +40,15 @@ MARK: Final = 6
 @click.option("--port", default="", help="for an edge agent: the serial port, as in `aira edge PORT`")
 @click.option(
     "--protocol",
-    type=click.Choice(["frames", "rosserial"]),
-    default="frames",
-    help="for an edge agent: the protocol of the board",
+    type=click.Choice(["auto", "frames", "rosserial"]),
+    default="auto",
+    help="for an edge agent: the protocol of the board; it is found by default",
 )
 @click.option(
-    "--baud", type=click.IntRange(300, 4_000_000), default=57_600, help="for an edge agent: bits per second of the port"
+    "--baud",
+    type=click.IntRange(300, 4_000_000),
+    default=None,
+    help="for an edge agent: bits per second of the port; they are found by default",
 )
 @click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
 @click.option("--device", default="", help="for an edge agent: name of that device")
@@ -90,7 +93,7 @@ def _context_of(settings: Settings, role: Role | None, **options: Any) -> Doctor
             requested_role=role,
             agent=agent,
             device=device,
-            serial=SerialSettings(port=options["port"], protocol=options["protocol"], baud=options["baud"]),
+            serial=SerialSettings(port=options["port"], protocol=options["protocol"], baud=options["baud"] or 0),
             chain_id=options["chain_id"] or 0,
         )
     )

@@ -33,11 +33,11 @@ AREAS: Final[Mapping[Role, frozenset[Area]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class SerialSettings:
-    """The serial port of an edge agent, the protocol of its board, and bits per second."""
+    """The serial port of an edge agent, the protocol of its board (or `auto`), and bits per second (0: to be found)."""
 
     port: str = ""
-    protocol: Literal["frames", "rosserial"] = "frames"
-    baud: int = 57_600
+    protocol: Literal["auto", "frames", "rosserial"] = "auto"
+    baud: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)

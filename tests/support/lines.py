@@ -21,13 +21,13 @@ H = TypeVar("H")
 
 
 class LineClient:
-    """`with LineClient(board, dialect, baud=57600) as client`: opened, and the board is ready."""
+    """`with LineClient(board, dialect) as client`: opened, and the board is ready."""
 
-    def __init__(self, board: SimulatedBoard, dialect: Dialect, *, baud: int) -> None:
+    def __init__(self, board: SimulatedBoard, dialect: Dialect) -> None:
         self.dialect = dialect
         self.events: list[LineEvent] = []
         self._arrived: queue.SimpleQueue[LineEvent] = queue.SimpleQueue()
-        self.line = SerialLine(PortName(str(board.port)), dialect, baud=baud, on_event=self._arrived.put)
+        self.line = SerialLine(PortName(str(board.port)), dialect, on_event=self._arrived.put)
         self._thread = threading.Thread(target=self.line.run, name="line", daemon=True)
 
     def __enter__(self) -> Self:

@@ -35,11 +35,11 @@ FLASH, RAM = 3000, 500
 
 
 def frames(uno: SimulatedBoard) -> LineClient:
-    return LineClient(uno, FramesDialect(baud=BAUD, session=1234), baud=BAUD)
+    return LineClient(uno, FramesDialect(baud=BAUD, session=1234))
 
 
 def rosserial(uno: SimulatedBoard) -> LineClient:
-    return LineClient(uno, RosserialDialect(baud=BAUD, parameters={"loud": 7}), baud=BAUD)
+    return LineClient(uno, RosserialDialect(baud=BAUD, parameters={"loud": 7}))
 
 
 def test_an_echo_uses_little_of_an_uno() -> None:
@@ -138,7 +138,7 @@ def flashes(uno: SimulatedBoard) -> list[bool]:
 def test_rosserial_commands_are_queued_and_all_of_them_run() -> None:
     # On a busy machine the board runs slower than its line: allow it more time to announce its topics.
     patient = RosserialDialect(baud=BAUD, settle_time=3.0)
-    with board(ROSSERIAL_ECHO) as uno, LineClient(uno, patient, baud=BAUD) as client:
+    with board(ROSSERIAL_ECHO) as uno, LineClient(uno, patient) as client:
         for _ in range(12):
             client.submit("/work")
         assert [client.next(CommandFinished).status for _ in range(12)] == [CallStatus.READ] * 12

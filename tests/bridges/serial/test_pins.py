@@ -27,7 +27,7 @@ LAMP, BUTTON = 9, 2
 
 @contextmanager
 def dimmer() -> Iterator[tuple[SimulatedBoard, LineClient]]:
-    with board(DIMMER) as uno, LineClient(uno, FramesDialect(baud=57_600), baud=57_600) as client:
+    with board(DIMMER) as uno, LineClient(uno, FramesDialect(baud=57_600)) as client:
         yield uno, client
 
 

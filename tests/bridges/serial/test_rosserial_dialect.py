@@ -118,6 +118,19 @@ def test_a_board_is_ready_when_it_has_announced_its_topics() -> None:
     ]
 
 
+def test_a_slow_line_has_time_for_each_announcement() -> None:
+    bench = Bench(baud=9_600)
+    bench.dialect.opened(bench.now)
+    for topic in TOPICS:
+        assert bench.dialect.events() == []
+        bench.announce(topic)
+        bench.after(0.12)  # which an announcement of 115 bytes takes
+    bench.after(1.0)
+    [happening] = bench.dialect.events()
+    assert isinstance(happening, BoardReady)
+    assert len(happening.info.topics) == len(TOPICS)
+
+
 def test_a_request_for_the_time_is_answered_at_once() -> None:
     bench = ready()
     bench.receive(TIME)

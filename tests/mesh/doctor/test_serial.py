@@ -97,7 +97,7 @@ def test_a_port_without_an_answering_board_fails(silent: str) -> None:
     result = check.check_board(SerialSettings(port=silent), timeout=0.5)
 
     assert (result.ok, result.code) == (False, "board-silent")
-    assert "--protocol rosserial" in result.hint
+    assert "--protocol" in result.hint
 
 
 def test_an_answering_board_is_reported_with_its_protocol() -> None:
@@ -105,14 +105,16 @@ def test_an_answering_board_is_reported_with_its_protocol() -> None:
         result = check.check_board(SerialSettings(port=str(there.port)))
 
     assert result.ok, result
-    assert "answered in frames" in result.message
+    assert "answered in frames at 57600 baud" in result.message
 
 
 def test_a_rosserial_board_answers_in_rosserial_only() -> None:
     with board(ROSSERIAL_ECHO) as there:
         as_rosserial = check.check_board(SerialSettings(port=str(there.port), protocol="rosserial"))
-        as_frames = check.check_board(SerialSettings(port=str(there.port)))
+        as_frames = check.check_board(SerialSettings(port=str(there.port), protocol="frames", baud=57_600))
+        as_found = check.check_board(SerialSettings(port=str(there.port)))
 
     assert as_rosserial.ok, as_rosserial
     assert "answered in rosserial" in as_rosserial.message
+    assert "answered in rosserial at 57600 baud" in as_found.message
     assert not as_frames.ok
