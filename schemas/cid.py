@@ -48,6 +48,15 @@ def parse_cid(text: str) -> bytes:
     return multihash
 
 
+def is_cid(text: str) -> bool:
+    """Whether a text is a CIDv0."""
+    try:
+        parse_cid(text)
+    except InvalidCid:
+        return False
+    return True
+
+
 def format_cid(multihash: bytes) -> str:
     """The CIDv0 of a 34-byte sha2-256 multihash. Raises `InvalidCid` for any other multihash."""
     if multihash[:2] != MULTIHASH_PREFIX or len(multihash) != _MULTIHASH_SIZE:

@@ -84,7 +84,18 @@ def encode(message: Message) -> bytes:
     return _ENCODER.encode(message)
 
 
-def message_hash(message: Message) -> bytes:
+class MessageHash(bytes):
+    """The 32 bytes of a message's hash, which print as hexadecimal digits."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        return self.hex()
+
+    __repr__ = __str__
+
+
+def message_hash(message: Message) -> MessageHash:
     """The 32-byte hash that names a message and that its signature covers: keccak256 of the packed fields.
 
     Raises `InvalidMessage`: `unresolved-name` if an address is still an ENS name, `unsigned` for the feedback messages,
@@ -94,7 +105,7 @@ def message_hash(message: Message) -> bytes:
     if pack is None:
         raise InvalidMessage("unsigned", f"what is signed in a {type(message).__name__} is not defined")
     try:
-        return keccak256(pack(message))
+        return MessageHash(keccak256(pack(message)))
     except InvalidAddress as error:
         raise _unresolved(error) from None
 

@@ -29,7 +29,7 @@ REASON_TIMEOUT: Final = 10.0
 """Seconds without a new block after which the recording of a failed job is given up, and with it the reason."""
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class Outcome(msgspec.Struct, frozen=True, kw_only=True, repr_omit_defaults=True):
     """How a contract ended: `success` means that the promisor was paid; `result` is the recording's CID, or empty.
 
     If it failed, `reason` says why in a line of text and `code` for programs. They come from the promisor's recording,
@@ -51,6 +51,15 @@ class Contract:
         self._ended = ended
         self._parts = parts
         self._failure: Reason | None = None
+
+    def __repr__(self) -> str:
+        liability, ended = self.liability, self._ended
+        state = "open"
+        if ended.done():
+            failed = ended.cancelled() or ended.exception() is not None
+            state = "reverted" if failed else "paid" if ended.result().success else "refunded"
+        parties = f"promisee={liability.promisee}, promisor={liability.promisor}"
+        return f"Contract({self.address}, {state}, cost={liability.cost}, {parties})"
 
     @property
     def address(self) -> str:

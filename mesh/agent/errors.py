@@ -71,3 +71,12 @@ class ServiceClosed(AiraError, code="service-closed"):
 
 
 __all__ = ["Declined", "LiabilityReverted", "OrderClosed", "OrderExpired", "ServiceClosed"]
+
+
+class NotAnObjective(InputError, code="not-an-objective"):
+    """What is demanded is neither a CID nor an existing file."""
+
+    def __init__(self, text: str) -> None:
+        hint = "name an MCAP file or a ROS 1 bag that exists, or a CID of 46 characters (Qm…)"
+        super().__init__(f"{text!r} is neither a CID nor a file", hint=hint)
+        self.text = text

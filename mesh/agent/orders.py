@@ -242,13 +242,15 @@ class TermsWriter:
         self._chain_head = parts.chain_head
 
     async def terms(
-        self, *, model: str, objective: str, cost: int, token: str, validator: str, lifetime: int | None
+        self, *, model: str, objective: str, cost: int | str, token: str, validator: str, lifetime: int | None
     ) -> Terms:
         """The fields that a demand and an offer share, with names resolved, valid for `lifetime` blocks.
 
-        By default they are valid for about `LIFETIME` seconds.
+        By default they are valid for about `LIFETIME` seconds. Raises `InvalidAmount`, `NotAToken`.
         """
         settings, names = self._settings, self._chain.names
+        if not isinstance(cost, int):
+            cost = (await self._chain.tokens.unit(token or settings.erc20_token)).amount(cost)
         blocks = await default_lifetime(self._chain) if lifetime is None else lifetime
         return {
             "model": await names.model(model),

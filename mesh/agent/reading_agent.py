@@ -89,7 +89,7 @@ class ReadingAgent(TradingAgent):
 
         Raises `Unanswered` after `timeout` seconds. A robot may make a contract of a question, one that costs nothing.
         """
-        cid = await self._cid_of(objective)
+        cid = await self._cid_of(objective) if objective else ""
         writer = self.runtime.trader.writer
         by = parse_address(agent) if agent else ""
         try:

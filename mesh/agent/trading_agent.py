@@ -10,14 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypedDict, Unpack
 
 from mesh.agent.demands import current_buyer
-from mesh.agent.errors import OrderClosed
+from mesh.agent.errors import NotAnObjective, OrderClosed
 from mesh.agent.orders import Order, OrderState
 from mesh.agent.progress import nothing
+from mesh.amounts import XRT
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.recording import pack_values
 from mesh.role import Lifecycle
 from mesh.settings import load
 from schemas import Demand, Offer, Result, Verified
+from schemas.cid import is_cid
 
 if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
@@ -40,11 +42,11 @@ Messages: TypeAlias = Sequence[tuple[str, object]]
 class DemandTerms(TypedDict, total=False):
     """The optional arguments of `Agent.order` and `Agent.demand`."""
 
-    cost: int
+    cost: int | str
     model: str
     token: str
     validator: str
-    validator_fee: int
+    validator_fee: int | str
     lifetime: int | None
 
 
@@ -101,19 +103,21 @@ class TradingAgent(Lifecycle):
         demand: Verified[Demand] | Demand | None = None,
         *,
         objective: str = "",
-        cost: int = 0,
+        cost: int | str = 0,
         token: str = "",
         validator: str = "",
-        lighthouse_fee: int = 0,
+        lighthouse_fee: int | str = 0,
         lifetime: int | None = None,
     ) -> str:
         """Offer to do a job; returns the order's hash (hex). The offer is resent until it is matched or expires.
 
         With a `demand` the offer agrees to its terms, once its objective was examined; else `objective` (CID), `cost`
-        (the token's smallest unit), `token` and `validator` (names or addresses) are the terms, valid for `lifetime`
-        blocks, by default about ten minutes. `lighthouse_fee` is in wn, and paid to the provider.
+        (`"5 XRT"`, or a number of the token's smallest unit), `token` and `validator` (names or addresses) are the
+        terms, valid for `lifetime` blocks, by default about ten minutes. `lighthouse_fee` (`"0.1 XRT"`, or wn) is paid
+        to the provider.
 
-        Raises `InsufficientTokens`, and for an objective that can't be played `ObjectiveUnfit` or a `ContentError`.
+        Raises `InsufficientTokens`, `InvalidAmount`, and for an objective that can't be played `ObjectiveUnfit` or a
+        `ContentError`.
         """
         trader = self.runtime.trader
         if demand is not None:
@@ -124,7 +128,7 @@ class TradingAgent(Lifecycle):
             terms = await trader.writer.terms(
                 model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
             )
-        return (await trader.post(Offer, terms, lighthouse_fee=lighthouse_fee)).hash
+        return (await trader.post(Offer, terms, lighthouse_fee=XRT.amount(lighthouse_fee))).hash
 
     async def examine(self, cid: str) -> Objective:
         """The objective with that CID, fetched if needed, after it was checked as before a job.
@@ -138,21 +142,22 @@ class TradingAgent(Lifecycle):
         self,
         objective: str | Path | Messages,
         *,
-        cost: int = 0,
+        cost: int | str = 0,
         model: str = "",
         token: str = "",
         validator: str = "",
-        validator_fee: int = 0,
+        validator_fee: int | str = 0,
         lifetime: int | None = None,
     ) -> Order:
         """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
 
-        `objective` is a CID, the path of a file, or messages that are played one after the other, such as
-        `[("/blink", "red"), ("/stop", Empty())]`; the agent serves it. The other terms are as for `offer`. The factory
-        gets the allowance that they need. A restarted agent sends the order again.
+        `objective` is a CID, the path of a file (also as text), or messages that are played one after the other, such
+        as `[("/blink", "red"), ("/stop", Empty())]`; the agent serves it. The other terms are as for `offer`;
+        `validator_fee` is `"0.1 XRT"`, or wn. The factory gets the allowance that they need. A restarted agent sends
+        the order again.
 
-        Raises `InsufficientTokens`, and `ObjectiveUnfit` if the model's description is available and excludes the
-        objective.
+        Raises `NotAnObjective`, `InvalidAmount`, `InsufficientTokens`, and `ObjectiveUnfit` if the model's description
+        is available and excludes the objective.
         """
         writer = self.runtime.trader.writer
         cid = await self._cid_of(objective)
@@ -160,7 +165,7 @@ class TradingAgent(Lifecycle):
             model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
         )
         await self.runtime.require_fit(cid, terms["model"])
-        return await self.runtime.trader.post(Demand, terms, validator_fee=validator_fee)
+        return await self.runtime.trader.post(Demand, terms, validator_fee=XRT.amount(validator_fee))
 
     async def demand(
         self, objective: str | Path | Messages, *, on_progress: OnProgress = nothing, **terms: Unpack[DemandTerms]
@@ -204,18 +209,19 @@ class TradingAgent(Lifecycle):
             self.parts.chain.validators.check_known(message)
         return self.channel.publish(self.parts.signer.sign(message))
 
-    async def add(self, path: Path) -> str:
+    async def add(self, path: str | Path) -> str:
         """Copy a file to the agent's store, which serves it to others; returns its CID."""
-        return await asyncio.to_thread(self.parts.store.put_file, path)
+        return await asyncio.to_thread(self.parts.store.put_file, Path(path))
 
     async def _cid_of(self, objective: str | Path | Messages) -> str:
-        """The CID of an objective, once the agent's store has it."""
-        match objective:
-            case str():
-                return objective
-            case Path():
-                return await self.add(objective)
-        return await asyncio.to_thread(put_values, self.parts.store, objective)
+        """The CID of an objective, once the agent's store has it. Raises `NotAnObjective`."""
+        if not isinstance(objective, str | Path):
+            return await asyncio.to_thread(put_values, self.parts.store, objective)
+        if isinstance(objective, str) and is_cid(objective):
+            return objective
+        if not await asyncio.to_thread(Path(objective).is_file):
+            raise NotAnObjective(str(objective))
+        return await self.add(objective)
 
     async def fetch(self, cid: str) -> Path:
         """The file with that CID, from the store or fetched from others and checked. Raises a `ContentError`."""

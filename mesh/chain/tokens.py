@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from mesh.amounts import XRT, Unit
 from mesh.chain.abi import decode
 from mesh.chain.errors import NoContracts, Reverted
+from mesh.errors import ChainError
 
 if TYPE_CHECKING:
     from mesh.chain.abi import ContractCall, ContractFunctions
@@ -16,6 +18,10 @@ LONGEST_LABEL: Final = 64
 """Characters of a token's name or symbol that are shown; anybody can deploy a token with any name."""
 
 MAX_DECIMALS: Final = 255
+
+
+class NotAToken(ChainError, code="not-a-token"):
+    """An address or name is not an ERC-20 token."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +64,18 @@ class Tokens:
             decimals=_decimals(await self._ask(functions.decimals())),
             total_supply=total_supply,
         )
+
+    async def unit(self, token: str | None = None) -> Unit:
+        """The unit that a token is counted in (an address or ENS name; XRT by default). Raises `NotAToken`."""
+        try:
+            info = await self.info(token)
+        except (NoContracts, Reverted):
+            if token is None:
+                raise
+            raise NotAToken(f"{token} is not a token", hint="name an ERC-20 by its address or ENS name") from None
+        if info.address == self._contracts.xrt:
+            return Unit(info.symbol or XRT.symbol, info.decimals, XRT.smallest)
+        return Unit(info.symbol or "tokens", info.decimals)
 
     async def balance(self, address: str | None = None, *, token: str | None = None) -> int:
         """Units of a token (XRT by default) that an account holds."""

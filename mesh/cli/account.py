@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.amounts import ETH, XRT
+from mesh.amounts import ETH, XRT
 from mesh.cli.chain_client import address_in_keyfile, open_chain, required_address
 from mesh.cli.errors import FileExists, FileUnwritable, InvalidOptions, InvalidPrivateKey, PasswordFileUnusable
 from mesh.cli.options import FILE, with_chain_settings, with_json

@@ -1,75 +1,12 @@
-"""Amounts of tokens in commands.
-
-All commands follow one rule: a number alone counts whole tokens (`1.5` is one and a half XRT); a number that ends in
-`wn` (XRT, 10^-9), `wei` (ETH, 10^-18) or `units` (any token) counts the smallest unit. In JSON amounts are text, in the
-smallest unit.
-"""
+"""Amounts of tokens as options of commands."""
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import click
 
-from mesh.cli.errors import InvalidAmount
-
-UNLIMITED: Final = 2**256 - 1
-"""The largest number of a contract. As an allowance it is never used up."""
-AMOUNT: Final = re.compile(
-    r"(?P<whole>[0-9][0-9_]*|(?=\.[0-9]))(?:\.(?P<part>[0-9]+))?\s*(?P<ending>[A-Za-z]*)", re.ASCII
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Unit:
-    """A token's symbol, its decimals, and the name of its smallest unit."""
-
-    symbol: str
-    decimals: int
-    smallest: str = "units"
-
-    def show(self, amount: int) -> str:
-        """An amount of the smallest unit for people, with all its digits: `1,000.5 XRT`."""
-        return f"{self.number(amount)} {self.symbol}"
-
-    def number(self, amount: int) -> str:
-        """As `show`, without the symbol."""
-        if amount >= UNLIMITED:
-            return "unlimited"
-        whole, part = divmod(amount, 10**self.decimals)
-        digits = f".{part:0{self.decimals}}".rstrip("0") if part else ""
-        return f"{whole:,}{digits}"
-
-    def parse(self, text: str) -> int:
-        """Parse an amount into the smallest unit. Raises `InvalidAmount`."""
-        found = AMOUNT.fullmatch(text.strip())
-        if found is None:
-            raise InvalidAmount(f"{text[:40]!r} is not an amount", hint=self.hint())
-        whole, part, ending = found["whole"] or "0", (found["part"] or "").rstrip("0"), found["ending"].lower()
-        if ending in (self.smallest, "units"):
-            decimals = 0
-        elif ending in ("", self.symbol.lower()):
-            decimals = self.decimals
-        else:
-            raise InvalidAmount(f"{text[:40]!r} is not an amount of {self.symbol}", hint=self.hint())
-        if len(part) > decimals:
-            unit = self.symbol if decimals else self.smallest
-            raise InvalidAmount(
-                f"{text[:40]!r} has more than {decimals} decimals, the most that {unit} has", hint=self.hint()
-            )
-        amount = int(whole.replace("_", "") + part.ljust(decimals, "0"))
-        if amount > UNLIMITED:
-            raise InvalidAmount(f"{text[:40]!r} is more than a contract can store", hint=self.hint())
-        return amount
-
-    def hint(self) -> str:
-        return f"write 1.5 for one and a half {self.symbol}, or the smallest unit: 1500000{self.smallest}"
-
-
-XRT: Final = Unit("XRT", 9, "wn")
-ETH: Final = Unit("ETH", 18, "wei")
+from mesh.amounts import AMOUNT, XRT, InvalidAmount
 
 
 class AmountText(click.ParamType[str]):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.amounts import ETH, XRT, Unit
+from mesh.amounts import ETH, XRT, Unit
 from mesh.cli.chain_client import open_chain, own_address
 from mesh.cli.errors import AlreadyDeployed
 from mesh.cli.lazy import LazyGroup

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from mesh.cli.amounts import XRT, Unit
-from mesh.cli.errors import AccountMissing, BalanceTooLow, NotAToken
+from mesh.amounts import Unit
+from mesh.cli.errors import AccountMissing, BalanceTooLow
 from mesh.cli.output import short_address
 from mesh.errors import ChainError
 
@@ -105,21 +105,6 @@ async def spender_of(chain: Chain, named: str) -> str:
     return await chain.names.lighthouse(named)
 
 
-async def unit_of(chain: Chain, token: str | None) -> Unit:
-    """The unit of a token (ENS name or address; XRT by default), from its contract. Raises `NotAToken`."""
-    from mesh.chain import NoContracts, Reverted
-
-    try:
-        info = await chain.tokens.info(token)
-    except (NoContracts, Reverted):
-        if token is None:
-            raise
-        raise NotAToken(f"{token} is not a token", hint="--token names an ERC-20 by its address or ENS name") from None
-    if info.address == chain.xrt:
-        return Unit(info.symbol or XRT.symbol, info.decimals, XRT.smallest)
-    return Unit(info.symbol or "tokens", info.decimals)
-
-
 async def units_of(chain: Chain, paid: Iterable[Liability | Order]) -> dict[str, Unit]:
     """The units of the tokens that liabilities or orders are paid in, by the tokens' addresses.
 
@@ -131,9 +116,9 @@ async def units_of(chain: Chain, paid: Iterable[Liability | Order]) -> dict[str,
 
 async def _unit_of(chain: Chain, token: str) -> Unit:
     if token == chain.xrt:
-        return await unit_of(chain, None)
+        return await chain.tokens.unit()
     try:
-        unit = await unit_of(chain, token)
+        unit = await chain.tokens.unit(token)
     except ChainError:
         return Unit(f"units of {short_address(token)}", 0)
     return Unit(f"{unit.symbol} ({short_address(token)})", unit.decimals)

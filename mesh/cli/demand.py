@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from mesh.agent.errors import OrderExpired
+from mesh.amounts import XRT
 from mesh.background import Background
-from mesh.cli.amounts import XRT, AmountText
-from mesh.cli.chain_client import check_balance, unit_of
+from mesh.cli.amounts import AmountText
+from mesh.cli.chain_client import check_balance
 from mesh.cli.errors import InvalidOptions, JobNotDone, OutputFailed
 from mesh.cli.existing import take_existing
 from mesh.cli.files import file_or_cid, require_model, require_readable, require_writable
@@ -27,7 +28,7 @@ from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract, Order
-    from mesh.cli.amounts import Unit
+    from mesh.amounts import Unit
     from mesh.recording import Objective
     from mesh.settings import Settings
 HELD_TIMEOUT: Final = 3.0
@@ -115,7 +116,7 @@ async def demand(
     # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
         tasks.start(print_connection_changes(agent.parts.network), "network losses")
-        unit = await unit_of(agent.parts.chain, agent.settings.erc20_token)
+        unit = await agent.parts.chain.tokens.unit(agent.settings.erc20_token)
         with closing(JobPrinter(unit, as_json=as_json)) as printer:
             printer.line(f"demand by {agent.address} for {agent.model}")
             cid = source if isinstance(source, str) else await agent.add(source)

@@ -13,10 +13,6 @@ class InvalidUsage(InputError, code="invalid-usage"):
     """A command line that can't be understood: an unknown command or option, or a value of the wrong kind."""
 
 
-class InvalidAmount(InputError, code="invalid-amount"):
-    """A text is not an amount of the token."""
-
-
 class FileUnreadable(InputError, code="file-unreadable"):
     """The named file can't be read."""
 
@@ -71,10 +67,6 @@ class AlreadyDeployed(ConfigurationError, code="already-deployed"):
 
 class BalanceTooLow(ChainError, code="balance-too-low"):
     """An account has less of a token than the command needs."""
-
-
-class NotAToken(ChainError, code="not-a-token"):
-    """An address or name is not an ERC-20 token."""
 
 
 class NotALighthouse(ChainError, code="not-a-lighthouse"):

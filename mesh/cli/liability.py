@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.amounts import XRT, Unit
+from mesh.amounts import XRT, Unit
 from mesh.cli.chain_client import account_of, open_chain, own_address, units_of
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import ADDRESS, with_chain_settings, with_json

@@ -20,8 +20,8 @@ from mesh.outage_log import OutageLog
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from mesh.amounts import Unit
     from mesh.chain import BlockEvents, Chain
-    from mesh.cli.amounts import Unit
     from mesh.errors import AiraError
     from mesh.settings import Settings
     from schemas.records import Liability

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.amounts import XRT
+from mesh.amounts import XRT
 from mesh.cli.chain_client import notice_when_slow, open_chain, open_signing_chain
 from mesh.cli.errors import InvalidLighthouse, NameTaken, NotALighthouse
 from mesh.cli.lazy import LazyGroup

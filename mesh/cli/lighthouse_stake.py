@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mesh.cli.amounts import AMOUNT, XRT
+from mesh.amounts import AMOUNT, XRT, InvalidAmount
 from mesh.cli.chain_client import check_balance, notice_when_slow, open_signing_chain
-from mesh.cli.errors import InvalidAmount, InvalidOptions, InvalidStake, NotAProvider
+from mesh.cli.errors import InvalidOptions, InvalidStake, NotAProvider
 from mesh.cli.lighthouse import find_lighthouse
 from mesh.cli.options import with_json, with_signing_settings
 from mesh.cli.output import plural, print_facts, print_json

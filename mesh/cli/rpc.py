@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
-from mesh.cli.amounts import ETH
+from mesh.amounts import ETH
 from mesh.cli.errors import InvalidArgument, UnknownJob, UnknownService
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import print_facts, print_json, print_line, print_table, printable

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.amounts import ETH, XRT
+from mesh.amounts import ETH, XRT
 from mesh.cli.errors import NoAnswer
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import (

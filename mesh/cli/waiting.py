@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.agent import Progress
-    from mesh.cli.amounts import Unit
+    from mesh.amounts import Unit
     from mesh.network import Network
 
 STEP: Final = 10

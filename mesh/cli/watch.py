@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
+from mesh.amounts import XRT, Unit
 from mesh.background import Background
-from mesh.cli.amounts import XRT, Unit
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
 from mesh.cli.waiting import print_connection_changes

@@ -15,14 +15,13 @@ from mesh.cli.chain_client import (
     open_chain,
     open_signing_chain,
     spender_of,
-    unit_of,
 )
 from mesh.cli.options import ADDRESS, with_chain_settings, with_json, with_signing_settings
 from mesh.cli.output import print_facts, print_json, print_line
 
 if TYPE_CHECKING:
+    from mesh.amounts import Unit
     from mesh.chain import Chain
-    from mesh.cli.amounts import Unit
     from mesh.settings import Settings
 
 with_token = click.option("--token", type=ADDRESS, help="ENS name or address of another ERC-20 token [XRT]")
@@ -46,7 +45,7 @@ async def balance(settings: Settings, *, account: str | None, token: str | None,
     """Show the balance of ACCOUNT, an address or ENS name; by default the account of the settings."""
     async with open_chain(settings) as chain:
         owner = await account_of(chain, settings, account)
-        unit = await unit_of(chain, token)
+        unit = await chain.tokens.unit(token)
         amount = await chain.tokens.balance(owner, token=token)
         if as_json:
             print_json({"account": owner, **await _token_json(chain, token, unit), "balance": str(amount)})
@@ -66,7 +65,7 @@ async def allowance(settings: Settings, *, spender: str, owner: str | None, toke
     SPENDER is `factory` (the default), a lighthouse's name, an ENS name or an address."""
     async with open_chain(settings) as chain:
         whose, by = await account_of(chain, settings, owner), await spender_of(chain, spender)
-        unit = await unit_of(chain, token)
+        unit = await chain.tokens.unit(token)
         amount = await chain.tokens.allowance(whose, by, token=token)
         if as_json:
             about = await _token_json(chain, token, unit)
@@ -87,7 +86,7 @@ async def approve(settings: Settings, *, spender: str, amount: str, token: str |
     SPENDER is `factory` (for costs and fees), a lighthouse's name (for stakes), an ENS name or an address.
     """
     async with open_signing_chain(settings) as chain:
-        unit = await unit_of(chain, token)
+        unit = await chain.tokens.unit(token)
         value, by = unit.parse(amount), await spender_of(chain, spender)
         with notice_when_slow():
             tx = await chain.tokens.approve(by, value, token=token)
@@ -106,7 +105,7 @@ async def approve(settings: Settings, *, spender: str, amount: str, token: str |
 async def transfer(settings: Settings, *, to: str, amount: str, token: str | None, as_json: bool) -> None:
     """Transfer AMOUNT from the account to TO, an address or ENS name."""
     async with open_signing_chain(settings) as chain:
-        unit = await unit_of(chain, token)
+        unit = await chain.tokens.unit(token)
         value, recipient = unit.parse(amount), await chain.names.address(to)
         await check_balance(chain, unit, value, token=token)
         with notice_when_slow():

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.cli.amounts import ETH, UNLIMITED, XRT, Unit
+from mesh.amounts import ETH, UNLIMITED, XRT, Unit
 from mesh.errors import InputError
 
 PENNY = Unit("PNY", 2)

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.amounts import InvalidAmount
 from mesh.chain import XRT, Account, Chain, TransactionSender, new_private_key
 from mesh.chain.artifacts import is_code_of, load_artifact
 from mesh.chain.errors import InsufficientFunds, NoContracts, NodeUnreachable
 from mesh.cli.chain import DEPLOYMENT_GAS
-from mesh.cli.errors import AlreadyDeployed, InvalidAmount, InvalidLighthouse
+from mesh.cli.errors import AlreadyDeployed, InvalidLighthouse
 from mesh.errors import ConfigurationError, InvalidAddress
 from mesh.settings import AccountNotSet
 from tests.mesh.cli.served_chain import ServedChain, columns, write_quick_keyfile

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import Declined, JobFailed, Progress
-from mesh.cli.amounts import XRT
+from mesh.amounts import XRT
 from mesh.cli.demand import demand
 from mesh.cli.errors import JobNotDone
 from mesh.cli.waiting import JobPrinter

@@ -6,11 +6,11 @@ from itertools import count
 
 import pytest
 
+from mesh.amounts import InvalidAmount
 from mesh.chain import XRT
 from mesh.chain.errors import UnknownName
 from mesh.cli.errors import (
     BalanceTooLow,
-    InvalidAmount,
     InvalidLighthouse,
     InvalidOptions,
     InvalidStake,

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.amounts import InvalidAmount
 from mesh.chain.accounts import WrongPassword
 from mesh.chain.errors import NodeUnreachable, UnknownName
-from mesh.cli.errors import BalanceTooLow, FileUnwritable, InvalidAmount, InvalidOptions, NotAFileOrCid
+from mesh.cli.errors import BalanceTooLow, FileUnwritable, InvalidOptions, NotAFileOrCid
 from mesh.errors import AiraError, ConfigurationError, InputError, NetworkUnavailable
 from mesh.recording import open_objective
 from mesh.settings import AccountNotSet

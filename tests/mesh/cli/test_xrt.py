@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.amounts import InvalidAmount
 from mesh.chain import XRT, Account, TransactionSender, new_private_key
 from mesh.chain.accounts import KeyfileError, WrongPassword
 from mesh.chain.errors import InsufficientFunds, NodeUnreachable, UnknownName
-from mesh.cli.errors import AccountMissing, BalanceTooLow, InvalidAmount, NotAToken
+from mesh.chain.tokens import NotAToken
+from mesh.cli.errors import AccountMissing, BalanceTooLow
 from mesh.errors import InputError
 from mesh.settings import AccountNotSet
 from tests.mesh.cli.served_chain import MONEY, ServedChain, columns, write_quick_keyfile
