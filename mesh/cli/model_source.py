@@ -7,7 +7,7 @@ import runpy
 import sys
 from contextlib import contextmanager
 from traceback import extract_tb
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar
 
 from mesh.cli.errors import ProgramUnusable
 from mesh.cli.files import require_readable
@@ -37,12 +37,14 @@ def description_from(source: Path) -> ModelDescription:
 def _of_program(path: Path) -> ModelDescription:
     from mesh.agent import Agent
 
-    with _importing_from(path.parent), _without_running(Agent):
+    with _importing_from(path.parent), _not_running(Agent, path) as started:
         try:
             names = runpy.run_path(str(path), run_name=path.stem)
         except AiraError:
             raise
         except (Exception, SystemExit) as error:  # whatever the program raises
+            if started:  # `run_to_end` has reported it
+                raise
             lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
             where = f"{path}:{lines[-1]}" if lines else str(path)
             why = " ".join(str(error).split())
@@ -77,11 +79,20 @@ def _importing_from(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _without_running(kind: type[Any]) -> Iterator[None]:
-    """Let `agent.run()` do nothing: many programs end with it."""
-    run = kind.run
-    kind.run = lambda agent: None
+def _not_running(kind: type[Any], path: Path) -> Iterator[list[Any]]:
+    """Let `agent.run()`, with which many programs end, do nothing, and let `async with agent` fail.
+
+    Yields the list of the agents that were to be started.
+    """
+    run, enter = kind.run, kind.__aenter__
+    started: list[Any] = []
+
+    async def refuse(agent: Any) -> NoReturn:
+        started.append(agent)
+        raise ProgramUnusable(f"{path} starts an agent", hint='do that below `if __name__ == "__main__":`')
+
+    kind.run, kind.__aenter__ = lambda agent: None, refuse
     try:
-        yield
+        yield started
     finally:
-        kind.run = run
+        kind.run, kind.__aenter__ = run, enter

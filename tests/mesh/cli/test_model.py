@@ -13,7 +13,7 @@ import pytest
 from mesh.cli.errors import FileExists, ProgramUnusable
 from schemas import cid_of_file
 from schemas.model import InvalidDescription, ModelDescription, read_description
-from tests.support.commands import invoke, refused
+from tests.support.commands import aira, invoke, refused
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -202,6 +202,22 @@ def test_new_describes_the_robot_of_the_docs(tmp_path: Path) -> None:
     (topic,) = description.objective
     assert topic.value is not None
     assert topic.value.properties["speed"].unit == "m/s"
+
+
+def test_new_starts_no_agent(tmp_path: Path) -> None:
+    text = """
+from mesh import Agent, run_to_end
+
+agent = Agent()
+
+async def main() -> None:
+    async with agent:
+        raise SystemExit("it was started")
+
+run_to_end(main)
+"""
+    done = aira("model", "new", program(tmp_path, text))
+    refused(done, ProgramUnusable, "robot.py starts an agent", exit_code=2)
 
 
 @pytest.mark.parametrize(
