@@ -100,7 +100,8 @@ def check(settings: Settings, model: str, objective: str | None, as_json: bool) 
         if as_json:
             print_json(facts)
         elif facts["ok"]:
-            print_line(f"{facts['cid']}  valid: {'a description' if description else 'a model without a description'}")
+            valid = "valid: a description" if description else "valid: a model without a description"
+            print_line(f"{facts['cid']}  {valid if recording is None else 'the objective fits'}")
         else:
             print_line(f"{facts['cid']}  {facts['reason']}: {printable(str(facts['detail']))}")
         return bool(facts["ok"])

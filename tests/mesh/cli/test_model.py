@@ -198,7 +198,7 @@ def test_new_describes_an_agent_whose_model_is_the_file_to_write(tmp_path: Path)
 def test_new_describes_the_robot_of_the_docs(tmp_path: Path) -> None:
     (text,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "models.md").read_text(), re.DOTALL)
     description = new_model(program(tmp_path, text))
-    assert (description.title, description.success, description.seconds) == ("Drive", "It stands.", 60)
+    assert (description.title, description.price, description.seconds) == ("Rover", "5 XRT", 10)
     (topic,) = description.objective
     assert topic.value is not None
     assert topic.value.properties["speed"].unit == "m/s"
