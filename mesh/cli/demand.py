@@ -224,7 +224,7 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
         outcome = await contract.outcome(on_progress=printer)
     except asyncio.CancelledError:
         goes_on = f"the contract goes on; `aira liability watch {contract.address}` waits for its end"
-        click.echo(f"{goes_on}, `aira liability cancel` tells how to cancel it", err=True)
+        click.echo(f"{goes_on}, `aira liability show` says from when the cost can be refunded", err=True)
         raise
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
     printer.close()

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import click
+
+from mesh.background import Background
 from mesh.cli.chain_client import own_address
 from mesh.cli.errors import FileExists, FileUnreadable, FileUnwritable, FolderMissing, NotAFileOrCid, NotAModel
-from mesh.cli.output import printable, progress
+from mesh.cli.output import printable, progress, short_address
 from mesh.content import Exchange, Store
 from mesh.settings import NetworkSettings, options_of
 from schemas import InvalidCid, cid_of_file, parse_cid
@@ -18,12 +22,17 @@ from schemas.address import is_ens_name
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from mesh.network import Network
     from mesh.settings import Settings
 
 STORE_SETTINGS: Final = ("data_dir", "keyfile")
 """The settings that locate the store."""
 FETCH_SETTINGS: Final = (*options_of(NetworkSettings), "fetch_timeout", *STORE_SETTINGS)
 """The settings to find a file in the store or fetch it from the mesh."""
+NOTICE: Final = 0.5
+"""Seconds after which a command says what it waits for."""
+PEERS_NAMED: Final = 3
+"""Peers that are named when a file is looked for."""
 LARGEST_FILE: Final = 8 << 30
 """Bytes of the largest file that commands put into the store."""
 
@@ -114,10 +123,11 @@ async def opened_store(settings: Settings) -> AsyncIterator[Store]:
         store.close()
 
 
-async def fetch(settings: Settings, store: Store, cid: str) -> Path:
+async def fetch(settings: Settings, store: Store, cid: str, *, size_limit: int | None = None) -> Path:
     """The path of the file with that CID in the store, fetched from the mesh if the store does not have it.
 
-    Raises `InvalidCid`, `NetworkUnavailable`, `ContentUnavailable` and other `ContentError`s.
+    If that takes more than a moment, says on stderr what it waits for, which peers it asks, and when it gives up.
+    `size_limit` is in bytes. Raises `InvalidCid`, `NetworkUnavailable`, `ContentUnavailable` and other `ContentError`s.
     """
     from mesh.composition import endpoints_of
     from mesh.network import Network
@@ -126,6 +136,37 @@ async def fetch(settings: Settings, store: Store, cid: str) -> Path:
     held = await asyncio.to_thread(store.checked, cid)
     if held is not None:
         return held
-    async with Network(endpoints_of(settings)) as network, Exchange(network.session, store) as exchange:
-        with progress(f"fetching {cid[:8]}…") as report:
-            return await exchange.fetch(cid, timeout=settings.fetch_timeout, progress=report)
+    waits = f"aira: {cid} is not in the store; connecting to {', '.join(settings.connect)}"
+    waits += f" for at most {settings.connect_timeout:g} s"
+    connecting = asyncio.get_running_loop().call_later(NOTICE, partial(click.echo, waits, err=True))
+    try:
+        async with Network(endpoints_of(settings)) as network, Exchange(network.session, store) as exchange:
+            connecting.cancel()
+            async with Background() as tasks:
+                tasks.start(_say_who_is_asked(settings, network, cid), "notice")
+                with progress(f"fetching {cid[:8]}…") as report:
+                    return await exchange.fetch(
+                        cid, size_limit=size_limit, timeout=settings.fetch_timeout, progress=report
+                    )
+    finally:
+        connecting.cancel()
+
+
+async def _say_who_is_asked(settings: Settings, network: Network, cid: str) -> None:
+    """Say whom a file is asked of, and when that ends, unless it arrives at once."""
+    await asyncio.sleep(NOTICE)
+    patience = f"gives up after {settings.fetch_timeout:g} s without an answer"
+    click.echo(f"aira: {cid} is not in the store; asking {await _peers(settings, network)}; {patience}", err=True)
+
+
+async def _peers(settings: Settings, network: Network) -> str:
+    """Who is asked for a file: the agents and bridges that are present on the settings' lighthouse, and all others."""
+    from mesh.network import Channel
+    from mesh.watching import present
+
+    async with Channel(network.session, settings.lighthouse_contract) as channel:
+        peers = await present(channel, "agent", "bridge")
+    named = ", ".join(f"{peer.role} {short_address(peer.address)}" for peer in peers[:PEERS_NAMED])
+    more = f" and {len(peers) - PEERS_NAMED} more" if len(peers) > PEERS_NAMED else ""
+    who = f"{named}{more}" if peers else f"all peers (none is present on {settings.lighthouse_contract})"
+    return f"{who} through {', '.join(settings.connect)}"

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from mesh.amounts import XRT, Unit
 from mesh.cli.chain_client import account_of, open_chain, own_address, units_of
+from mesh.cli.files import FETCH_SETTINGS, fetch, opened_store
 from mesh.cli.lazy import LazyGroup
-from mesh.cli.options import ADDRESS, with_chain_settings, with_json
-from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, short_address
+from mesh.cli.options import ADDRESS, with_chain_settings, with_json, with_settings
+from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, printable, short_address
+from mesh.errors import AiraError
+from mesh.settings import ChainSettings, options_of
 from schemas.address import ZERO_ADDRESS
 
 if TYPE_CHECKING:
@@ -20,9 +24,14 @@ if TYPE_CHECKING:
 
     from mesh.chain import Chain, RefundState
     from mesh.settings import Settings
+    from mesh.work.notes import Reason
     from schemas.records import Liability
 
 
+CONNECT_TIMEOUT: Final = 3.0
+"""Seconds to connect to a router, for the recording of a failed job."""
+FETCH_TIMEOUT: Final = 10.0
+"""Seconds without a block of that recording after which it is given up."""
 HEAD = ("LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR")
 
 
@@ -105,23 +114,52 @@ async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> S
 @command.command("show", short_help="show the parties, terms, cost and state of one")
 @click.argument("address", type=ADDRESS)
 @with_json
-@with_chain_settings()
+@with_settings(*dict.fromkeys((*FETCH_SETTINGS, *options_of(ChainSettings))))
 async def show(settings: Settings, address: str, as_json: bool) -> None:
-    """Show the liability at ADDRESS: its parties, terms, cost and state, and from which block it can be refunded."""
+    """Show the liability at ADDRESS: its parties, terms, cost and state, and from which block it can be refunded.
+
+    Of a job that failed, show also why, as its recording says; that is fetched if the store does not have it.
+    """
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
-        await print_liability(chain, await chain.liabilities.get(address), own=own, as_json=as_json)
+        await print_liability(chain, await chain.liabilities.get(address), settings, own=own, as_json=as_json)
 
 
-async def print_liability(chain: Chain, liability: Liability, *, own: str | None, as_json: bool) -> None:
-    """Print all facts about a liability."""
+async def print_liability(
+    chain: Chain, liability: Liability, settings: Settings, *, own: str | None, as_json: bool
+) -> None:
+    """Print all facts about a liability; of a failed job also why it failed."""
     refund = await refund_state(chain, liability)
+    failure = await _failure(settings, liability.result) if state_of(liability) == "failed" else None
     if as_json:
-        print_json(liability_json(liability) | {"refundableFrom": None if refund is None else refund.refundable_from})
+        facts = liability_json(liability) | {"refundableFrom": None if refund is None else refund.refundable_from}
+        print_json(facts if failure is None else facts | {"reason": failure.text, "code": failure.code})
         return
     units = await units_of(chain, [liability])
     words = None if refund is None else refund_words(refund)
-    print_facts(describe_liability(liability, units[liability.token], own=own, refundable=words))
+    described = describe_liability(liability, units[liability.token], own=own, refundable=words)
+    if failure is not None:
+        described["reason"] = (
+            f"{printable(failure.text)} ({failure.code})" if failure.text else "the recording has none"
+        )
+    print_facts(described)
+
+
+async def _failure(settings: Settings, result: str) -> Reason:
+    """Why a job failed, as its recording says."""
+    from mesh.work.notes import Reason, read_reason
+
+    quick = replace(
+        settings,
+        connect_timeout=min(settings.connect_timeout, CONNECT_TIMEOUT),
+        fetch_timeout=min(settings.fetch_timeout, FETCH_TIMEOUT),
+    )
+    try:
+        async with opened_store(quick) as store:
+            path = await fetch(quick, store, result, size_limit=settings.objective_expanded_limit)
+            return await asyncio.to_thread(read_reason, path)
+    except AiraError as error:
+        return Reason(f"unknown, the recording is not available: {error}", "recording-unavailable")
 
 
 async def refund_state(chain: Chain, liability: Liability) -> RefundState | None:

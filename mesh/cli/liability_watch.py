@@ -54,7 +54,7 @@ async def watch(settings: Settings, address: str | None, from_block: int | None,
         liability = await chain.liabilities.get(address)
         if not liability.is_finalized and not as_json:
             print_line(f"{liability.address} is open; waiting until it ends (Ctrl-C stops waiting)")
-        await print_liability(chain, await chain.liabilities.watch(address), own=own, as_json=as_json)
+        await print_liability(chain, await chain.liabilities.watch(address), settings, own=own, as_json=as_json)
 
 
 async def _watch_all(settings: Settings, from_block: int | None, as_json: bool) -> None:

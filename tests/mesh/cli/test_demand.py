@@ -17,6 +17,8 @@ from mesh.cli.waiting import JobPrinter
 from mesh.work.objectives import ObjectiveUnfit
 from schemas import cid_of_file
 from tests.mesh.operations.site import MODEL, Site, settings_of
+from tests.support.commands import aira
+from tests.support.ports import free_endpoint
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -108,6 +110,19 @@ async def test_a_failed_job_is_shown_with_its_reason_and_its_recording_is_kept(s
     } in progress
     assert (end["reason"], end["code"]) == ("the lamp is broken", "job-failed")
     assert cid_of_file(Path(end["recording"])) == end["result"]
+    # The robot and the router may be off: the recording is in the person's store.
+    variables = site.variables("person", connect=free_endpoint())
+    shown = await asyncio.to_thread(aira, "liability", "show", end["liability"], "--json", **variables)
+    assert (json.loads(shown.stdout)["reason"], json.loads(shown.stdout)["code"]) == (end["reason"], end["code"])
+    unknown = await asyncio.to_thread(
+        aira,
+        "liability",
+        "show",
+        end["liability"],
+        "--json",
+        **(variables | {"AIRA_DATA_DIR": str(site.folder / "no")}),
+    )
+    assert json.loads(unknown.stdout)["code"] == "recording-unavailable"
 
 
 async def test_an_interrupted_demand_is_withdrawn_if_asked_for(site: Site, output: Output) -> None:

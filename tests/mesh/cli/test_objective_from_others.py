@@ -13,8 +13,9 @@ from mesh.cli.errors import NothingRecorded
 from mesh.content import Exchange, Store
 from mesh.content.errors import ContentUnavailable
 from mesh.errors import NetworkUnavailable
-from mesh.network import Endpoints, Network
+from mesh.network import Channel, Endpoints, Network
 from mesh.recording import open_objective
+from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import RAW, STRING, String
 from tests.mesh.cli.calls import call
@@ -76,6 +77,23 @@ def test_a_missing_file_and_a_missing_router_are_one_clear_line(router: Embedded
     nowhere = ["--connect", free_endpoint(), "--connect-timeout", "0.2"]
     refused(call(*words, *nowhere), NetworkUnavailable)
     refused(call("pack", "--hear", "a/**", "--out", tmp_path / "it", *nowhere), NetworkUnavailable)
+
+
+async def test_a_fetch_says_whom_it_asks_and_when_it_gives_up(router: EmbeddedRouter, tmp_path: Path) -> None:
+    import asyncio
+
+    cid, robot = cid_of_bytes(b"nobody's"), f"0x{'1' * 40}"
+    lighthouse = Settings().lighthouse_contract
+    async with (
+        Network(Endpoints(connect=(router.endpoint,))) as network,
+        Channel(network.session, lighthouse) as channel,
+    ):
+        channel.announce("agent", robot)
+        words: list[str | Path] = ["objective", "get", cid, "--out", tmp_path / "it", "--fetch-timeout", "2"]
+        done = await asyncio.to_thread(aira, *words, "--connect", router.endpoint)
+    notice, error, *_ = done.stderr.splitlines()
+    assert f"[{ContentUnavailable.code}]" in error
+    assert all(word in notice for word in (cid, "agent 0x1111…1111", router.endpoint, "2 s"))
 
 
 class Speaker:
