@@ -115,9 +115,10 @@ async def demand(
     checked = await asyncio.to_thread(_check_objective, settings, source) if isinstance(source, Path) else None
     # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
-        tasks.start(print_connection_changes(agent.parts.network), "network losses")
         unit = await agent.parts.chain.tokens.unit(agent.settings.erc20_token)
         with closing(JobPrinter(unit, as_json=as_json)) as printer:
+            changes = print_connection_changes(agent.parts.network, before=printer.close)
+            tasks.start(changes, "network losses")
             printer.line(f"demand by {agent.address} for {agent.model}")
             cid = source if isinstance(source, str) else await agent.add(source)
             if (examined := checked or await _check_held(agent, cid)) is not None:
@@ -223,6 +224,7 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
     try:
         outcome = await contract.outcome(on_progress=printer)
     except asyncio.CancelledError:
+        printer.close()
         goes_on = f"the contract goes on; `aira liability watch {contract.address}` waits for its end"
         click.echo(f"{goes_on}, `aira liability show` says from when the cost can be refunded", err=True)
         raise

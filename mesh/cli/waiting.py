@@ -120,8 +120,9 @@ def _json(seen: Progress) -> dict[str, Any]:
     return facts | {"code": seen.code, "detail": seen.detail}
 
 
-async def print_connection_changes(network: Network) -> None:
-    """Print to stderr when the router is unreachable, and when it is back, until cancelled."""
+async def print_connection_changes(network: Network, *, before: Callable[[], object] = lambda: None) -> None:
+    """Print to stderr when the router is unreachable, and when it is back, until cancelled; call `before` that."""
     async for _ in network.changes():
+        before()
         words = "connected to the router again" if network.connected else "lost the router; waiting for it"
         click.echo(f"aira: {words}", err=True)
