@@ -44,7 +44,7 @@ command = LazyGroup(
     "objective",
     help="Create, show, check and fetch objectives and recordings: MCAP files (or ROS 1 bags) of a robot's messages.",
     lazy={
-        "cat": ("mesh.cli.objective_messages:cat", "print the messages"),
+        "cat": ("mesh.cli.objective_show:cat", "print the messages"),
         "pack": ("mesh.cli.objective_pack:pack_objective", "create one from JSON lines, a bag, or live messages"),
         "show": ("mesh.cli.objective_show:show", "show the summary, topics, schemas and message times"),
     },

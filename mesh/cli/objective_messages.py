@@ -1,16 +1,10 @@
-"""`aira objective cat`: prints the messages of an objective or a recording."""
+"""Printing the messages of an objective or a recording."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-import click
-import msgspec
-
-from mesh.cli.files import FETCH_SETTINGS
-from mesh.cli.objective_show import local_file
-from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import print_json, print_line, printable, run_sync
+from mesh.cli.output import json_text, print_json, print_line, printable
 from mesh.recording import GENEROUS, open_objective
 from schemas.errors import InvalidPayload
 from schemas.payloads import Empty, String, decode_value
@@ -19,22 +13,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.recording import Played
-    from mesh.settings import Settings
 
 BYTES_SHOWN: Final = 32
 """How many bytes of a message without a known text are printed."""
-
-
-@click.command("cat")
-@click.argument("objective")
-@click.option("--topic", "topics", multiple=True, help="only messages on this topic; may be repeated [all topics]")
-@with_json
-@with_settings(*FETCH_SETTINGS)
-def cat(settings: Settings, objective: str, topics: tuple[str, ...], as_json: bool) -> None:
-    """Print the messages of OBJECTIVE, a file or a CID: seconds since its first message, topic, value. --json prints
-    an object for each; bytes are in `base64` there."""
-    path = local_file(settings, objective)
-    run_sync(lambda: print_messages(path, frozenset(topics), as_json=as_json))
 
 
 def print_messages(path: Path, topics: frozenset[str], *, as_json: bool) -> None:
@@ -67,7 +48,7 @@ def _text(message: Played) -> str:
     if isinstance(value, bytes):
         shown = value[:BYTES_SHOWN].hex(" ") + (" …" if len(value) > BYTES_SHOWN else "")
         return f"{printable(message.type.schema_name or message.type.encoding or 'bytes')}, {len(value)} bytes: {shown}"
-    return printable(msgspec.json.encode(value).decode())
+    return printable(json_text(value))
 
 
 def _value(message: Played) -> Any:

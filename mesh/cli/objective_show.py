@@ -1,4 +1,4 @@
-"""`aira objective show`: shows the content of an objective or a recording."""
+"""`aira objective show` and `aira objective cat`: the content of an objective or a recording, and its messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.files import FETCH_SETTINGS, fetch, file_or_cid, opened_store, require_readable, write_error
+from mesh.cli.files import FETCH_SETTINGS, fetch, file_or_cid, opened_store, require_readable
+from mesh.cli.objective_messages import print_messages
+from mesh.cli.objective_plot import draw
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import (
     format_duration,
@@ -20,7 +22,6 @@ from mesh.cli.output import (
     progress,
     run_sync,
 )
-from mesh.extras import needs_extra
 from mesh.recording import GENEROUS, Objective, TopicRates, open_objective, rates_of
 from mesh.running import run_to_end
 from schemas import cid_of_file
@@ -45,14 +46,39 @@ BARS: Final = " ▁▂▃▄▅▆▇█"
 @click.command("show")
 @click.argument("objective")
 @click.option("--schemas", is_flag=True, help="also print the schema of each type")
-@click.option("--png", type=click.Path(path_type=Path), help="also plot the messages per second to this PNG file")
+@click.option("--png", type=click.Path(path_type=Path), help="also plot the numbers in the messages to this PNG file")
+@click.option("--messages", is_flag=True, help="print the messages instead, as `aira objective cat` does")
+@click.option("--topic", "topics", multiple=True, help="print only messages on this topic; may be repeated")
 @with_json
 @with_settings(*FETCH_SETTINGS)
-def show(settings: Settings, objective: str, schemas: bool, png: Path | None, as_json: bool) -> None:
+def show(
+    settings: Settings,
+    objective: str,
+    schemas: bool,
+    png: Path | None,
+    messages: bool,
+    topics: tuple[str, ...],
+    as_json: bool,
+) -> None:
     """Show the content of OBJECTIVE, a file or a CID: its duration, topics, types, metadata, and the times of its
-    messages. `aira objective cat` prints the messages."""
+    messages; or, with --messages or --topic, the messages."""
     path = local_file(settings, objective)
-    run_sync(lambda: _show(path, schemas=schemas, png=png, as_json=as_json))
+    if messages or topics:
+        run_sync(lambda: print_messages(path, frozenset(topics), as_json=as_json))
+    else:
+        run_sync(lambda: _show(path, schemas=schemas, png=png, as_json=as_json))
+
+
+@click.command("cat")
+@click.argument("objective")
+@click.option("--topic", "topics", multiple=True, help="only messages on this topic; may be repeated [all topics]")
+@with_json
+@with_settings(*FETCH_SETTINGS)
+def cat(settings: Settings, objective: str, topics: tuple[str, ...], as_json: bool) -> None:
+    """Print the messages of OBJECTIVE, a file or a CID: seconds since its first message, topic, value. --json prints
+    an object for each; bytes are in `base64` there."""
+    path = local_file(settings, objective)
+    run_sync(lambda: print_messages(path, frozenset(topics), as_json=as_json))
 
 
 def local_file(settings: Settings, objective: str) -> Path:
@@ -78,7 +104,7 @@ def _show(path: Path, *, schemas: bool, png: Path | None, as_json: bool) -> None
     with progress(f"reading {path.name}") as tell:
         objective = open_objective(path, GENEROUS, progress=tell)
     if png is not None:
-        draw(_rates(objective, PNG_SPANS), png, title=path.name)
+        draw(objective, _rates(objective, PNG_SPANS), png)
     if as_json:
         print_json(_objective_json(objective))
         return
@@ -171,29 +197,3 @@ def _print_schemas(objective: Objective) -> None:
         click.echo(f"\n{printable(kind.zenoh_encoding)} ({plural(len(kind.schema_data), 'byte')} of schema)")
         for line in kind.schema_data.decode(errors="replace").splitlines():
             click.echo(f"  {printable(line.expandtabs())}")
-
-
-def draw(rates: TopicRates, path: Path, *, title: str) -> None:
-    """Plot the messages per second of each topic to a PNG at `path`. Raises `PackageMissing`, `FileUnwritable`."""
-    with needs_extra("plot", "--png"):
-        from matplotlib.figure import Figure
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    axes = figure.add_subplot()
-    spans = len(next(iter(rates.counts.values()), []))
-    edges = [number * rates.span_ns / 1e9 for number in range(spans + 1)]
-    for topic in sorted(rates.counts):
-        axes.stairs(rates.per_second(topic), edges, label=_plain_text(topic))
-    axes.set(title=_plain_text(title), xlabel="seconds from the first message", ylabel="messages per second")
-    axes.set_ylim(bottom=0)
-    if rates.counts:
-        axes.legend(loc="upper right", fontsize="small")
-    try:
-        figure.savefig(path, format="png", dpi=100)
-    except OSError as error:
-        raise write_error(path, error) from None
-
-
-def _plain_text(text: str) -> str:
-    """Text from others for matplotlib, where a dollar starts a formula and a leading underscore hides a label."""
-    shown = "".join(letter if letter.isprintable() else "\ufffd" for letter in text)
-    return shown.replace("$", r"\$").lstrip("_")

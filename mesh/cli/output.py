@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import signal
 import sys
@@ -62,8 +64,17 @@ def print_line(text: str = "") -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON value on a line. Structs have the field names that they have on the wire."""
+    """Print one JSON value on a line. Structs have the field names that they have on the wire.
+
+    Numbers that JSON can't hold exactly are printed as text, also NaN and infinity.
+    """
     print_line(msgspec.json.encode(_exact(msgspec.to_builtins(value))).decode())
+
+
+def json_text(value: Any) -> str:
+    """A value as JSON for people: bytes as base64, and NaN and infinity by these names."""
+    plain = msgspec.to_builtins(value, builtin_types=(float,))
+    return json.dumps(plain, ensure_ascii=False, separators=(",", ":"))
 
 
 def print_facts(facts: Mapping[str, object]) -> None:
@@ -197,5 +208,7 @@ def _exact(value: Any) -> Any:
         case list() | tuple():
             return [_exact(member) for member in value]
         case int() if abs(value) >= LARGEST_NUMBER:
+            return str(value)
+        case float() if not math.isfinite(value):  # which JSON can't hold
             return str(value)
     return value

@@ -16,7 +16,7 @@ import msgspec
 from mesh.amounts import XRT, Unit
 from mesh.background import Background
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
+from mesh.cli.output import json_text, plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
 from mesh.cli.waiting import print_connection_changes
 from mesh.network import Reading
 from mesh.running import run_until_stopped
@@ -288,7 +288,7 @@ def _value(reading: Reading) -> Any:
 
 def _shown(reading: Reading) -> str:
     value = _value(reading)
-    text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
+    text = value if isinstance(value, str) else json_text(value)
     return printable(text[:LONGEST_TEXT] + ("…" if len(text) > LONGEST_TEXT else ""))
 
 

@@ -17,16 +17,17 @@ from mesh.cli.errors import (
     InvalidOptions,
     NotAFileOrCid,
 )
+from mesh.cli.objective_plot import FIELDS, POINTS, TOPICS, Line, lines_of
 from mesh.cli.output import format_size
 from mesh.content import Store
 from mesh.errors import AiraError, InvalidCid
 from mesh.extras import PackageMissing
-from mesh.recording import Recorder, RecordingAbout, open_objective
+from mesh.recording import Played, Recorder, RecordingAbout, open_objective
 from mesh.recording.errors import NotARecording, RecordingError, RecordingExists
 from mesh.recording.packing import InvalidLine
 from mesh.work.objectives import ObjectiveUnfit
 from schemas import cid_of_bytes, cid_of_file
-from schemas.payloads import JSON, STRING, Empty, String
+from schemas.payloads import JSON, STRING, Empty, String, encode_value
 from tests.mesh.cli.calls import call
 from tests.mesh.recording.files import T0, with_messages
 from tests.support.bags import Bag, BagMessage, string
@@ -186,9 +187,53 @@ def test_cat_prints_the_messages_of_a_topic(tmp_path: Path) -> None:
     refused(call("cat", "missing"), NotAFileOrCid, "missing")
 
 
-def test_show_draws_a_plot(tmp_path: Path, sound: Path) -> None:
-    done = call("show", sound, "--png", tmp_path / "it.png")
-    assert done.exit_code == 0, done.output
+@pytest.fixture
+def measured(tmp_path: Path) -> Path:
+    """A recording with numbers of every kind."""
+    path = tmp_path / "measured.mcap"
+    values = [("/speed", 1.5), ("/speed", float("nan")), ("/pose", {"x": 1, "at": {"y": True}, "name": "arm"})]
+    values += [("/joints", [1, 2.5]), ("/volts", "0.5 1.5"), ("/raw", b"\1"), ("/name", "arm"), ("/volts", "0.75 2")]
+    path.write_bytes(objective(*values))
+    return path
+
+
+def test_show_prints_messages_and_keeps_nan(measured: Path) -> None:
+    assert call("show", measured, "--messages").stdout == call("cat", measured).stdout
+    assert call("show", measured, "--topic", "/speed").stdout == call("cat", measured, "--topic", "/speed").stdout
+    lines = call("show", measured, "--topic", "/speed").stdout.splitlines()
+    assert [line.rpartition("  ")[2] for line in lines] == ["1.5", "NaN"]
+    objects = [json.loads(line) for line in call("cat", measured, "--topic", "/speed", "--json").stdout.splitlines()]
+    assert [one["value"] for one in objects] == [1.5, "nan"]
+
+
+def test_a_plot_has_a_line_for_each_number(measured: Path) -> None:
+    opened = open_objective(measured)
+    topics = lines_of(opened.messages(), start_ns=opened.start_ns)
+    assert {topic: {name: line.values for name, line in lines.items()} for topic, lines in topics.items()} == {
+        "/speed": {"": [1.5, pytest.approx(float("nan"), nan_ok=True)]},
+        "/pose": {".x": [1.0], ".at.y": [1.0]},
+        "/joints": {"[0]": [1.0], "[1]": [2.5]},
+        "/volts": {"[0]": [0.5, 0.75], "[1]": [1.5, 2.0]},
+    }
+    assert topics["/volts"]["[0]"].seconds == sorted(topics["/volts"]["[0]"].seconds) != [0.0, 0.0]
+
+
+def test_a_plot_is_limited_in_topics_lines_and_points() -> None:
+    payload, kind = encode_value({str(number): number for number in range(FIELDS + 5)})
+    messages = [Played(f"/{n}", payload, n, n, 0, kind) for n in range(TOPICS + 5)]
+    topics = lines_of(messages, start_ns=0)
+    assert (len(topics), len(topics["/0"])) == (TOPICS, FIELDS)
+    line = Line()
+    for number in range(10 * POINTS):
+        line.add(number, number)
+    assert POINTS / 4 < len(line.values) <= POINTS
+    assert line.values == line.seconds == [float(each) for each in range(0, 10 * POINTS, 16)]
+
+
+def test_show_draws_a_plot(tmp_path: Path, sound: Path, measured: Path) -> None:
+    for shown in (sound, measured):
+        done = call("show", shown, "--png", tmp_path / "it.png")
+        assert done.exit_code == 0, done.output
     assert (tmp_path / "it.png").read_bytes().startswith(b"\x89PNG\r\n")
     refused(call("show", sound, "--png", tmp_path / "nowhere" / "it.png"), FileUnwritable)
 
