@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from tests.support.routers import EmbeddedRouter
 
-JOBS = 30
+JOBS = 16
 COST = 1000
 QUOTAS = {"provider": 2, "rival": 1}
 TIMEOUT_BLOCKS = 6
