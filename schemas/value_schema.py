@@ -251,7 +251,7 @@ def _article(kind: str) -> str:
 
 def _shown(value: Any) -> str:
     names = {type(None): "null", bytes: "bytes", dict: "an object", list: "an array", tuple: "an array"}
-    text = names.get(type(value)) or str(value)[:80]
+    text = names.get(type(value)) or "".join(one if one.isprintable() else "\ufffd" for one in str(value)[:80])
     return text if len(text) <= 40 else text[:39] + "…"
 
 

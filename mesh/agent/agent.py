@@ -106,7 +106,7 @@ class Agent(HandlerDecorators, ReadingAgent):
         stack.callback(self._closed)
         await stack.enter_async_context(self.telemetry)
         await wait_for_files(self.settings)
-        self.model = model_of(self._given_model)
+        self.model = await asyncio.to_thread(model_of, self._given_model)
         account = self._account
         if account is None and self.settings.keyfile:
             account = await asyncio.to_thread(load_account, self.settings)

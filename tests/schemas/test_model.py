@@ -233,6 +233,24 @@ def test_an_integer_may_be_written_as_a_float(value: Any, fits: bool) -> None:
     assert (ValueSchema(type="array", items=schema).fault([2, value]) == "") is fits
 
 
+def test_what_is_said_about_a_strangers_value_is_one_printable_line() -> None:
+    fault = DRIVE.message_fault("/lamp", STRING, String("on\n\x1b[2Jfake"))
+    assert fault is not None
+    assert fault.detail.isprintable()
+
+
+@pytest.mark.parametrize(("value", "fits"), [(0, False), (0.01, True), (1.99, True), (2, False)])
+def test_exclusive_bounds_are_exclusive(value: float, fits: bool) -> None:
+    schema = ValueSchema(type="number", exclusive_minimum=0, exclusive_maximum=2)
+    assert (schema.fault(value) == "") is fits
+
+
+def test_an_encoding_without_a_name_fits_every_type_of_that_encoding() -> None:
+    topic = ModelTopic(topic="/a", encoding="application/json")
+    assert topic.fault(PayloadType("json", "Move", "jsonschema"), {}) == ""
+    assert topic.fault(STRING, String("{}")) != ""
+
+
 def test_only_so_many_values_are_checked() -> None:
     inner = ValueSchema(type="object", properties={"a": ValueSchema(type="number")})
     topic = ModelTopic(topic="/a", value=ValueSchema(type="array", items=inner))
