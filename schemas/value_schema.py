@@ -223,7 +223,7 @@ def require_plain_text(text: str, *, lines: bool = False) -> None:
 
 
 def normal_number(field: str, value: Any) -> Any:
-    """A number in its only form: a float without a fraction is an integer."""
+    """A number in canonical form: a float without a fraction is an integer."""
     if isinstance(value, float):
         if not math.isfinite(value):
             raise ValueError(f"{field} is not a finite number")

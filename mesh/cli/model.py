@@ -53,7 +53,7 @@ def command() -> None:
 @click.option("--replace", is_flag=True, help="replace the file if it exists; the model then has another CID")
 @with_json
 def new(source: Path, out: Path | None, replace: bool, as_json: bool) -> None:
-    """Write a description in the only form that models have, and print its CID.
+    """Write a description in canonical form, and print its CID.
 
     SOURCE is a JSON file as people write it (docs/models.md explains the fields), or a Python program with an agent
     (NAME.py). The program is run, but its agent is not: the types of its handlers' messages say what the model takes.

@@ -1,4 +1,4 @@
-"""Descriptions of models: their only form, what is refused, and which objectives fit."""
+"""Descriptions of models: their canonical form, what is refused, and which objectives fit."""
 
 from __future__ import annotations
 

@@ -205,6 +205,14 @@ async def test_a_person_orders_nothing_that_the_model_excludes(place: Place, fil
         assert (await contract.outcome()).success
 
 
+async def test_a_person_orders_nothing_of_a_model_that_is_not_valid(place: Place) -> None:
+    async with place.agent("person") as person:
+        model = person.parts.store.put_bytes(DRIVE.encode().rstrip())
+        with pytest.raises(InvalidDescription):
+            await person.order(place.save(GOOD), model=model)
+        assert person.orders() == []
+
+
 async def test_a_person_orders_an_objective_that_is_not_available_to_it(place: Place) -> None:
     async with place.agent("person") as person:
         person.parts.store.put_bytes(DRIVE.encode())
