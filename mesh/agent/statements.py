@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
@@ -69,8 +69,13 @@ async def received_rejections(
 
 
 @asynccontextmanager
-async def received_declines(parts: AgentComponents, orders: Mapping[str, TradedOrder]) -> AsyncIterator[None]:
-    """Meanwhile report to the waiters of `orders` each decline that an agent signed that is present."""
+async def received_declines(
+    parts: AgentComponents, orders: Mapping[str, TradedOrder]
+) -> AsyncIterator[Callable[[], None]]:
+    """Meanwhile report to the waiters of `orders` each decline that an agent signed that is present.
+
+    Yields a function to call when there is a demand: a robot that never demands does not subscribe.
+    """
     agents = PresentAgents(parts.channel, role="agent")
 
     async def check_all(queue: FairQueue[Decline]) -> None:
@@ -82,10 +87,18 @@ async def received_declines(parts: AgentComponents, orders: Mapping[str, TradedO
                 facts = log_event("order-declined", order=decline.order, agent=decline.agent, code=decline.code)
                 log.info("agent %s declines the %s (%s)", decline.agent, order, decline.code, extra=facts)
 
-    with _queued(parts, "decline", Decline, orders) as queue:
+    with ExitStack() as subscription:
         async with Background() as tasks:
-            tasks.start(check_all(queue), "declines")
-            yield
+            subscribed = False
+
+            def subscribe() -> None:
+                nonlocal subscribed
+                if not subscribed:
+                    subscribed = True
+                    queue = subscription.enter_context(_queued(parts, "decline", Decline, orders))
+                    tasks.start(check_all(queue), "declines")
+
+            yield subscribe
 
 
 @contextmanager

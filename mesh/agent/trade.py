@@ -26,7 +26,7 @@ from mesh.work.ledger import Phase
 from schemas import Demand, Offer, Withdrawal, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection
     from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
@@ -57,6 +57,7 @@ class Trader(Lifecycle):
         self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address)
         self.writer = TermsWriter(parts)
         self._orders: dict[str, TradedOrder] = {}
+        self._hear_declines: Callable[[], None] = lambda: None
         self._answers = OpenOffers()
         self._changing = asyncio.Lock()
         self.contracts = WatchedContracts(parts)
@@ -72,6 +73,7 @@ class Trader(Lifecycle):
         stack.push_async_callback(self._close)
         for job in await self._parts.ledger.jobs(Phase):
             self.customers.add(job.liability.promisee)
+        self._hear_declines = await stack.enter_async_context(received_declines(self._parts, self._orders))
         resumed = [order for order in await self.load() if order.is_open]
         for order in resumed:
             if isinstance(order.signed, Offer):
@@ -79,7 +81,6 @@ class Trader(Lifecycle):
             facts = log_event("order-resumed", order=order.identity, kind=order.signed.kind, deadline=order.deadline)
             log.info("the %s of an earlier run is open until block %d", order, order.deadline, extra=facts)
         await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
-        await stack.enter_async_context(received_declines(self._parts, self._orders))
         self._tasks = await stack.enter_async_context(Background())
         self._send_when_covered([order for order in resumed if order.is_open])
 
@@ -97,6 +98,8 @@ class Trader(Lifecycle):
         if kind is Offer and (buyer := current_buyer()) is not None:
             await self._give_up(self._answers.add(order.identity, buyer.maker, pays=buyer.pays))
         self._orders[order.identity] = order
+        if kind is Demand:
+            self._hear_declines()
         try:
             await self._ensure_allowance(order)
         except BaseException:
@@ -239,6 +242,8 @@ class Trader(Lifecycle):
                 if order is None:
                     order = self._orders[stored.identity] = TradedOrder(signed, stored.posted)
                     self._allowances.count(order, self._chain.costs.of(signed))
+                    if isinstance(signed, Demand):
+                        self._hear_declines()
                     new.append(order)
                 if stored.is_withdrawn and order.is_open:
                     self._allowances.withdraw(order)

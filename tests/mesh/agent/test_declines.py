@@ -13,14 +13,14 @@ from mesh import Declined, InputError, Progress
 from mesh.agent.declines import PER_MAKER, DeclinePublisher, Grounds
 from mesh.flood import Drops
 from mesh.network import Endpoints, Network
-from schemas import DeclineKey, Demand, Empty, Signer, Verified, cid_of_bytes
+from schemas import DeclineKey, Demand, Empty, RejectKey, Signer, Verified, cid_of_bytes
 from schemas.signing import Decline
 from tests.mesh.agent.trades import OBJECTIVE, posted
 from tests.support import orders
 from tests.support.log_events import logged_facts
 from tests.support.market import Place, offering
 from tests.support.objectives import objective
-from tests.support.waiting import until
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from mesh.agent import Agent
@@ -121,3 +121,20 @@ async def test_declines_are_limited_for_each_maker(place: Place) -> None:
             signed = orders.demand(signer=Signer(b"\x05" * 32))
             publisher.decline(Verified(signed, secrets.token_bytes(32), place.address("person")), Grounds("busy", ""))
     assert drops.totals()["declines"] >= 4
+
+
+async def test_only_those_who_demand_subscribe_to_declines(place: Place) -> None:
+    """A robot that only offers declares nothing for it."""
+    async with (
+        place.agent("robot") as robot,
+        place.agent("person") as person,
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+    ):
+        lighthouse = person.channel.lighthouse
+        order = await person.order(OBJECTIVE)
+        await until_heard(network.session, str(DeclineKey(lighthouse, person.address)))
+        await until_heard(network.session, str(RejectKey(lighthouse, robot.address)))
+        with network.session.declare_publisher(str(DeclineKey(lighthouse, robot.address))) as publisher:
+            assert not publisher.matching_status.matching  # type: ignore[attr-defined]
+        async with asyncio.timeout(60):
+            await order.withdraw()
