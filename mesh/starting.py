@@ -1,23 +1,27 @@
 """Starting a server while a dependency is missing: a file, the router, the node, contracts, a stake.
 
-By default the server exits with an error. With `connect_timeout = -1` it retries, and logs once what it waits for.
+By default the server exits with an error. With `connect_timeout = -1` it retries, and logs once what it waits for. So
+does every server that runs already when another chain takes the place of the one that it served on.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from mesh.errors import ConfigurationError, RemoteError
+from mesh.errors import ChainError, ConfigurationError, RemoteError
+from mesh.log_context import log_event
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff, RetryPolicy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Iterator, Sequence
     from contextlib import AbstractAsyncContextManager, AsyncExitStack
     from pathlib import Path
 
+    from mesh.chain import ChainWentBack
     from mesh.settings import NetworkSettings, Settings
 
 log = logging.getLogger(__name__)
@@ -26,6 +30,7 @@ STARTUP: Final = RetryPolicy(initial=0.5, ceiling=5.0)
 """Shorter delays than elsewhere: on start, someone is usually setting up the missing parts."""
 
 T = TypeVar("T")
+S = TypeVar("S", bound="NetworkSettings")
 
 
 class FilesMissing(ConfigurationError, code="files-missing"):
@@ -104,6 +109,38 @@ async def open_when_ready(
         else:
             outages.recovered(f"the {role} starts")
             return opened
+
+
+async def serve_on_each_chain(
+    settings: S, serve: Callable[[S], Awaitable[object]], *, place: Callable[[], object] = object
+) -> None:
+    """Await `serve(settings)`; and again each time that the chain it served on is gone, such as a development chain
+    that was started afresh. From the second time on, the settings say to wait for what is missing.
+
+    `place` is called after a failure and names the chain that was served on, None if there was none yet. Other errors
+    are raised, and so is one about a chain that was given up before: it is the same, and can't be followed.
+    """
+    served: object = None
+    while True:
+        try:
+            await serve(settings)
+            return
+        except (ChainError, BaseExceptionGroup) as error:
+            gone, here = _chain_gone(error), place()
+            if gone is None or here is None or (gone.is_final and here == served):
+                raise
+            fields = log_event("chain-gone", code=gone.code)
+            log.warning("the chain was started afresh (%s); serving on the one that is there now", gone, extra=fields)
+            served, settings = here, replace(settings, connect_timeout=-1.0)
+
+
+def _chain_gone(error: ChainError | BaseExceptionGroup[BaseException]) -> ChainWentBack | None:
+    """The error that says so, if it is one."""
+    from mesh.chain import ChainWentBack  # loaded before, as it is an error of a chain
+    from mesh.running import cause_of
+
+    cause = cause_of(error) if isinstance(error, BaseExceptionGroup) else error
+    return cause if isinstance(cause, ChainWentBack) else None
 
 
 def _file_error(settings: Settings) -> ConfigurationError | None:

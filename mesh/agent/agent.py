@@ -17,7 +17,7 @@ from mesh.background import Background
 from mesh.composition import load_account
 from mesh.flood import Drops
 from mesh.log_context import LogSource, log_event, source_context
-from mesh.starting import open_when_ready, wait_for_files
+from mesh.starting import open_when_ready, serve_on_each_chain, wait_for_files
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 from mesh.work.models import Models
@@ -98,9 +98,20 @@ class Agent(HandlerDecorators, ReadingAgent):
         run_until_stopped(self.serve, settings=self.settings, role="agent")
 
     async def serve(self) -> None:
-        """Serve until cancelled."""
-        async with self:
-            await asyncio.Event().wait()
+        """Serve until cancelled, also when a development chain is started afresh."""
+        place: Path | None = None
+
+        async def on_one_chain(settings: Settings) -> None:
+            nonlocal place
+            self.settings = settings
+            async with self:
+                place = None if self._runtime is None else self._runtime.parts.directory
+                await asyncio.Event().wait()
+
+        if self._given_chain is None:
+            await serve_on_each_chain(self.settings, on_one_chain, place=lambda: place)
+        else:
+            await on_one_chain(self.settings)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.callback(self._closed)

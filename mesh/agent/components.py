@@ -118,6 +118,8 @@ async def working(
         ledger = await enter(Ledger(directory / LEDGER))
         # What an earlier run has not read may have made contracts of orders that have expired meanwhile.
         handled, _ = await ledger.cursor()
+        if handled is not None:
+            await _check_length(chain, handled)
         chain_head = ChainHead(await chain.block_number() if handled is None else handled)
         network, channel = await enter(_connected(settings, chain, chain_head, drops))
         store = await asyncio.to_thread(
@@ -142,6 +144,15 @@ async def working(
         )
         _make_folder(parts.recordings)
         yield parts
+
+
+async def _check_length(chain: Chain, handled: int) -> None:
+    """Raise `ChainWentBack` if the chain lacks blocks that were handled, and more than it may replace."""
+    from mesh.chain import ChainWentBack
+
+    head = await chain.block_number()
+    if handled > head + chain.node.timing.reorg_depth:
+        raise ChainWentBack(handled + 1, head)
 
 
 @asynccontextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from mesh.errors import ChainError, ConfigurationError, InputError
 
@@ -225,6 +225,9 @@ class TransactionTimeout(ChainError, code="transaction-timeout"):
 class ChainWentBack(ChainError, code="chain-went-back"):
     """The chain is shorter than what was already read of it: it was started afresh, or the node is still syncing."""
 
+    is_final: ClassVar[bool] = False
+    """Whether waiting does not help: the blocks that were read are on no chain of the node's."""
+
     def __init__(self, cursor: int, head: int) -> None:
         super().__init__(
             f"block {cursor} was to be read next, but the chain ends at block {head}",
@@ -239,6 +242,8 @@ class ReorganisedTooDeep(ChainWentBack, code="reorganised-too-deep"):
 
     `cursor` is the oldest block that is remembered.
     """
+
+    is_final = True
 
     def __init__(self, cursor: int, head: int) -> None:
         ChainError.__init__(

@@ -17,6 +17,7 @@ from mesh.cli.output import announce
 from mesh.log_context import LogSource, log_event
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
+from mesh.starting import open_when_ready, serve_on_each_chain, wait_for_files
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 
@@ -52,12 +53,11 @@ def command(settings: Settings) -> None:
     The account needs a stake at the lighthouse, and ETH for gas. Earnings and costs are logged every ten minutes and
     when it stops.
     """
-    run_until_stopped(lambda: serve(settings), settings=settings, role="provider")
+    run_until_stopped(lambda: serve_on_each_chain(settings, serve), settings=settings, role="provider")
 
 
 async def serve(settings: Settings) -> None:
     from mesh.composition import load_account
-    from mesh.starting import open_when_ready, wait_for_files
 
     lighthouse = settings.lighthouse_contract
     async with AsyncExitStack() as stack:

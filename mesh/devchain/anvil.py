@@ -8,7 +8,6 @@ import ctypes
 import json
 import shutil
 import signal
-import socket
 import sys
 import tempfile
 from collections import deque
@@ -19,7 +18,8 @@ from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.background import Background
 from mesh.devchain.anvil_state import STATE_SECONDS, copy_states, prepare_state, settle_state
-from mesh.devchain.errors import NotAProgram, PortUnavailable
+from mesh.devchain.errors import NotAProgram
+from mesh.devchain.ports import check_port
 from mesh.errors import ConfigurationError, RemoteError
 
 if TYPE_CHECKING:
@@ -124,15 +124,15 @@ class Anvil:
 
 @asynccontextmanager
 async def serve_anvil(
-    program: Path, *, host: str, port: int, block_time: float | None, state: Path | None
+    program: Path, *, host: str, port: int, block_time: float | None, state: Path | None, load: Path | None = None
 ) -> AsyncIterator[Anvil]:
     """Run anvil for the body, which is cancelled with `NodeEnded` when anvil ends by itself; port 0 takes a free one.
 
     Each transaction is mined at once; with `block_time` (seconds) empty blocks are mined as well. The chain is loaded
-    from the file `state` if it exists, and kept in it. Raises `ConfigurationError` for a port that is taken, and for
-    an invalid state.
+    from the file `state` if it exists, and kept in it; or it is loaded from the file `load`, and lost. Raises
+    `ConfigurationError` for a port that is taken, and for an invalid state.
     """
-    port = _bindable(host, port)
+    port = check_port(host, port)
     async with AsyncExitStack() as stack:
         facts = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-anvil-"))) / "facts.json"
         command = ["--host", host, "--port", str(port), "--config-out", str(facts), "--quiet"]
@@ -142,6 +142,8 @@ async def serve_anvil(
             await asyncio.to_thread(prepare_state, state)
             command += ["--state", str(state), "--state-interval", str(STATE_SECONDS)]
             stack.push_async_callback(asyncio.to_thread, settle_state, state)
+        elif load is not None:
+            command += ["--load-state", str(load)]
         node = Anvil(program, await _start(program, command), host=host, port=port)
         stack.push_async_callback(node.stop)
         await node.until_ready(facts)
@@ -182,15 +184,3 @@ def _keys_in(facts: Path) -> tuple[bytes, ...]:
         return tuple(bytes.fromhex(key[2:]) for key in json.loads(facts.read_text())["private_keys"])
     except (OSError, ValueError):
         return ()
-
-
-def _bindable(host: str, port: int) -> int:
-    """The port, or a free one for 0. Raises `PortUnavailable` when it is taken."""
-    try:
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-            taken: int = probe.getsockname()[1]
-            return taken
-    except OSError as error:
-        raise PortUnavailable(host, port, str(error.strerror)) from None

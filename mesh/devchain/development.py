@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import tempfile
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain import (
@@ -22,14 +24,15 @@ from mesh.chain import (
     write_keyfile,
 )
 from mesh.devchain.anvil import serve_anvil
-from mesh.devchain.anvil_state import deploying
-from mesh.devchain.embedded import serve_embedded
+from mesh.devchain.anvil_state import deploying, prepare_state
+from mesh.devchain.embedded import EmbeddedChain
 from mesh.devchain.errors import KeyfilesNotWritable, MarketMissing
+from mesh.devchain.ports import check_port
+from mesh.devchain.rpc_server import JsonRpcServer
 from mesh.private_files import make_private_folder
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
-    from pathlib import Path
 
     from web3.providers.async_base import AsyncBaseProvider
 
@@ -163,7 +166,8 @@ async def serve_chain(
     anvil: Path | None = None,
     state: Path | None = None,
 ) -> AsyncIterator[DevelopmentChain]:
-    """Serve a chain with a market on it: by the program `anvil`, embedded without one. `block_time` is in seconds.
+    """Serve a chain with a market on it: by the program `anvil`, embedded without one. `block_time` is in seconds. The
+    port opens when the market is there.
 
     The chain is gone at the end, unless anvil keeps it in the file `state`. Raises `ConfigurationError` when the port
     is taken, the keyfiles can't be written or the state can't be used; `NodeEnded` when anvil ends by itself.
@@ -171,12 +175,17 @@ async def serve_chain(
     keys = settings.state_directory / "development"
     async with AsyncExitStack() as stack:
         if anvil is None:
-            served = await stack.enter_async_context(serve_embedded(host, port, block_time=block_time))
-            url, funded, engine = served.url, served.node.funded_keys, "embedded"
-            market = await deploy_market(served.node.provider, funded)
+            check_port(host, port)
+            embedded = await stack.enter_async_context(EmbeddedChain(block_time=block_time))
+            funded, engine = embedded.funded_keys, "embedded"
+            market = await deploy_market(embedded.provider, funded)
+            server = await stack.enter_async_context(JsonRpcServer(embedded.provider, host=host, port=port))
+            url = server.url
         else:
+            port = check_port(host, port)
+            new = await stack.enter_async_context(_new_market(anvil, state))
             node = await stack.enter_async_context(
-                serve_anvil(anvil, host=host, port=port, block_time=block_time, state=state)
+                serve_anvil(anvil, host=host, port=port, block_time=block_time, state=state, load=new)
             )
             url, funded, engine = node.url, node.funded_keys, f"anvil ({anvil})"
             market = await _load_or_deploy(node.url, funded, state)
@@ -185,6 +194,28 @@ async def serve_chain(
         except OSError as error:
             raise KeyfilesNotWritable(keys, str(error.strerror)) from None
         yield DevelopmentChain(url=url, engine=engine, market=market, keys=keys)
+
+
+@asynccontextmanager
+async def _new_market(anvil: Path, state: Path | None) -> AsyncIterator[Path | None]:
+    """The state of a new chain with a market, which is in the file `state` if it is given; None if that has a chain.
+
+    Anvil listens as soon as it runs, so a chain is made at a port that nobody knows, and only then served.
+    """
+    async with AsyncExitStack() as stack:
+        if state is None:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-market-"))
+            new = Path(folder) / "chain.json"
+        else:
+            await asyncio.to_thread(prepare_state, state)
+            if await asyncio.to_thread(state.exists):
+                yield None
+                return
+            new = state
+        async with serve_anvil(anvil, host="127.0.0.1", port=0, block_time=None, state=new) as node:
+            with deploying(new):
+                await deploy_market(node.url, node.funded_keys)
+        yield new
 
 
 async def _load_or_deploy(url: str, keys: tuple[bytes, ...], state: Path | None) -> DevelopmentMarket:
