@@ -121,7 +121,7 @@ async def working(
         if handled is not None:
             await _check_length(chain, handled)
         chain_head = ChainHead(await chain.block_number() if handled is None else handled)
-        network, channel = await enter(_connected(settings, chain, chain_head, drops))
+        network, channel = await enter(connected(settings, chain, chain_head, drops))
         store = await asyncio.to_thread(
             Store, directory.parent / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
         )
@@ -156,7 +156,7 @@ async def _check_length(chain: Chain, handled: int) -> None:
 
 
 @asynccontextmanager
-async def _connected(
+async def connected(
     settings: Settings, chain: Chain, head: ChainHead, drops: Drops
 ) -> AsyncIterator[tuple[Network, Channel]]:
     """A session, and the channel of the lighthouse, which resolves names and knows the head by the chain."""

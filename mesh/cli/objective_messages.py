@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.cli.output import json_text, print_json, print_line, printable
-from mesh.recording import GENEROUS, open_objective
-from schemas.errors import InvalidPayload
-from schemas.payloads import Empty, String, decode_value
+from mesh.recording import GENEROUS, open_objective, value_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,24 +37,13 @@ def _facts(message: Played) -> dict[str, Any]:
         "type": message.type.zenoh_encoding,
         "role": message.role,
     }
-    value = _value(message)
+    value = value_of(message)
     return facts | ({"base64": value} if isinstance(value, bytes) else {"value": value})
 
 
 def _text(message: Played) -> str:
-    value = _value(message)
+    value = value_of(message)
     if isinstance(value, bytes):
         shown = value[:BYTES_SHOWN].hex(" ") + (" …" if len(value) > BYTES_SHOWN else "")
         return f"{printable(message.type.schema_name or message.type.encoding or 'bytes')}, {len(value)} bytes: {shown}"
     return printable(json_text(value))
-
-
-def _value(message: Played) -> Any:
-    """A text, None for an empty message, JSON data, or the bytes of what has another type or is not of its type."""
-    try:
-        value = decode_value(message.payload, message.type)
-    except InvalidPayload:
-        return message.payload
-    if isinstance(value, String):
-        return value.data
-    return None if isinstance(value, Empty) else value

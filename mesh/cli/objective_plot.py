@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.cli.files import write_error
 from mesh.extras import needs_extra
-from schemas.errors import InvalidPayload
-from schemas.payloads import String, decode_value
+from mesh.recording import numbers_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
     from pathlib import Path
 
     from mesh.recording import Objective, Played, TopicRates
@@ -51,37 +50,11 @@ def lines_of(messages: Iterable[Played], *, start_ns: int) -> dict[str, dict[str
     for message in messages:
         if message.topic not in topics and len(topics) == TOPICS:
             continue
-        try:
-            value = decode_value(message.payload, message.type)
-        except InvalidPayload:
-            continue
-        for name, number in numbers_in(value):
+        for name, number in numbers_of(message):
             lines = topics.setdefault(message.topic, {})
             if name in lines or len(lines) < FIELDS:
                 lines.setdefault(name, Line()).add((message.log_time_ns - start_ns) / 1e9, number)
     return topics
-
-
-def numbers_in(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
-    """The numbers in a decoded message with the names of their fields. A text may consist of numbers, too."""
-    match value:
-        case bool() | int() | float():
-            try:
-                yield name, float(value)
-            except OverflowError:
-                return
-        case dict():
-            for key, member in value.items():
-                yield from numbers_in(member, f"{name}.{key}")
-        case list():
-            for number, member in enumerate(value[:FIELDS]):
-                yield from numbers_in(member, f"{name}[{number}]")
-        case String(data):
-            try:
-                numbers = [float(word) for word in data.split(maxsplit=FIELDS)[:FIELDS]]
-            except ValueError:
-                return
-            yield from numbers_in(numbers[0] if len(numbers) == 1 else numbers)
 
 
 def draw(objective: Objective, rates: TopicRates, path: Path) -> None:

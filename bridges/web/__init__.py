@@ -1,0 +1,1 @@
+"""The page: a web server with which people order work, watch it and judge it in a browser."""

@@ -1,0 +1,81 @@
+"""What the page's server has open: router, chain, files, and perhaps an account."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from mesh.agent import Agent
+from mesh.agent.components import ChainHead, connected
+from mesh.composition import chain_of
+from mesh.content import Exchange, Store
+from mesh.flood import Drops
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from mesh.chain import Account, Chain
+    from mesh.network import Channel, Network
+    from mesh.settings import Settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class WebComponents:
+    """The open components of the page's server. `agent` is that of the local account, if there is one."""
+
+    settings: Settings
+    network: Network
+    channel: Channel
+    chain: Chain
+    chain_head: ChainHead
+    store: Store
+    exchange: Exchange
+    drops: Drops
+    agent: Agent | None
+    lighthouse: str
+    """The lighthouse's address."""
+    token: str
+    """The address of the token that pays for work."""
+
+
+@asynccontextmanager
+async def opened(
+    settings: Settings, *, account: Account | None = None, chain: Chain | None = None
+) -> AsyncIterator[WebComponents]:
+    """The components, with the settings' account or `account`, on `chain` (open) or on the settings' own.
+
+    Raises `ConfigurationError`, `NetworkUnavailable`, `ChainError`.
+    """
+    settings = replace(settings, metrics_listen="", enable_executor=False)
+    drops = Drops()
+    async with AsyncExitStack() as stack:
+        enter = stack.enter_async_context
+        if account is not None or settings.keyfile:
+            agent = await enter(Agent(settings=settings, account=account, chain=chain))
+            parts = agent.parts
+            network, channel, store, exchange = parts.network, parts.channel, parts.store, parts.exchange
+            opened_chain, head, drops = parts.chain, ChainHead(await parts.chain.block_number()), parts.drops
+        else:
+            agent = None
+            opened_chain = await enter(chain_of(settings, None)) if chain is None else chain
+            head = ChainHead(await opened_chain.block_number())
+            network, channel = await enter(connected(settings, opened_chain, head, drops))
+            folder, limit = settings.state_directory / "content", settings.objective_expanded_limit
+            store = await asyncio.to_thread(Store, folder, limit=limit, quota=settings.content_limit)
+            stack.callback(store.close)
+            exchange = await enter(Exchange(network.session, store, drops=drops))
+        yield WebComponents(
+            settings=settings,
+            network=network,
+            channel=channel,
+            chain=opened_chain,
+            chain_head=head,
+            store=store,
+            exchange=exchange,
+            drops=drops,
+            agent=agent,
+            lighthouse=await opened_chain.names.address(settings.lighthouse_contract),
+            token=await opened_chain.names.address(settings.erc20_token),
+        )

@@ -1,0 +1,231 @@
+"""A job, an account and the lighthouse, as the page shows them: from the chain, the market and the files."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from bridges.web.views import JobRecord, liability_json, order_json, records_of, result_json
+from mesh.chain import NotOffered
+from mesh.errors import AiraError
+from mesh.evidence import Claim, Verdict, check_end, verify
+from mesh.watching import present, statuses
+from mesh.work.notes import read_reason
+from schemas import ZERO_ADDRESS, encode
+from schemas.status import ALIVE, OFF, BridgeStatus
+
+if TYPE_CHECKING:
+    from bridges.web.components import WebComponents
+    from bridges.web.contracts import SeenJob
+    from bridges.web.files import Files
+    from bridges.web.market import Market, SeenOrder
+    from mesh.watching import RoleStatus
+
+LISTED: Final = 200
+"""Jobs and orders in one answer."""
+AGENTS: Final = 256
+"""Agents in one answer."""
+AGENTS_AGE: Final = 3.0
+"""Seconds for which a list of agents is used."""
+
+
+class Views:
+    """Answers the page's questions about jobs, accounts, agents and the lighthouse."""
+
+    def __init__(self, components: WebComponents, market: Market, files: Files) -> None:
+        self._parts = components
+        self._market = market
+        self._contracts = market.contracts
+        self._files = files
+        self._asking = asyncio.Lock()
+        self._agents: dict[str, Any] | None = None
+        self._agents_at = float("-inf")
+
+    async def job(self, address: str) -> dict[str, Any]:
+        """A job: terms, parties, phase, timeline. Raises `NotALiability`, `ChainError`."""
+        job = await self._contracts.job(address)
+        liability = job.liability
+        await self._contracts.labels.learn(liability.token)
+        result = self._contracts.results.get((address, liability.promisor))
+        position = job.playback
+        return {
+            "liability": liability_json(liability, self._contracts.labels),
+            "phase": "finalized" if liability.is_finalized else job.phase,
+            "playback": None if position is None else {"position": position.position, "total": position.total},
+            "demandHash": job.demand,
+            "offerHash": job.offer,
+            "refundableFrom": await self._refundable_from(job),
+            "timeline": await self._timeline(job),
+            "resultMessage": None if result is None else result_json(result),
+            "present": bool(await self._parts.channel.present("agent", liability.promisor)),
+            "reason": await self._reason(job),
+        }
+
+    async def _timeline(self, job: SeenJob) -> list[dict[str, Any]]:
+        for step in job.steps:
+            if step["at"] is None and step["block"] is not None:
+                step["at"] = await self._contracts.time_of(step["block"])
+        order = ("created", "ready", "playing", "result", "reverted", "paid", "refunded")
+        return sorted(job.steps, key=lambda step: order.index(step["kind"]))
+
+    async def _refundable_from(self, job: SeenJob) -> int | None:
+        if job.liability.is_finalized:
+            return None
+        with suppress(NotOffered):
+            return await self._parts.chain.liabilities.refundable_from(job.liability.address)
+        return None
+
+    async def _reason(self, job: SeenJob) -> dict[str, str] | None:
+        """Why a job failed, if its recording is at hand."""
+        liability = job.liability
+        if not liability.is_finalized or liability.is_success:
+            return None
+        if not liability.result:
+            return {"code": "no-result", "text": ""}
+        held = await asyncio.to_thread(self._parts.store.checked, liability.result)
+        if held is None:
+            return {"code": "recording-unavailable", "text": ""}
+        with suppress(AiraError):
+            reason = await asyncio.to_thread(read_reason, held)
+            return {"code": reason.code, "text": reason.text}
+        return None
+
+    async def verification(self, address: str) -> dict[str, Any]:
+        """The checklist of `aira verify`. Raises `NotALiability`, `ContentError`, `ChainError`."""
+        liability = await self._parts.chain.liabilities.get(address)
+        claim = Claim.of_contract(liability)
+        message = self._contracts.results.get((address, liability.promisor))
+        if not claim.result:
+            verdict = Verdict((check_end(claim),))
+        else:
+            objective, result = await self._files.fetch(claim.objective), await self._files.fetch(claim.result)
+            verdict = await self._files.in_thread(
+                verify,
+                claim,
+                objective=objective,
+                result=result,
+                message=None if message is None else encode(message.message),
+                objective_cid=claim.objective,
+                result_cid=claim.result,
+            )
+        return {
+            "holds": verdict.holds,
+            "claim": msgspec.to_builtins(claim),
+            "findings": [msgspec.to_builtins(finding) for finding in verdict.findings],
+        }
+
+    async def account(self, address: str) -> dict[str, Any]:
+        """Balances, allowances, the next nonce, orders and jobs of an account. Raises `ChainError`."""
+        parts, chain, market = self._parts, self._parts.chain, self._market
+        eth, xrt, token, count, state = await asyncio.gather(
+            chain.tokens.eth_balance(address),
+            chain.tokens.balance_and_allowance(address, chain.factory),
+            chain.tokens.balance_and_allowance(address, chain.factory, token=parts.token),
+            chain.node.transaction_count(address),
+            chain.lighthouses.get(parts.lighthouse),
+        )
+        is_counted = parts.settings.generation == 5
+        nonce = str(await chain.liabilities.next_nonce(address)) if is_counted else None
+        jobs = [
+            job
+            for job in reversed(market.contracts.jobs.values())
+            if address in (job.liability.promisee, job.liability.promisor)
+        ]
+        own = [order for order in market.orders() if order.verified.signer == address]
+        own = [order for order in own if order.state(market.head) in ("open", "withdrawn")]
+        record = records_of(jobs, parts.token).get(address, JobRecord())
+        return {
+            "address": address,
+            "eth": str(eth),
+            "xrt": {"balance": str(xrt[0]), "allowance": str(xrt[1])},
+            "token": {"balance": str(token[0]), "allowance": str(token[1])},
+            "nonce": nonce,
+            "transactions": count,
+            "stake": str(state.stakes.get(address, 0)),
+            "orders": [market.posted_json(order) for order in own[-LISTED:]],
+            "record": record.json(),
+            "spent": str(record.spent),
+            "liabilities": [liability_json(job.liability, market.contracts.labels) for job in jobs[:LISTED]],
+        }
+
+    async def lighthouse(self) -> dict[str, Any]:
+        """Providers, stakes, turns, quotas. Raises `ChainError`."""
+        parts = self._parts
+        state, gas = await asyncio.gather(parts.chain.lighthouses.get(parts.lighthouse), parts.chain.node.gas_price())
+        statuses = {agent["address"]: agent["status"] for agent in (await self.agents())["agents"]}
+        return {
+            "name": parts.channel.lighthouse,
+            "address": state.address,
+            "minimalStake": str(state.minimal_stake),
+            "timeoutBlocks": state.timeout_blocks,
+            "keepAliveBlock": state.keep_alive_block,
+            "quotaLeft": state.quota,
+            "current": state.current,
+            "block": self._market.head,
+            "providers": [
+                {
+                    "address": provider,
+                    "stake": str(stake),
+                    "quota": stake // state.minimal_stake if state.minimal_stake else 0,
+                    "hasTurn": provider == state.current != ZERO_ADDRESS,
+                    "status": statuses.get(provider),
+                }
+                for provider, stake in list(state.stakes.items())[:AGENTS]
+            ],
+            "gasPrice": str(gas),
+        }
+
+    async def agents(self) -> dict[str, Any]:
+        """Who is present, with status, offers and record; a few seconds old at most."""
+        loop = asyncio.get_running_loop()
+        async with self._asking:
+            if self._agents is None or loop.time() - self._agents_at > AGENTS_AGE:
+                self._agents = await self._ask_agents()
+                self._agents_at = loop.time()
+            return self._agents
+
+    async def _ask_agents(self) -> dict[str, Any]:
+        parts, market = self._parts, self._market
+        peers = await present(parts.channel)
+        found = await statuses(parts.network.session, parts.channel, peers[:AGENTS], timeout=2.0)
+        records = records_of(list(market.contracts.jobs.values()), parts.token)
+        offers, models = self._offers(), self._models()
+        listed = [
+            {
+                "role": peer.role,
+                "address": peer.address,
+                "health": _health(status),
+                "status": None if status is None else msgspec.json.decode(status.encode()),
+                "models": sorted(models.get(peer.address, ())) if peer.role == "agent" else [],
+                "offers": [order_json(order) for order in offers.get(peer.address, ())][:LISTED],
+                "record": records.get(peer.address, JobRecord()).json(),
+            }
+            for peer, status in found.items()
+        ]
+        return {"agents": listed, "unlisted": max(0, len(peers) - AGENTS)}
+
+    def _offers(self) -> dict[str, list[SeenOrder]]:
+        """The open offers by signer."""
+        found: dict[str, list[SeenOrder]] = {}
+        for order in self._market.orders():
+            if order.message.kind == "offer" and order.state(self._market.head) == "open":
+                found.setdefault(order.verified.signer, []).append(order)
+        return found
+
+    def _models(self) -> dict[str, set[str]]:
+        """The models that each account offers or has worked by."""
+        found = {signer: {order.message.model for order in offers} for signer, offers in self._offers().items()}
+        for job in self._contracts.jobs.values():
+            found.setdefault(job.liability.promisor, set()).add(job.liability.model)
+        return found
+
+
+def _health(status: RoleStatus | None) -> str:
+    if status is None:
+        return "silent"
+    if isinstance(status, BridgeStatus):
+        return "alive" if status.state in ("connected", "alone") else "degraded"
+    return "alive" if all(state in (ALIVE, OFF) for state in status.parts.values()) else "degraded"

@@ -1,0 +1,300 @@
+"""The page's HTTP server: what is open, who may do what, and the protection against other sites' pages."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import ipaddress
+import logging
+import secrets
+import ssl
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+
+import msgspec
+from aiohttp import web
+
+from bridges.web.api import Api, answer, body_of
+from bridges.web.errors import (
+    InvalidRequest,
+    LoginRequired,
+    NotOpenToOthers,
+    PageNotFound,
+    TooManyRequests,
+    WrongHost,
+    WrongOrigin,
+    status_of,
+)
+from bridges.web.files import Files
+from bridges.web.jobs import Views
+from bridges.web.market import Market
+from bridges.web.orders import OrderPublisher
+from bridges.web.stream import Stream
+from mesh.background import Background
+from mesh.errors import AiraError
+from mesh.flood import BoundedDict, Rate, RateLimiter
+from mesh.log_context import log_event
+from mesh.role import Lifecycle
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from contextlib import AsyncExitStack
+
+    from bridges.web.components import WebComponents
+
+    Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+log = logging.getLogger(__name__)
+
+STATIC: Final = Path(__file__).with_name("static")
+OWN_HEADER: Final = "X-Aira-Request"
+COOKIE: Final = "aira_session"
+REQUESTS: Final = Rate(per_second=50, burst=400)
+"""Requests of one address."""
+REQUESTS_IN_TOTAL: Final = Rate(per_second=500, burst=2000)
+LOGINS: Final = Rate(per_second=0.2, burst=10)
+"""Attempts to log in, of one address."""
+SESSIONS: Final = 1024
+LONGEST_BODY: Final = 1 << 20
+"""Bytes of a body that is no objective."""
+SESSION_SECONDS: Final = 12 * 3600.0
+AGENTS_INTERVAL: Final = 3.0
+"""Seconds between two lists of agents on the stream."""
+OPEN_PATHS: Final = ("/api/v1/session", "/api/v1/openapi.json")
+"""Parts of the interface that need no login."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WebOptions:
+    """How the page is served."""
+
+    host: str = "127.0.0.1"
+    port: int = 8585
+    names: tuple[str, ...] = ()
+    """Names besides its own address by which browsers reach it (`HOST` or `HOST:PORT`)."""
+    token: str = field(default="", repr=False)
+    """What people log in with; empty: no login."""
+    operator_token: str = field(default="", repr=False)
+    certificate: str = ""
+    key: str = ""
+    embed: tuple[str, ...] = ()
+    """Origins that may show the page in a frame."""
+    robot: dict[str, Any] | None = None
+    """The one robot that the page orders from: see Robot in openapi.json."""
+    explorer: str = ""
+    from_block: int = 0
+    static: Path = STATIC
+
+    def check(self) -> None:
+        """Raise `NotOpenToOthers` for a server that other machines can reach without TLS and login."""
+        if is_loopback(self.host):
+            return
+        if not (self.certificate and self.key and (self.token or self.operator_token)):
+            raise NotOpenToOthers(
+                f"other machines can reach {self.host}: that needs TLS and a login",
+                hint="give --certificate, --key and --token-file, or listen on 127.0.0.1",
+            )
+
+
+class PageServer(Lifecycle):
+    """Serves the page: `async with PageServer(components, options) as server`; then `server.url`."""
+
+    title = "page server"
+
+    def __init__(self, components: WebComponents, options: WebOptions) -> None:
+        options.check()
+        self.components = components
+        self.options = options
+        self.stream = Stream()
+        self.market = Market(components, self.stream, from_block=options.from_block)
+        self.files = Files(components)
+        self.views = Views(components, self.market, self.files)
+        self.publisher = OrderPublisher(components, self.market)
+        self.url = ""
+        self._hosts: frozenset[str] = frozenset()
+        self._limiter = RateLimiter(per_sender=REQUESTS, total=REQUESTS_IN_TOTAL)
+        self._logins = RateLimiter(per_sender=LOGINS)
+        self._sessions: BoundedDict[str, tuple[str, float]] = BoundedDict(SESSIONS)
+        self._chain_asked = float("-inf")
+        self._has_chain = True
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        enter = stack.enter_async_context
+        await enter(self.market)
+        await enter(self.publisher)
+        tasks = await enter(Background())
+        tasks.start(self._show_agents(), "page: agents")
+        tasks.start(self.components.drops.run(), "page: drops")
+        app = web.Application(middlewares=[self._guarded], client_max_size=LONGEST_BODY)
+        app.add_routes([*Api(self).routes(), web.post("/api/v1/session", self._log_in)])
+        app.router.add_get("/{path:.*}", self._static)
+        app.on_shutdown.append(lambda _: self.stream.close())
+        runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0)
+        await runner.setup()
+        stack.push_async_callback(runner.cleanup)
+        site = web.TCPSite(runner, self.options.host, self.options.port, ssl_context=self._tls())
+        await site.start()
+        port = runner.addresses[0][1]
+        host = f"[{self.options.host}]" if ":" in self.options.host else self.options.host
+        self.url = f"{'https' if self.options.certificate else 'http'}://{host}:{port}"
+        own = {f"{host}:{port}", *(name if ":" in name else f"{name}:{port}" for name in self.options.names)}
+        if is_loopback(self.options.host):
+            own |= {f"{name}:{port}" for name in ("localhost", "127.0.0.1", "[::1]")}
+        self._hosts = frozenset(own | set(self.options.names))
+
+    def role_of(self, request: web.Request) -> str:
+        """`operator` or `anybody`: what the session of a request may do."""
+        return self._session_of(request) or "anybody"
+
+    async def has_chain(self) -> bool:
+        """Whether the node answers; asked once in three seconds."""
+        if time.monotonic() - self._chain_asked > AGENTS_INTERVAL:
+            self._chain_asked = time.monotonic()
+            try:
+                async with asyncio.timeout(2.0):
+                    await self.components.chain.block_number()
+                self._has_chain = True
+            except (AiraError, TimeoutError):
+                self._has_chain = False
+        return self._has_chain
+
+    @web.middleware
+    async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Check a request, answer errors in JSON, and add the headers that protect the page."""
+        try:
+            self._check(request)
+            response = await handler(request)
+        except AiraError as error:
+            response = _failure(error)
+        except web.HTTPRequestEntityTooLarge:
+            response = _failure(InvalidRequest(f"a body has at most {LONGEST_BODY} bytes"))
+        except web.HTTPException as error:
+            response = _failure(PageNotFound(error.reason)) if error.status == 404 else error
+        except (ConnectionError, asyncio.CancelledError):
+            raise
+        except Exception:
+            log.exception("a request failed", extra=log_event("page-request-failed", path=request.path))
+            response = answer({"error": {"code": "error", "message": "the server failed; see its log", "hint": ""}})
+            response.set_status(500)
+        if not response.prepared:
+            for name, value in self._headers().items():
+                response.headers.setdefault(name, value)
+            if request.path.startswith("/api/"):
+                response.headers.setdefault("Cache-Control", "no-store")
+        return response
+
+    def _check(self, request: web.Request) -> None:
+        sender = request.remote or ""
+        if not self._limiter.allow(sender):
+            self.components.drops.count("page-request", sender)
+            raise TooManyRequests("too many requests", hint="wait a moment")
+        if request.host not in self._hosts:
+            raise WrongHost(f"this server is not {request.host[:80]!r}", hint="name it with --name")
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc not in self._hosts:
+            raise WrongOrigin("pages of other sites may not use this server")
+        is_api = request.path.startswith("/api/") or request.path == "/rpc"
+        if is_api and request.headers.get("Sec-Fetch-Site") == "cross-site":
+            raise WrongOrigin("pages of other sites may not use this server")
+        if request.method not in ("GET", "HEAD"):
+            if request.headers.get(OWN_HEADER) != "1":
+                raise WrongOrigin(f"the header {OWN_HEADER} is missing")
+            if request.content_type not in ("application/json", "application/octet-stream"):
+                raise InvalidRequest("a body is application/json, or application/octet-stream for an objective")
+        if is_api and request.path not in OPEN_PATHS and self._needs_login and self._session_of(request) is None:
+            raise LoginRequired("log in first", hint="the token is in the server's token file")
+
+    @property
+    def _needs_login(self) -> bool:
+        return bool(self.options.token) or not is_loopback(self.options.host)
+
+    def _session_of(self, request: web.Request) -> str | None:
+        """The role of a request's session; None if it has none."""
+        role, until = self._sessions.get(request.cookies.get(COOKIE, ""), ("", 0.0))
+        return role if time.monotonic() < until else None
+
+    async def _log_in(self, request: web.Request) -> web.Response:
+        if not self._logins.allow(request.remote or ""):
+            raise TooManyRequests("too many attempts to log in", hint="wait a minute")
+        given = (await body_of(request, LoginRequest)).token.encode()
+        roles = (("operator", self.options.operator_token), ("anybody", self.options.token))
+        role = next((name for name, token in roles if token and hmac.compare_digest(token.encode(), given)), None)
+        if role is None:
+            raise LoginRequired("this is not the token")
+        session = secrets.token_urlsafe(32)
+        self._sessions[session] = role, time.monotonic() + SESSION_SECONDS
+        response = answer({"role": role})
+        secure = bool(self.options.certificate)
+        response.set_cookie(
+            COOKIE, session, max_age=int(SESSION_SECONDS), httponly=True, samesite="Strict", secure=secure
+        )
+        return response
+
+    def _headers(self) -> dict[str, str]:
+        frames = " ".join(self.options.embed) or "'none'"
+        return {
+            "Content-Security-Policy": "default-src 'self'; style-src 'self'; img-src 'self' data: blob:;"
+            f" object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors {frames}",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
+        }
+
+    async def _static(self, request: web.Request) -> web.StreamResponse:
+        """A built file; any other path that looks like no file is the page itself, which has its own routes."""
+        root = self.options.static
+        path = (root / request.match_info["path"].lstrip("/")).resolve()
+        if path.is_file() and path.is_relative_to(root.resolve()):
+            return web.FileResponse(path, headers={"Cache-Control": "no-cache"})
+        index = root / "index.html"
+        if "." in request.path.rpartition("/")[2] or request.path.startswith("/api/") or not index.is_file():
+            raise PageNotFound(f"there is no {request.path[:80]}")
+        return web.FileResponse(index, headers={"Cache-Control": "no-cache"})
+
+    async def _show_agents(self) -> None:
+        """Publish the agents while somebody looks at them."""
+        last: bytes = b""
+        while True:
+            await asyncio.sleep(AGENTS_INTERVAL)
+            if not self.stream.has_subscribers("agents"):
+                continue
+            try:
+                agents = await self.views.agents()
+            except AiraError as error:
+                log.debug("the agents can't be listed: %s", error)
+                continue
+            if (text := msgspec.json.encode(agents)) != last:
+                last = text
+                self.stream.publish("agents", "agents", agents)
+
+    def _tls(self) -> ssl.SSLContext | None:
+        if not self.options.certificate:
+            return None
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        context.load_cert_chain(Path(self.options.certificate).expanduser(), Path(self.options.key).expanduser())
+        return context
+
+
+class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A token to log in with."""
+
+    token: str
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a host."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _failure(error: AiraError) -> web.Response:
+    facts = {"code": error.code, "message": str(error), "hint": error.hint}
+    if (reason := getattr(error, "reason", None)) is not None and isinstance(reason, str):
+        facts["reason"] = reason
+    return answer({"error": facts}, status=status_of(error))
