@@ -1,0 +1,193 @@
+// What all pages share: the market, the account that orders, and how it signs.
+
+import { createContext } from "preact";
+import type { ComponentChildren } from "preact";
+import { useCallback, useContext, useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { getAddress } from "viem";
+import type { Address, Hex } from "viem";
+import { ApiError, get } from "./api";
+import { stream } from "./stream";
+import { texts } from "./texts";
+import type { Market, StreamEvent } from "./types";
+import { WalletError, announcedWallets, ask, switchChain, transact, watchWallets } from "./wallet";
+import type { Announced } from "./wallet";
+
+export type Account =
+  | { kind: "local"; address: Address }
+  | { kind: "wallet"; address: Address; wallet: Announced; chainId: number };
+
+interface App {
+  market: Market;
+  block: number;
+  account: Account | null;
+  connect: (wallet: Announced) => Promise<void>;
+  useLocal: () => void;
+  disconnect: () => void;
+  fixChain: () => Promise<void>;
+  /** Sends a transaction from the connected wallet. */
+  send: (to: Address, data: Hex) => Promise<Hex>;
+  notify: (text: string, kind?: "good" | "bad") => void;
+  reloadMarket: () => void;
+}
+
+const Context = createContext<App | null>(null);
+const REMEMBERED = "aira-wallet";
+
+export function useApp(): App {
+  return useContext(Context)!;
+}
+
+export function AppProvider(props: { market: Market; reloadMarket: () => void; children: ComponentChildren }) {
+  const { market, reloadMarket } = props;
+  const [block, setBlock] = useState(market.block);
+  const [account, setAccount] = useState<Account | null>(null);
+  const [notes, setNotes] = useState<{ id: number; text: string; kind: string }[]>([]);
+  const lastNote = useRef(0);
+
+  useTopic("chain", (event) => event.kind === "block" && setBlock(event.data.number));
+
+  const notify = useCallback((text: string, kind: "good" | "bad" = "good") => {
+    const id = ++lastNote.current;
+    setNotes((known) => [...known.slice(-3), { id, text, kind }]);
+    setTimeout(() => setNotes((known) => known.filter((note) => note.id !== id)), 9000);
+  }, []);
+
+  const adopt = useCallback(async (wallet: Announced, method: string) => {
+    const accounts: string[] = await ask(wallet.provider, method);
+    if (!accounts.length) return;
+    const chainId = Number(await ask(wallet.provider, "eth_chainId"));
+    setAccount({ kind: "wallet", address: getAddress(accounts[0]), wallet, chainId });
+    localStorage.setItem(REMEMBERED, wallet.info.rdns);
+  }, []);
+
+  const connect = useCallback((wallet: Announced) => adopt(wallet, "eth_requestAccounts"), [adopt]);
+  const useLocal = useCallback(() => {
+    if (market.account) setAccount({ kind: "local", address: market.account });
+    localStorage.setItem(REMEMBERED, "local");
+  }, [market.account]);
+  const disconnect = useCallback(() => {
+    setAccount(null);
+    localStorage.removeItem(REMEMBERED);
+  }, []);
+
+  // The account of the last visit, if its wallet still gives it without asking.
+  useEffect(() => {
+    const remembered = localStorage.getItem(REMEMBERED);
+    if (remembered === "local" && market.account) useLocal();
+    const resume = () => {
+      const wallet = announcedWallets().find((one) => one.info.rdns === remembered);
+      if (wallet) adopt(wallet, "eth_accounts").catch(() => {});
+    };
+    resume();
+    return watchWallets(resume);
+  }, []);
+
+  const wallet = account?.kind === "wallet" ? account.wallet : null;
+  useEffect(() => {
+    if (!wallet) return;
+    let current = true;
+    wallet.provider.on?.("accountsChanged", (accounts: string[]) => {
+      if (!current) return;
+      if (accounts.length) setAccount((known) => known?.kind === "wallet" ? { ...known, address: getAddress(accounts[0]) } : known);
+      else disconnect();
+    });
+    wallet.provider.on?.("chainChanged", (chainId: string) => {
+      if (current) setAccount((known) => known?.kind === "wallet" ? { ...known, chainId: Number(chainId) } : known);
+    });
+    return () => {
+      current = false;
+    };
+  }, [wallet]);
+
+  const app = useMemo<App>(() => {
+    const connected = () => {
+      if (account?.kind !== "wallet") throw new WalletError(texts.needsWallet, false, false);
+      return account;
+    };
+    return {
+      market,
+      block,
+      account,
+      connect,
+      useLocal,
+      disconnect,
+      notify,
+      reloadMarket,
+      fixChain: async () => {
+        const { wallet } = connected();
+        await switchChain(wallet.provider, market.chainId);
+        const chainId = Number(await ask(wallet.provider, "eth_chainId"));
+        setAccount((known) => known?.kind === "wallet" ? { ...known, chainId } : known);
+      },
+      send: async (to, data) => {
+        const { wallet, address, chainId } = connected();
+        if (chainId !== market.chainId) throw new WalletError(texts.wrongChain(chainId, market.chainId), false, false);
+        return transact(wallet.provider, address, to, data);
+      },
+    };
+  }, [market, block, account]);
+
+  return (
+    <Context.Provider value={app}>
+      {props.children}
+      <div class="notes" role="status" aria-live="polite">
+        {notes.map((note) => <p key={note.id} class={`note ${note.kind}`}>{note.text}</p>)}
+      </div>
+    </Context.Provider>
+  );
+}
+
+/** The words for an error of any kind. */
+export function wordsOf(error: unknown): string {
+  if (error instanceof ApiError) return error.hint ? `${error.message} — ${error.hint}` : error.message;
+  return error instanceof Error ? error.message : String(error);
+}
+
+/** Calls `listener` for the events of a topic, as long as the component is shown. */
+export function useTopic(topic: string | null, listener: (event: StreamEvent) => void): void {
+  const latest = useRef(listener);
+  latest.current = listener;
+  useEffect(() => (topic ? stream.on(topic, (event) => latest.current(event)) : undefined), [topic]);
+}
+
+export function useLive(): boolean {
+  const [live, setLive] = useState(stream.live);
+  useEffect(() => stream.watch(setLive), []);
+  return live;
+}
+
+export interface Loaded<T> {
+  data: T | null;
+  error: unknown;
+  loading: boolean;
+  reload: () => void;
+}
+
+/** What the server answers at `path`; read again by `reload`, which keeps what is shown meanwhile. */
+export function useData<T>(path: string | null): Loaded<T> {
+  const [state, setState] = useState<{ path: string | null; data: T | null; error: unknown; loading: boolean }>({
+    path, data: null, error: null, loading: path !== null,
+  });
+  const [turn, setTurn] = useState(0);
+  const waiting = useRef<ReturnType<typeof setTimeout> | null>(null);
+  useEffect(() => {
+    if (path === null) return setState({ path, data: null, error: null, loading: false });
+    const stopped = new AbortController();
+    setState((known) => ({ path, data: known.path === path ? known.data : null, error: null, loading: true }));
+    get<T>(path, stopped.signal).then(
+      (data) => setState({ path, data, error: null, loading: false }),
+      (error) => {
+        if (!stopped.signal.aborted) setState((known) => ({ ...known, error, loading: false }));
+      },
+    );
+    return () => stopped.abort();
+  }, [path, turn]);
+  const reload = useCallback(() => {
+    waiting.current ??= setTimeout(() => {
+      waiting.current = null;
+      setTurn((known) => known + 1);
+    }, 60);
+  }, []);
+  const current = state.path === path;
+  return { data: current ? state.data : null, error: current ? state.error : null, loading: !current || state.loading, reload };
+}

@@ -1,0 +1,77 @@
+// From a draft to a signed and published demand.
+
+import { zeroAddress } from "viem";
+import type { Address, Hex } from "viem";
+import { get, post, postText } from "./api";
+import type { Account } from "./app";
+import { canonicalSignature, encodeWire, orderHash, randomNonce, signerOf, withdrawalHash } from "./messages";
+import type { Demand } from "./messages";
+import { texts } from "./texts";
+import { ServerLies, checkAsked, checkOrder, rememberOrder } from "./trust";
+import type { AccountState, Market, Order, PostedOrder } from "./types";
+import { personalSign } from "./wallet";
+
+export interface Draft {
+  model: string;
+  objective: string;
+  cost: bigint;
+  validator: Address;
+  validatorFee: bigint;
+  lifetime: number;
+}
+
+/** The demand that a wallet is to sign, with a deadline and a nonce of now. */
+export async function prepare(draft: Draft, account: Address): Promise<{ demand: Demand; hash: Hex }> {
+  const [market, state] = await Promise.all([get<Market>("market"), get<AccountState>(`accounts/${account}`)]);
+  const demand: Demand = {
+    model: draft.model,
+    objective: draft.objective,
+    token: market.token.address,
+    cost: draft.cost,
+    lighthouse: market.lighthouse.address,
+    validator: draft.validator,
+    validatorFee: draft.validatorFee,
+    deadline: BigInt(market.block + draft.lifetime),
+    nonce: state.nonce === null ? randomNonce() : BigInt(state.nonce),
+    sender: state.nonce === null ? undefined : account,
+  };
+  return { demand, hash: orderHash(demand) };
+}
+
+/** Signs the hash of exactly these fields, and publishes the demand. Returns its hash. */
+export async function signAndPost(demand: Demand, shown: Hex, account: Account): Promise<string> {
+  if (account.kind !== "wallet") throw new Error(texts.needsWallet);
+  const hash = orderHash(demand);
+  if (hash !== shown) throw new ServerLies(texts.lieHash);
+  const signature = canonicalSignature(await personalSign(account.wallet.provider, hash, account.address));
+  if ((await signerOf(hash, signature)) !== account.address) throw new Error(texts.otherAccountSigned);
+  const posted = await postText<PostedOrder>("orders", encodeWire({ ...demand, signature }));
+  if (posted.order.hash !== hash.slice(2)) throw new ServerLies(texts.lieHash);
+  rememberOrder(posted.order.hash);
+  return posted.order.hash;
+}
+
+/** Lets the server's local account order. Returns the order's hash. */
+export async function orderLocally(draft: Draft, account: Address, market: Market): Promise<string> {
+  const { model, objective, lifetime } = draft;
+  const validator = draft.validator === zeroAddress ? "" : draft.validator;
+  const [cost, validatorFee] = [String(draft.cost), String(draft.validatorFee)];
+  const fields = { model, objective, cost, validator, validatorFee, token: "", lifetime };
+  const { order } = await post<PostedOrder>("local/orders", fields);
+  checkAsked(order, { model, objective, cost, account, market });
+  await checkOrder(order);
+  rememberOrder(order.hash);
+  return order.hash;
+}
+
+export async function withdraw(order: Order, account: Account): Promise<void> {
+  if (account.kind === "local") {
+    await post("local/withdrawals", { order: order.hash });
+    return;
+  }
+  const { lighthouse } = order;
+  const deadline = BigInt(order.deadline);
+  const hash = withdrawalHash({ order: `0x${order.hash}`, lighthouse, deadline });
+  const signature = canonicalSignature(await personalSign(account.wallet.provider, hash, account.address));
+  await postText("orders", encodeWire({ withdraws: order.hash, lighthouse, deadline, signature }));
+}

@@ -1,0 +1,167 @@
+import { useEffect, useState } from "preact/hooks";
+import { useApp, useData, useTopic, wordsOf } from "../app";
+import { calls } from "../contracts";
+import { amount, clock, duration, short } from "../format";
+import { texts } from "../texts";
+import { checkJob } from "../trust";
+import type { Finding, Job, Step } from "../types";
+import { Action, Badge, Facts, Money, Name, Show, Strange } from "../ui";
+import { JobState } from "./account";
+import { Steps } from "./follow";
+import { Recording } from "./recording";
+
+/** A job by its contract's address: terms, parties, files, timeline, and the checks. */
+export function JobPage(props: { address: string }) {
+  const job = useData<Job>(`liabilities/${props.address}`);
+  const [playback, setPlayback] = useState<Job["playback"]>(null);
+  useTopic(`liability/${props.address}`, (event) => {
+    if (event.kind === "playing" && event.data?.total) setPlayback(event.data);
+    else job.reload();
+  });
+  useTopic("chain", () => job.data && !job.data.liability.isFinalized && job.reload());
+  return (
+    <>
+      <h1>{texts.job} <Name text={props.address} /></h1>
+      <Show of={job}>{(known) => <JobView job={known} playback={playback ?? known.playback} changed={job.reload} />}</Show>
+    </>
+  );
+}
+
+const PHASES = { incoming: 2, ready: 2, running: 3, complete: 4, finalized: 5 };
+
+export function JobView(props: { job: Job; playback: Job["playback"]; changed: () => void }) {
+  const { job, playback } = props;
+  const { liability } = job;
+  const ended = liability.isFinalized;
+  const failed = ended && liability.state !== "paid";
+  const done = ended ? (failed ? 4 : 5) : PHASES[job.phase];
+  const share = playback && playback.total ? playback.position / playback.total : undefined;
+  return (
+    <>
+      <Steps done={done} active={!ended} failed={failed} share={job.phase === "running" || playback ? share : undefined} />
+      <p class="lead" aria-live="polite">
+        <JobState state={liability.state} /> {texts.jobStateLong[liability.state]}
+        {playback && !ended ? ` ${texts.played(playback.position, playback.total)}` : ""}
+      </p>
+      {job.reason ? <p class="problem"><Strange text={job.reason.text} /> <code>{job.reason.code}</code></p> : null}
+      <Refund job={job} changed={props.changed} />
+      <div class="columns">
+        <section>
+          <h2>{texts.terms}</h2>
+          <Facts
+            of={[
+              [texts.price, <Money units={liability.cost} token={liability.token} />],
+              [texts.person, <Name text={liability.promisee} href={`#/account/${liability.promisee}`} />],
+              [texts.robot, <Name text={liability.promisor} href={`#/account/${liability.promisor}`} />],
+              [texts.model, <Name text={liability.model} href={`#/order/model/${liability.model}`} />],
+              [texts.objective, <Name text={liability.objective} href={`#/file/${liability.objective}`} />],
+              [texts.result, liability.result ? <Name text={liability.result} href={`#/file/${liability.result}`} /> : texts.notYet],
+              [texts.validator, /^0x0+$/.test(liability.validator) ? "" : <Name text={liability.validator} />],
+              [texts.demand, job.demandHash ? <Name text={job.demandHash} href={`#/order/${job.demandHash}`} /> : ""],
+              [texts.offer, job.offerHash ? <Name text={job.offerHash} href={`#/order/${job.offerHash}`} /> : ""],
+            ]}
+          />
+        </section>
+        <section>
+          <h2>{texts.timeline}</h2>
+          <Timeline steps={job.timeline} />
+        </section>
+      </div>
+      {liability.result ? (
+        <section>
+          <h2>{texts.recording}</h2>
+          <Recording cid={liability.result} />
+        </section>
+      ) : null}
+      <Evidence job={job} />
+    </>
+  );
+}
+
+function Timeline(props: { steps: Step[] }) {
+  const { market } = useApp();
+  return (
+    <ol class="timeline">
+      {props.steps.map((step) => (
+        <li key={`${step.kind}${step.at}${step.block}`}>
+          <strong>{texts.stepName[step.kind] ?? step.kind}</strong>
+          <span class="quiet">
+            {step.at !== null ? clock(step.at) : ""} {step.block !== null ? texts.block(step.block) : ""}{" "}
+            {step.tx ? (market.explorer ? <a href={`${market.explorer}/tx/${step.tx}`} rel="noreferrer">{short(step.tx)}</a> : <Name text={step.tx} />) : null}
+          </span>
+          {step.detail ? <Strange text={step.detail} /> : null}
+        </li>
+      ))}
+    </ol>
+  );
+}
+
+function Refund(props: { job: Job; changed: () => void }) {
+  const { account, block, market, send, notify } = useApp();
+  const { liability, refundableFrom } = props.job;
+  if (liability.isFinalized || refundableFrom === null || account?.address !== liability.promisee) return null;
+  const left = refundableFrom - block;
+  if (left > 0) return <p class="hint">{texts.refundLater(amount(liability.cost, liability.token), refundableFrom, duration(left * market.blockTime))}</p>;
+  if (account.kind === "local") return <p class="callout">{texts.refundLocal(liability.address)}</p>;
+  const refund = async () => {
+    await send(market.factory, calls.refund(liability.address));
+    notify(texts.refunded);
+    props.changed();
+  };
+  return (
+    <div class="callout">
+      <p>{texts.refundNow}</p>
+      <Action id="refund" run={refund}>{texts.refundButton(amount(liability.cost, liability.token))}</Action>
+    </div>
+  );
+}
+
+/** What this browser checked itself, and beside it the checklist that the server made. */
+function Evidence({ job }: { job: Job }) {
+  const { account, market } = useApp();
+  const [own, setOwn] = useState<Finding[]>([]);
+  const [error, setError] = useState("");
+  const { liability } = job;
+  const verification = useData<{ holds: boolean; findings: Finding[] }>(liability.isFinalized ? `liabilities/${liability.address}/verification` : null);
+  useEffect(() => {
+    let current = true;
+    setOwn([]);
+    (async () => {
+      for await (const finding of checkJob(job, account, market)) if (current) setOwn((known) => [...known, finding]);
+    })().catch((problem) => setError(wordsOf(problem)));
+    return () => {
+      current = false;
+    };
+  }, [liability.address, liability.isFinalized, liability.result, job.resultMessage?.signature, account?.address]);
+  const lies = own.filter((finding) => finding.holds === false);
+  return (
+    <section>
+      <h2>{texts.checks}</h2>
+      {lies.length ? <p class="problem" role="alert" id="lie">{texts.serverLies}</p> : null}
+      {error ? <p class="problem">{error}</p> : null}
+      <div class="columns">
+        <div>
+          <h3>{texts.byBrowser}</h3>
+          <Findings of={own} names={texts.ownCheck} />
+        </div>
+        <div>
+          <h3>{texts.byServer}</h3>
+          {liability.isFinalized ? <Show of={verification}>{({ findings }) => <Findings of={findings} names={texts.check} />}</Show> : <p class="quiet">{texts.checksLater}</p>}
+        </div>
+      </div>
+    </section>
+  );
+}
+
+function Findings(props: { of: Finding[]; names: Record<string, string> }) {
+  return (
+    <ul class="findings">
+      {props.of.map((finding) => (
+        <li key={finding.name}>
+          <Badge kind={finding.holds === null ? "calm" : finding.holds ? "good" : "bad"}>{finding.holds === null ? texts.open : finding.holds ? texts.holds : texts.fails}</Badge>
+          <span><strong>{props.names[finding.name] ?? finding.name}</strong> <Strange text={finding.detail} /></span>
+        </li>
+      ))}
+    </ul>
+  );
+}

@@ -1,0 +1,42 @@
+import { useState } from "preact/hooks";
+import { query } from "../api";
+import { useApp, useData, useTopic } from "../app";
+import { texts } from "../texts";
+import type { Liability } from "../types";
+import { Field, Show } from "../ui";
+import { JobTable } from "./account";
+
+/** All jobs, or those of the account; newest first. */
+export function JobsPage() {
+  const { account } = useApp();
+  const [state, setState] = useState("");
+  const [mine, setMine] = useState(false);
+  const [wanted, setWanted] = useState("");
+  const party = mine ? account?.address : undefined;
+  const jobs = useData<{ liabilities: Liability[]; more: boolean }>(`liabilities${query({ state, party, limit: 100 })}`);
+  useTopic("chain", jobs.reload);
+  return (
+    <>
+      <h1>{texts.jobs}</h1>
+      <form class="row end" onSubmit={(event) => { event.preventDefault(); if (wanted) location.hash = `#/job/${wanted}`; }}>
+        <Field label={texts.state}>
+          {(id) => (
+            <select id={id} value={state} onChange={(event) => setState(event.currentTarget.value)}>
+              <option value="">{texts.all}</option>
+              <option value="open">{texts.jobState.open}</option>
+              <option value="finalized">{texts.ended}</option>
+            </select>
+          )}
+        </Field>
+        {account ? (
+          <label class="check"><input type="checkbox" checked={mine} onChange={(event) => setMine(event.currentTarget.checked)} /> {texts.onlyMine}</label>
+        ) : null}
+        <Field label={texts.byAddress}>
+          {(id) => <input id={id} class="wide" placeholder="0x…" spellcheck={false} value={wanted} onInput={(event) => setWanted(event.currentTarget.value.trim())} />}
+        </Field>
+        <button class="button small" disabled={!/^0x[0-9a-fA-F]{40}$/.test(wanted)}>{texts.show}</button>
+      </form>
+      <Show of={jobs}>{({ liabilities, more }) => <><JobTable liabilities={liabilities} />{more ? <p class="hint">{texts.moreJobs}</p> : null}</>}</Show>
+    </>
+  );
+}

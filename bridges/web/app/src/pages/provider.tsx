@@ -1,0 +1,137 @@
+import { useState } from "preact/hooks";
+import { useApp, useData, useTopic } from "../app";
+import { calls } from "../contracts";
+import { amount, duration, ether, parseAmount } from "../format";
+import { texts } from "../texts";
+import type { AccountState, Lighthouse, Order } from "../types";
+import { Action, Badge, Facts, Field, Money, Name, Show, Strange, Table } from "../ui";
+
+/** The lighthouse for those who run it: providers, turns, gas and earnings, stakes, the order book. */
+export function ProviderPage() {
+  const { market, account } = useApp();
+  const lighthouse = useData<Lighthouse>("lighthouse");
+  const orders = useData<{ orders: Order[]; dropped: number }>("orders?limit=100");
+  useTopic("chain", () => { lighthouse.reload(); orders.reload(); });
+  return (
+    <>
+      <h1>{texts.providerTitle}</h1>
+      <Show of={lighthouse}>
+        {(known) => (
+          <>
+            <Facts
+              of={[
+                [texts.lighthouse, <><Strange text={known.name} /> <Name text={known.address} /></>],
+                [texts.minimalStake, <Money units={known.minimalStake} token={market.xrt} />],
+                [texts.turnLength, texts.blocks(known.timeoutBlocks)],
+                [texts.hasTurn, <Name text={known.current} />],
+                [texts.quotaLeft, known.quotaLeft],
+                [texts.gasPrice, ether(known.gasPrice)],
+              ]}
+            />
+            <h2>{texts.providers}</h2>
+            <Table label={texts.providers} head={[texts.account, texts.stake, texts.quota, texts.turn, texts.bookOrders, texts.contractsMade, texts.feesAndMinted, texts.gasSpent]} numbers={[1, 2]} empty={texts.noProviders}>
+              {known.providers.map((provider) => (
+                <tr key={provider.address}>
+                  <td><Name text={provider.address} href={`#/account/${provider.address}`} /></td>
+                  <td class="right"><Money units={provider.stake} token={market.xrt} /></td>
+                  <td class="right">{provider.quota}</td>
+                  <td>{provider.hasTurn ? <Badge kind="good">{texts.itsTurn}</Badge> : ""}</td>
+                  <td>{provider.status?.market?.openOrders ?? "—"}</td>
+                  <td>{provider.status?.market ? `${provider.status.market.created} / ${provider.status.market.finalized}` : "—"}</td>
+                  <td>{provider.status?.market ? `${amount(provider.status.market.fees, market.xrt)} + ${amount(provider.status.market.minted, market.xrt)}` : "—"}</td>
+                  <td>{provider.status?.market ? ether(provider.status.market.spent) : "—"}</td>
+                </tr>
+              ))}
+            </Table>
+            <h2>{texts.yourStake}</h2>
+            {account?.kind === "wallet" ? <Stake lighthouse={known} address={account.address} changed={lighthouse.reload} /> : <p class="callout">{texts.stakeNeedsWallet}</p>}
+          </>
+        )}
+      </Show>
+      <h2>{texts.orderBook}</h2>
+      <Show of={orders}>
+        {({ orders: open }) => (
+          <Table label={texts.orderBook} head={[texts.order, texts.what, texts.by, texts.price, texts.model, texts.validUntil]} numbers={[3]} empty={texts.noOrders}>
+            {open.map((order) => (
+              <tr key={order.hash}>
+                <td><Name text={order.hash} href={`#/order/${order.hash}`} /></td>
+                <td><span class={`kind ${order.kind}`}>{texts.eventName[order.kind]}</span></td>
+                <td><Name text={order.signer} /></td>
+                <td class="right">{amount(order.cost, market.token)}</td>
+                <td><Name text={order.model} /></td>
+                <td>{texts.block(order.deadline)}</td>
+              </tr>
+            ))}
+          </Table>
+        )}
+      </Show>
+    </>
+  );
+}
+
+function Stake(props: { lighthouse: Lighthouse; address: string; changed: () => void }) {
+  const { market, send, notify } = useApp();
+  const state = useData<AccountState>(`accounts/${props.address}`);
+  const [value, setValue] = useState("");
+  const units = parseAmount(value, market.xrt.decimals);
+  const done = (text: string) => {
+    notify(text);
+    state.reload();
+    props.changed();
+  };
+  const stake = async () => {
+    // The contract that takes the stake is the lighthouse; it needs an allowance of its own.
+    await send(market.xrt.address, calls.approve(props.lighthouse.address, units!));
+    await send(props.lighthouse.address, calls.refill(units!));
+    done(texts.staked);
+  };
+  const takeBack = async () => {
+    await send(props.lighthouse.address, calls.withdraw(units!));
+    done(texts.stakeWithdrawn);
+  };
+  return (
+    <>
+      <Show of={state}>
+        {(known) => <Facts of={[[texts.stake, <Money units={known.stake} token={market.xrt} />], [texts.balance, <Money units={known.xrt.balance} token={market.xrt} />], [texts.gas, ether(known.eth)]]} />}
+      </Show>
+      <div class="row end">
+        <Field label={texts.stakeAmount} error={value && units === null ? texts.notAnAmount : ""}>
+          {(id) => <input id={id} inputMode="decimal" value={value} onInput={(event) => setValue(event.currentTarget.value)} />}
+        </Field>
+        <Action id="stake" class="button" disabled={!units} run={stake}>{texts.stakeButton}</Action>
+        <Action id="unstake" class="button quietly" disabled={!units} run={takeBack}>{texts.withdrawStake}</Action>
+      </div>
+      <p class="hint">{texts.stakeHint}</p>
+      <CreateLighthouse done={done} />
+    </>
+  );
+}
+
+function CreateLighthouse(props: { done: (text: string) => void }) {
+  const { market, send } = useApp();
+  const [name, setName] = useState("");
+  const [stake, setStake] = useState("1");
+  const [blocks, setBlocks] = useState(10);
+  const units = parseAmount(stake, market.xrt.decimals);
+  const create = async () => {
+    await send(market.factory, calls.createLighthouse(units!, BigInt(blocks), name));
+    props.done(texts.lighthouseCreated(name));
+  };
+  return (
+    <details class="more">
+      <summary>{texts.createLighthouse}</summary>
+      <div class="fields">
+        <Field label={texts.name} hint={texts.lighthouseNameHint}>
+          {(id, described) => <input id={id} aria-describedby={described} value={name} spellcheck={false} onInput={(event) => setName(event.currentTarget.value.trim())} />}
+        </Field>
+        <Field label={texts.minimalStake} error={units === null ? texts.notAnAmount : ""}>
+          {(id) => <input id={id} inputMode="decimal" value={stake} onInput={(event) => setStake(event.currentTarget.value)} />}
+        </Field>
+        <Field label={texts.turnLength} hint={duration(blocks * market.blockTime)}>
+          {(id) => <input id={id} type="number" min={1} value={blocks} onInput={(event) => setBlocks(Math.max(1, Number(event.currentTarget.value)))} />}
+        </Field>
+      </div>
+      <Action disabled={!name || !units} run={create}>{texts.createLighthouse}</Action>
+    </details>
+  );
+}

@@ -1,0 +1,149 @@
+// What the browser checks itself, so that a server that lies is caught.
+
+import type { Address, Hex } from "viem";
+import { getBytes, post } from "./api";
+import type { Account } from "./app";
+import { cidOf } from "./cid";
+import { cidText, read } from "./contracts";
+import type { Reader } from "./contracts";
+import { orderHash, resultHash, signerOf } from "./messages";
+import type { Demand, Offer } from "./messages";
+import { texts } from "./texts";
+import type { Finding, Job, Market, Order } from "./types";
+import { ask } from "./wallet";
+
+const LARGEST = 64 * 1024 * 1024;
+const REMEMBERED = "aira-orders";
+const MOST_REMEMBERED = 200;
+
+/** The server said what can't be true. */
+export class ServerLies extends Error {}
+
+/** An order as the server writes it, in the form that is hashed. */
+export function orderOf(order: Order): Demand | Offer {
+  const terms = {
+    model: order.model,
+    objective: order.objective,
+    token: order.token,
+    cost: BigInt(order.cost),
+    lighthouse: order.lighthouse,
+    validator: order.validator,
+    deadline: BigInt(order.deadline),
+    nonce: order.sender ? BigInt(order.nonce) : order.nonce,
+    sender: order.sender ?? undefined,
+  };
+  if (order.kind === "demand") return { ...terms, validatorFee: BigInt(order.validatorFee ?? "0") };
+  return { ...terms, lighthouseFee: BigInt(order.lighthouseFee ?? "0") };
+}
+
+/** Throws `ServerLies` unless the order's fields have the hash and the signature that the server gives. */
+export async function checkOrder(order: Order): Promise<void> {
+  const hash = orderHash(orderOf(order));
+  if (hash.slice(2) !== order.hash) throw new ServerLies(texts.lieHash);
+  const signer = await signerOf(hash, order.signature).catch(() => null);
+  if (signer !== order.signer) throw new ServerLies(texts.lieSigner);
+}
+
+/** Throws `ServerLies` if an order that the local account made is not the one that was asked for. */
+export function checkAsked(order: Order, asked: { model: string; objective: string; cost: string; account: Address; market: Market }): void {
+  const { model, objective, cost, account, market } = asked;
+  const same =
+    order.kind === "demand" && order.model === model && order.objective === objective && order.cost === cost &&
+    order.signer === account && order.token === market.token.address && order.lighthouse === market.lighthouse.address;
+  if (!same) throw new ServerLies(texts.lieAsked);
+}
+
+export function rememberOrder(hash: string): void {
+  const known = ownOrders().filter((one) => one !== hash);
+  localStorage.setItem(REMEMBERED, JSON.stringify([hash, ...known].slice(0, MOST_REMEMBERED)));
+}
+
+/** The hashes of the orders that this browser made, newest first. */
+export function ownOrders(): string[] {
+  try {
+    const known = JSON.parse(localStorage.getItem(REMEMBERED) ?? "[]");
+    return Array.isArray(known) ? known.filter((one) => typeof one === "string") : [];
+  } catch {
+    return [];
+  }
+}
+
+/** Reads contracts through the wallet's node if it is on the same chain: the server can't change those answers. */
+export function readerFor(account: Account | null, market: Market): { reader: Reader; independent: boolean } {
+  if (account?.kind === "wallet" && account.chainId === market.chainId) {
+    const { provider } = account.wallet;
+    return { reader: (to, data) => ask(provider, "eth_call", [{ to, data }, "latest"]), independent: true };
+  }
+  return { reader: throughServer, independent: false };
+}
+
+async function throughServer(to: Address, data: Hex): Promise<Hex> {
+  const answer = await post<{ result?: Hex; error?: { message: string } }>("../../rpc", {
+    jsonrpc: "2.0", id: 1, method: "eth_call", params: [{ to, data }, "latest"],
+  });
+  if (answer.result === undefined) throw new Error(answer.error?.message ?? texts.unreachable);
+  return answer.result;
+}
+
+type Check = (job: Job, reader: Reader, independent: boolean) => Promise<Finding>;
+
+/** The checks of a job that the browser makes itself, one after the other. */
+export async function* checkJob(job: Job, account: Account | null, market: Market): AsyncGenerator<Finding> {
+  const { reader, independent } = readerFor(account, market);
+  for (const check of [checkContract, checkOwnOrder, checkSignature, checkFile("objective"), checkFile("result")] as Check[]) {
+    try {
+      yield await check(job, reader, independent);
+    } catch (error) {
+      yield { name: "open", holds: null, detail: String((error as Error).message ?? error) };
+    }
+  }
+}
+
+async function checkContract({ liability }: Job, reader: Reader, independent: boolean): Promise<Finding> {
+  const { address } = liability;
+  const [model, objective, result, promisee, promisor, token, cost, isFinalized, isSuccess] = await Promise.all([
+    read(reader, address, "model").then(cidText),
+    read(reader, address, "objective").then(cidText),
+    read(reader, address, "result").then(cidText),
+    read(reader, address, "promisee"),
+    read(reader, address, "promisor"),
+    read(reader, address, "token"),
+    read(reader, address, "cost"),
+    read(reader, address, "isFinalized"),
+    read(reader, address, "isSuccess"),
+  ]);
+  const found = { model, objective, result, promisee, promisor, token, cost: String(cost), isFinalized, isSuccess };
+  const said: Record<string, unknown> = { ...liability, token: liability.token.address };
+  const wrong = Object.entries(found).filter(([name, value]) => said[name] !== value).map(([name]) => name);
+  const where = independent ? texts.walletsNode : texts.serversNode;
+  if (wrong.length) return { name: "contract", holds: false, detail: texts.contractDiffers(wrong.join(", "), where) };
+  return { name: "contract", holds: independent ? true : null, detail: texts.contractAgrees(where, independent) };
+}
+
+async function checkOwnOrder(job: Job, reader: Reader): Promise<Finding> {
+  const hash = String(await read(reader, job.liability.address, "demandHash")).slice(2);
+  if (ownOrders().includes(hash)) return { name: "order", holds: true, detail: texts.ownOrder };
+  return { name: "order", holds: null, detail: texts.notOwnOrder };
+}
+
+async function checkSignature({ liability, resultMessage }: Job): Promise<Finding> {
+  if (!resultMessage) return { name: "signature", holds: null, detail: texts.noResultMessage };
+  const signer = await signerOf(resultHash(resultMessage), resultMessage.signature).catch(() => null);
+  const belongs = resultMessage.liability === liability.address && (!liability.result || resultMessage.result === liability.result);
+  if (signer !== liability.promisor || !belongs) return { name: "signature", holds: false, detail: texts.wrongSignature };
+  return { name: "signature", holds: true, detail: texts.rightSignature(signer) };
+}
+
+function checkFile(which: "objective" | "result"): Check {
+  return async ({ liability }) => {
+    const cid = liability[which];
+    if (!cid) return { name: which, holds: null, detail: texts.noFile };
+    const found = await cidOf(await getBytes(cid, LARGEST));
+    return { name: which, holds: found === cid, detail: found === cid ? texts.fileMatches(found) : texts.fileDiffers(found, cid) };
+  };
+}
+
+/** Throws `ServerLies` if the objective that the server stored is not the file that was sent. */
+export async function checkUpload(file: Uint8Array, cid: string): Promise<void> {
+  if ((await cidOf(file)) !== cid) throw new ServerLies(texts.lieUpload);
+}

@@ -1,0 +1,288 @@
+// What the server answers: see openapi.json.
+
+import type { Address, Hex } from "viem";
+
+export interface Token {
+  address: Address;
+  symbol: string;
+  decimals: number;
+}
+
+export interface Robot {
+  model: string;
+  objective: string | null;
+  cost: string | null;
+  title: string;
+  text: string;
+}
+
+export interface Market {
+  lighthouse: { name: string; address: Address };
+  chainId: number;
+  generation: 3 | 5;
+  contracts: string;
+  block: number;
+  blockTime: number;
+  factory: Address;
+  xrt: Token;
+  ens: Address;
+  token: Token;
+  defaultLifetime: number;
+  account: Address | null;
+  role: "anybody" | "operator";
+  providers: Address[];
+  connected: { router: boolean; chain: boolean };
+  limits: { upload: number; orders: number };
+  robot: Robot | null;
+  explorer: string;
+  version: string;
+  stream: string;
+}
+
+export interface JobRecord {
+  created: number;
+  done: number;
+  failed: number;
+  open: number;
+  earned: string;
+}
+
+export interface Order {
+  hash: string;
+  kind: "demand" | "offer";
+  signer: Address;
+  model: string;
+  objective: string;
+  token: Address;
+  cost: string;
+  lighthouse: Address;
+  validator: Address;
+  validatorFee?: string;
+  lighthouseFee?: string;
+  deadline: number;
+  nonce: string;
+  sender: Address | null;
+  signature: string;
+  generation: number;
+  at: number;
+}
+
+export interface Statement {
+  kind: "rejected" | "declined";
+  agent: Address;
+  code: string;
+  detail: string;
+  at: number;
+}
+
+export interface PostedOrder {
+  order: Order;
+  state: "open" | "withdrawn" | "contract" | "expired";
+  liability: Address | null;
+  statements: Statement[];
+}
+
+export interface AgentStatus {
+  version?: string;
+  parts?: Record<string, string>;
+  head?: number;
+  uptime?: number;
+  work?: { jobs: Record<string, number>; outbox: number; store: { files: number; bytes: number; quota: number | null } };
+  market?: {
+    openOrders: number;
+    created: number;
+    finalized: number;
+    rejected: Record<string, number>;
+    gasUsed: number;
+    spent: string;
+    fees: string;
+    minted: string;
+  };
+  dropped?: Record<string, number>;
+}
+
+export interface Agent {
+  role: string;
+  address: Address;
+  health: "alive" | "degraded" | "silent";
+  status: AgentStatus | null;
+  models: string[];
+  offers: Order[];
+  record: JobRecord;
+}
+
+export interface ValueSchema {
+  type?: string;
+  title?: string;
+  description?: string;
+  unit?: string;
+  default?: string | number | boolean | null;
+  enum?: (string | number)[];
+  minimum?: number;
+  maximum?: number;
+  exclusiveMinimum?: number;
+  exclusiveMaximum?: number;
+  minLength?: number;
+  maxLength?: number;
+  contentEncoding?: string;
+  items?: ValueSchema;
+  minItems?: number;
+  maxItems?: number;
+  properties?: Record<string, ValueSchema>;
+  required?: string[];
+}
+
+export interface ModelTopic {
+  topic: string;
+  title?: string;
+  description?: string;
+  encoding?: string;
+  value?: ValueSchema | null;
+  required?: boolean;
+  maxMessages?: number | null;
+}
+
+export interface Description {
+  title: string;
+  description?: string;
+  objective?: ModelTopic[];
+  result?: ModelTopic[];
+  success?: string;
+  price?: string;
+  seconds?: number | null;
+  limits?: { messages?: number; seconds?: number; size?: number } | null;
+}
+
+export interface Model {
+  cid: string;
+  described: boolean;
+  description: Description | null;
+  text: string | null;
+}
+
+export interface TopicSummary {
+  topic: string;
+  role: "objective" | "device";
+  messages: number;
+  types: string[];
+  shown: "values" | "image" | "text" | "bytes" | "none";
+}
+
+export interface Summary {
+  cid: string;
+  format: string;
+  size: number;
+  messages: number;
+  startNs: string;
+  durationNs: string;
+  topics: TopicSummary[];
+  metadata: Record<string, Record<string, string>>;
+  attachments: { name: string; mediaType: string; size: number }[];
+}
+
+export interface Objective {
+  cid: string;
+  size: number;
+  summary: Summary;
+  preflight: { ok: boolean; reason: string; detail: string };
+}
+
+export interface Message {
+  number: number;
+  topic: string;
+  role: string;
+  type: string;
+  at: number;
+  size: number;
+  value: unknown;
+  cut: boolean;
+  image: string | null;
+}
+
+export interface Values {
+  topic: string;
+  messages: number;
+  points: number;
+  at: number[];
+  columns: { name: string; values: (number | null)[] }[];
+}
+
+export interface Liability {
+  address: Address;
+  model: string;
+  objective: string;
+  result: string;
+  promisee: Address;
+  promisor: Address;
+  lighthouse: Address;
+  lighthouseFee: string;
+  token: Token;
+  cost: string;
+  validator: Address;
+  validatorFee: string;
+  isSuccess: boolean;
+  isFinalized: boolean;
+  state: "open" | "paid" | "failed" | "called-off";
+}
+
+export interface Step {
+  kind: string;
+  at: number | null;
+  block: number | null;
+  tx: Hex | null;
+  agent: Address | null;
+  detail: string;
+}
+
+export interface Job {
+  liability: Liability;
+  phase: "incoming" | "ready" | "running" | "complete" | "finalized";
+  playback: { position: number; total: number } | null;
+  demandHash: string | null;
+  offerHash: string | null;
+  refundableFrom: number | null;
+  timeline: Step[];
+  resultMessage: { liability: Address; result: string; success: boolean; signature: string; signer: Address } | null;
+  reason: { code: string; text: string } | null;
+}
+
+export interface Finding {
+  name: string;
+  holds: boolean | null;
+  detail: string;
+}
+
+export interface AccountState {
+  address: Address;
+  eth: string;
+  xrt: { balance: string; allowance: string };
+  token: { balance: string; allowance: string };
+  nonce: string | null;
+  transactions: number;
+  stake: string;
+  orders: PostedOrder[];
+  record: JobRecord;
+  spent: string;
+  liabilities: Liability[];
+}
+
+export interface Lighthouse {
+  name: string;
+  address: Address;
+  minimalStake: string;
+  timeoutBlocks: number;
+  keepAliveBlock: number;
+  quotaLeft: number;
+  current: Address;
+  block: number;
+  providers: { address: Address; stake: string; quota: number; hasTurn: boolean; status: AgentStatus | null }[];
+  gasPrice: string;
+}
+
+export interface StreamEvent {
+  seq: number;
+  topic?: string;
+  kind: string;
+  data?: any;
+  at: number;
+}

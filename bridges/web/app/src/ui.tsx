@@ -1,0 +1,151 @@
+// The pieces that pages are made of.
+
+import type { ComponentChildren } from "preact";
+import { useEffect, useId, useRef, useState } from "preact/hooks";
+import { useApp, wordsOf } from "./app";
+import type { Loaded } from "./app";
+import { amount, plain, short } from "./format";
+import { texts } from "./texts";
+import type { Token } from "./types";
+
+/** An address, hash or CID: short, whole in its title, with a button that copies it. */
+export function Name(props: { text: string; href?: string; label?: string }) {
+  const { account } = useApp();
+  const own = account?.address === props.text;
+  const [copied, setCopied] = useState(false);
+  const visible = props.label ?? (own ? texts.you : short(props.text));
+  const copy = async () => {
+    await navigator.clipboard.writeText(props.text);
+    setCopied(true);
+    setTimeout(() => setCopied(false), 1200);
+  };
+  return (
+    <span class="name" title={props.text}>
+      {props.href ? <a href={props.href}>{visible}</a> : <span>{visible}</span>}
+      <button type="button" class="copy" aria-label={texts.copy(props.text)} onClick={copy}>
+        {copied ? "✓" : "⧉"}
+      </button>
+    </span>
+  );
+}
+
+export function Money(props: { units: string; token: Token }) {
+  return <span class="number">{amount(props.units, props.token)}</span>;
+}
+
+export function Strange(props: { text: string; most?: number }) {
+  return <bdi class="strange">{plain(props.text, props.most)}</bdi>;
+}
+
+export function Badge(props: { kind: "good" | "bad" | "warn" | "calm"; children: ComponentChildren }) {
+  return <span class={`badge ${props.kind}`}>{props.children}</span>;
+}
+
+/** A button for what takes time: it waits, and says what failed. */
+export function Action(props: {
+  children: ComponentChildren;
+  run: () => Promise<unknown> | unknown;
+  class?: string;
+  disabled?: boolean;
+  id?: string;
+  onError?: (error: unknown) => void;
+}) {
+  const { notify } = useApp();
+  const [busy, setBusy] = useState(false);
+  const run = async () => {
+    setBusy(true);
+    try {
+      await props.run();
+    } catch (error) {
+      if (props.onError) props.onError(error);
+      else notify(wordsOf(error), "bad");
+    } finally {
+      setBusy(false);
+    }
+  };
+  return (
+    <button type="button" id={props.id} class={props.class ?? "button"} disabled={props.disabled || busy} aria-busy={busy} onClick={run}>
+      {props.children}
+    </button>
+  );
+}
+
+export function Field(props: { label: ComponentChildren; hint?: ComponentChildren; error?: string; children: (id: string, described: string) => ComponentChildren }) {
+  const id = useId();
+  return (
+    <div class={props.error ? "field wrong" : "field"}>
+      <label for={id}>{props.label}</label>
+      {props.children(id, `${id}-hint`)}
+      <p id={`${id}-hint`} class="hint">{props.error || props.hint}</p>
+    </div>
+  );
+}
+
+/** What was loaded, or why not. */
+export function Show<T>(props: { of: Loaded<T>; children: (data: T) => ComponentChildren }) {
+  const { data, error, loading, reload } = props.of;
+  if (data !== null) {
+    return (
+      <>
+        {error ? <Problem error={error} retry={reload} /> : null}
+        {props.children(data)}
+      </>
+    );
+  }
+  if (error) return <Problem error={error} retry={reload} />;
+  return loading ? <p class="quiet" aria-busy="true">{texts.loading}</p> : null;
+}
+
+export function Problem(props: { error: unknown; retry?: () => void }) {
+  return (
+    <div class="problem" role="alert">
+      <p><Strange text={wordsOf(props.error)} /></p>
+      {props.retry ? <button type="button" class="button small" onClick={props.retry}>{texts.again}</button> : null}
+    </div>
+  );
+}
+
+export function Table(props: { label: string; head: string[]; numbers?: number[]; children: ComponentChildren; empty?: string }) {
+  const rows = Array.isArray(props.children) ? props.children.flat().filter(Boolean).length : props.children ? 1 : 0;
+  if (!rows && props.empty) return <p class="quiet">{props.empty}</p>;
+  return (
+    <div class="scroll" tabIndex={0} role="region" aria-label={props.label}>
+      <table>
+        <caption class="hidden">{props.label}</caption>
+        <thead>
+          <tr>{props.head.map((title, place) => <th key={title} scope="col" class={props.numbers?.includes(place) ? "right" : ""}>{title}</th>)}</tr>
+        </thead>
+        <tbody>{props.children}</tbody>
+      </table>
+    </div>
+  );
+}
+
+export function Facts(props: { of: [string, ComponentChildren][] }) {
+  return (
+    <dl class="facts">
+      {props.of.filter(([, value]) => value !== null && value !== undefined && value !== "").map(([name, value]) => (
+        <div key={name}><dt>{name}</dt><dd>{value}</dd></div>
+      ))}
+    </dl>
+  );
+}
+
+export function Dialog(props: { title: string; open: boolean; onClose: () => void; children: ComponentChildren }) {
+  const box = useRef<HTMLDialogElement>(null);
+  const id = useId();
+  useEffect(() => {
+    const dialog = box.current!;
+    if (props.open && !dialog.open) dialog.showModal();
+    if (!props.open && dialog.open) dialog.close();
+  }, [props.open]);
+  return (
+    <dialog ref={box} aria-labelledby={id} onClose={props.onClose}>
+      <header>
+        <h2 id={id}>{props.title}</h2>
+        <button type="button" class="close" aria-label={texts.close} onClick={props.onClose}>×</button>
+      </header>
+      {props.open ? props.children : null}
+    </dialog>
+  );
+}
