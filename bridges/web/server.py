@@ -58,7 +58,7 @@ REQUESTS_IN_TOTAL: Final = Rate(per_second=500, burst=2000)
 LOGINS: Final = Rate(per_second=0.2, burst=10)
 """Attempts to log in, of one address."""
 SESSIONS: Final = 1024
-LONGEST_BODY: Final = 1 << 20
+LONGEST_BODY: Final = 1 << 18
 """Bytes of a body that is no objective."""
 SESSION_SECONDS: Final = 12 * 3600.0
 AGENTS_INTERVAL: Final = 3.0

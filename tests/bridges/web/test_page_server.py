@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import secrets
 from typing import TYPE_CHECKING, Any
 
-from schemas import ZERO_ADDRESS, Demand, encode
+from mesh import Job, String  # noqa: TC001  handlers are read at run time
+from schemas import ZERO_ADDRESS, Demand, Withdrawal, encode
+from schemas.model import ModelDescription, ModelTopic
+from schemas.value_schema import ValueSchema
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
-    from mesh import Job, String
     from mesh.chain import Account
     from tests.support.market import Place
 
@@ -71,3 +75,154 @@ async def test_a_wallet_orders_and_follows_its_job_to_the_payment(place: Place, 
         assert job["resultMessage"]["signer"] == place.address("robot")
         verdict = await browser.get(f"liabilities/{address}/verification")
         assert verdict["holds"], verdict
+
+
+DATA = {"X-Aira-Request": "1", "Content-Type": "application/octet-stream"}
+
+
+async def test_the_stream_tells_each_step_of_a_job(place: Place, serve: Any) -> None:
+    robot = offering(place.agent("robot"))
+
+    @robot.on("/blink")
+    async def blink(job: Job, message: String) -> None:
+        pass
+
+    async with place.provider(), robot, serve("person") as browser:
+        made = await browser.post("objectives", objective(("/blink", "on")), headers=DATA)
+        assert (await browser.get("market"))["account"] == place.address("person")
+        wanted = {"model": MODEL, "objective": made["cid"], "cost": str(COST)}
+        async with browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket:
+            await socket.send_json({"subscribe": ["market"]})
+            posted = await browser.post("local/orders", wanted, status=202)
+            assert posted["order"]["signer"] == place.address("person")
+            kinds: list[str] = []
+            async with asyncio.timeout(30):
+                while "matched" not in kinds:
+                    for event in json.loads((await socket.receive()).data):
+                        kinds.append(event["kind"])
+                        if event["kind"] == "matched":
+                            address = event["data"]["liability"]["address"]
+                await socket.send_json({"subscribe": [f"liability/{address}"], "after": 0})
+                while "paid" not in kinds:
+                    kinds += [event["kind"] for event in json.loads((await socket.receive()).data)]
+        assert kinds.index("order") < kinds.index("matched") < kinds.index("paid")
+        agents = (await browser.get("agents"))["agents"]
+        about = next(agent for agent in agents if agent["address"] == place.address("robot"))
+        assert about["health"] == "alive"
+        assert about["models"] == [MODEL]
+        assert about["record"]["done"] >= 1
+        jobs = await browser.get("liabilities", party=place.address("person"), limit=1)
+        assert jobs["liabilities"][0]["address"] == address
+        assert jobs["liabilities"][0]["token"]["symbol"] == "XRT"
+        account = await browser.get(f"accounts/{place.address('person')}")
+        assert int(account["spent"]) >= COST
+        provider = (await browser.get("lighthouse"))["providers"][0]
+        assert (provider["address"], provider["hasTurn"]) == (place.address("provider"), True)
+
+
+async def test_an_open_order_is_withdrawn_by_its_signer_alone(place: Place, serve: Any) -> None:
+    person, stranger = place.market.accounts["person"], place.market.accounts["robot"]
+    async with place.provider(), serve() as browser:
+        posted = await browser.post("orders", await signed_demand(browser, person, MODEL, cost=0), status=202)
+        order = posted["order"]
+        terms = {"order": order["hash"], "lighthouse": order["lighthouse"], "deadline": order["deadline"]}
+        forged = encode(stranger.signer.sign(Withdrawal(**terms)))
+        assert (await browser.post("orders", forged, status=404))["error"]["code"] == "page-not-found"
+        assert (await browser.get(f"orders/{order['hash']}"))["state"] == "open"
+        withdrawn = await browser.post("orders", encode(person.signer.sign(Withdrawal(**terms))), status=202)
+        assert withdrawn["state"] == "withdrawn"
+
+        async def honoured() -> bool:
+            statements = (await browser.get(f"orders/{order['hash']}"))["statements"]
+            return any(
+                said["code"] == "withdrawn" and said["agent"] == place.address("provider") for said in statements
+            )
+
+        await until_found(honoured, what="the provider's word")
+
+
+async def test_the_local_account_withdraws_its_order(place: Place, serve: Any) -> None:
+    async with place.provider(), serve("person") as browser:
+        wanted = {"model": MODEL, "objective": MODEL, "cost": "0"}
+        order_hash = (await browser.post("local/orders", wanted, status=202))["order"]["hash"]
+        withdrawn = await browser.post("local/withdrawals", {"order": order_hash})
+        assert withdrawn["state"] == "withdrawn"
+    async with serve() as browser:
+        refused = await browser.post("local/orders", wanted, status=409)
+        assert refused["error"]["code"] == "no-local-account"
+
+
+async def test_an_order_that_no_provider_could_use_is_refused_with_the_reason(place: Place, serve: Any) -> None:
+    poor, person = place.market.accounts["robot"], place.market.accounts["person"]
+    async with place.provider(), serve() as browser:
+        demand = await signed_demand(browser, poor, MODEL, cost=10**30)
+        refused = (await browser.post("orders", demand, status=400))["error"]
+        assert refused["code"] == "order-unusable"
+        assert refused["reason"].startswith("ERC20Insufficient")
+        late = await signed_demand(browser, person, MODEL, cost=0, lifetime=10**6)
+        assert (await browser.post("orders", late, status=400))["error"]["reason"] == "deadline"
+        past = await signed_demand(browser, person, MODEL, cost=0, lifetime=0)
+        assert (await browser.post("orders", past, status=400))["error"]["reason"] == "expired"
+
+
+async def test_posting_again_changes_nothing(place: Place, serve: Any) -> None:
+    async with place.provider(), serve() as browser:
+        demand = await signed_demand(browser, place.market.accounts["person"], MODEL, cost=0)
+        first = await browser.post("orders", demand, status=202)
+        assert (await browser.post("orders", demand, status=202))["order"] == first["order"]
+    async with place.provider(), serve() as browser:  # another server, which knows nothing
+        assert (await browser.post("orders", demand, status=202))["order"]["hash"] == first["order"]["hash"]
+
+
+async def test_a_form_becomes_an_objective_that_its_model_accepts(serve: Any) -> None:
+    colour = ModelTopic(topic="/colour", value=ValueSchema(type="string", enum=("red", "blue")), required=True)
+    model = ModelDescription(title="A lamp", objective=(colour, ModelTopic(topic="/go")))
+    async with serve() as browser:
+        cid = (await browser.post("objectives", model.encode(), headers=DATA))["cid"]
+        described = await browser.get(f"models/{cid}")
+        assert described["description"]["title"] == "A lamp"
+        values = [{"topic": "/colour", "value": "red"}, {"topic": "/go", "value": None, "at": 1.5}]
+        made = await browser.post("objectives/form", {"model": cid, "values": values})
+        assert made["preflight"]["ok"]
+        assert made["summary"]["durationNs"] == str(1_500_000_000)
+        wrong = await browser.post("objectives/form", {"model": cid, "values": [{"topic": "/colour", "value": "puce"}]})
+        assert wrong["preflight"]["reason"] == "unfit-message"
+        assert await browser.get(f"files/{wrong['cid']}/preflight", model=cid) == wrong["preflight"]
+
+
+async def test_a_recording_is_listed_and_plotted(serve: Any) -> None:
+    moves = [("/move", {"linear": {"x": number / 2}, "name": "a"}) for number in range(9_000)]
+    async with serve() as browser:
+        cid = (await browser.post("objectives", objective(("/go", "1.5"), *moves), headers=DATA))["cid"]
+        topics = {topic["topic"]: topic for topic in (await browser.get(f"files/{cid}/summary"))["topics"]}
+        assert topics["/move"]["messages"] == 9_000
+        assert topics["/move"]["shown"] == "values"
+        page = await browser.get(f"files/{cid}/messages", topic="/move", limit=2)
+        assert [message["number"] for message in page["messages"]] == [1, 2]
+        assert page["next"] == 2
+        plotted = await browser.get(f"files/{cid}/values", topic="/move")
+        assert plotted["messages"] == 9_000
+        assert plotted["points"] == len(plotted["at"]) <= 4_000
+        assert [column["name"] for column in plotted["columns"]] == ["linear.x"]
+        assert plotted["columns"][0]["values"][1] == 1.5
+
+
+async def test_what_a_reorganisation_reverts_is_open_again(place: Place, serve: Any) -> None:
+    async with place.provider(), offering(place.agent("robot")), serve() as browser:
+        made = await browser.post("objectives", objective(("/none", "on")), headers=DATA)
+        before = await place.chains["provider"].block_number()
+        demand = await signed_demand(browser, place.market.accounts["person"], made["cid"], cost=0)
+        order_hash = (await browser.post("orders", demand, status=202))["order"]["hash"]
+
+        async def contract() -> Any:
+            return (await browser.get(f"orders/{order_hash}"))["liability"]
+
+        await until_found(contract, what="a contract")
+        head = await place.chains["provider"].block_number()
+        events: list[str] = []
+        async with browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket:
+            await socket.send_json({"subscribe": [f"order/{order_hash}"]})
+            await place.forget_blocks(head - before)
+            async with asyncio.timeout(20):
+                while "open" not in events or "contract" not in events[events.index("open") :]:
+                    events += [event["kind"] for event in json.loads((await socket.receive()).data)]
