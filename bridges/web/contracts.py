@@ -44,9 +44,9 @@ JOBS: Final = 16_384
 STEPS: Final = 32
 """Steps of one job that are remembered."""
 READ_AT_ONCE: Final = 32
-"""Contracts that are read in one call."""
+"""ContractFollower that are read in one call."""
 EARLY: Final = 1024
-"""Contracts of which agents spoke before they were read."""
+"""ContractFollower of which agents spoke before they were read."""
 REPORTED: Final = Rate(per_second=4.0, burst=16)
 """Reports of an agent about its playbacks."""
 PHASES: Final = {"incoming": "incoming", "ready": "ready", "playing": "running", "result": "complete"}
@@ -81,8 +81,8 @@ class ContractListener(Protocol):
         """The chain was read up to a block."""
 
 
-class Contracts(Lifecycle):
-    """Follows the chain and the playbacks: `async with Contracts(components, stream, listener) as contracts`.
+class ContractFollower(Lifecycle):
+    """Follows the chain and the playbacks: `async with ContractFollower(components, stream, listener) as contracts`.
 
     `from_block` is the first block whose contracts are listed. Changes are published on `stream`. Used in one event
     loop.

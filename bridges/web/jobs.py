@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from bridges.web.views import JobRecord, liability_json, order_json, records_of, result_json
+from bridges.web.views import AccountRecord, liability_json, order_json, records_of, result_json
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
 from mesh.evidence import Claim, Verdict, check_end, verify
@@ -136,7 +136,7 @@ class Views:
         ]
         own = [order for order in market.orders() if order.verified.signer == address]
         own = [order for order in own if order.state(market.head) in ("open", "withdrawn")]
-        record = records_of(jobs, parts.token).get(address, JobRecord())
+        record = records_of(jobs, parts.token).get(address, AccountRecord())
         return {
             "address": address,
             "eth": str(eth),
@@ -201,7 +201,7 @@ class Views:
                 "status": None if status is None else msgspec.json.decode(status.encode()),
                 "models": sorted(models.get(peer.address, ())) if peer.role == "agent" else [],
                 "offers": [order_json(order) for order in offers.get(peer.address, ())][:LISTED],
-                "record": records.get(peer.address, JobRecord()).json(),
+                "record": records.get(peer.address, AccountRecord()).json(),
             }
             for peer, status in found.items()
         ]

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from bridges.web.contracts import Contracts
+from bridges.web.contracts import ContractFollower
 from bridges.web.views import order_json
 from mesh.background import Background
 from mesh.errors import AiraError
@@ -79,7 +79,7 @@ class Market(Lifecycle):
         self._parts = components
         self._stream = stream
         self._clock = clock
-        self.contracts = Contracts(components, stream, self, from_block=from_block, clock=clock)
+        self.contracts = ContractFollower(components, stream, self, from_block=from_block, clock=clock)
         self._seen: BoundedDict[str, SeenOrder] = BoundedDict(ORDERS)
         self._posted: dict[str, SeenOrder] = {}
         """Orders that were posted here: they are remembered until their deadline."""

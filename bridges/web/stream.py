@@ -60,7 +60,7 @@ class Stream:
         self._clock = clock
         self._kept: deque[StreamEvent] = deque()
         self._bytes = 0
-        self._connections: set[Connection] = set()
+        self._connections: set[StreamConnection] = set()
         self.seq = 0
 
     def publish(self, topic: str, kind: str, data: Any) -> None:
@@ -97,7 +97,7 @@ class Stream:
         if len(self._connections) >= CONNECTIONS:
             await socket.close(code=1013, message=b"too many connections")
             return socket
-        connection = Connection(self, socket)
+        connection = StreamConnection(self, socket)
         self._connections.add(connection)
         sending = asyncio.create_task(connection.send(), name="page stream")
         try:
@@ -123,7 +123,7 @@ class Stream:
                 await connection.socket.close(code=1001, message=b"the server stops")
 
 
-class Connection:
+class StreamConnection:
     """One WebSocket: what it subscribed to, and what waits for it."""
 
     def __init__(self, stream: Stream, socket: web.WebSocketResponse) -> None:

@@ -66,7 +66,7 @@ def result_json(seen: Verified[Result]) -> dict[str, Any]:
     return fields | {"signer": seen.signer}
 
 
-class JobRecord(msgspec.Struct):
+class AccountRecord(msgspec.Struct):
     """What the chain says of an account's jobs, as far as they were read: amounts are those of one token."""
 
     created: int = 0
@@ -87,17 +87,17 @@ class JobRecord(msgspec.Struct):
         }
 
 
-def records_of(jobs: list[SeenJob], token: str) -> dict[str, JobRecord]:
+def records_of(jobs: list[SeenJob], token: str) -> dict[str, AccountRecord]:
     """The record of each account: jobs as promisor, and what it spent as promisee in `token`."""
-    found: dict[str, JobRecord] = {}
+    found: dict[str, AccountRecord] = {}
     for job in jobs:
         liability = job.liability
-        record = found.setdefault(liability.promisor, JobRecord())
+        record = found.setdefault(liability.promisor, AccountRecord())
         record.created += 1
         record.open += not liability.is_finalized
         record.failed += liability.is_finalized and not liability.is_success
         record.done += liability.is_success
         if liability.is_success and liability.token == token:
             record.earned += liability.cost
-            found.setdefault(liability.promisee, JobRecord()).spent += liability.cost
+            found.setdefault(liability.promisee, AccountRecord()).spent += liability.cost
     return found

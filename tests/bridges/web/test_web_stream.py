@@ -6,7 +6,7 @@ import asyncio
 import json
 from typing import TYPE_CHECKING, Any
 
-from bridges.web.stream import KEPT, WAITING, Connection, Stream
+from bridges.web.stream import KEPT, WAITING, Stream, StreamConnection
 from schemas import Demand, encode, verify
 from tests.support.market import MODEL
 from tests.support.waiting import until
@@ -28,8 +28,14 @@ async def test_an_order_on_the_mesh_reaches_the_page(place: Place, serve: Any) -
     async with serve() as browser, browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket:
         await socket.send_json({"subscribe": ["market"]})
         await received(socket, "hello")
-        terms = {"model": MODEL, "objective": MODEL, "cost": 2**70, "validator_fee": 0, "nonce": "ab" * 32}
-        addresses = {"token": place.address("robot"), "validator": "0x" + "00" * 20}
+        terms: dict[str, Any] = {
+            "model": MODEL,
+            "objective": MODEL,
+            "cost": 2**70,
+            "validator_fee": 0,
+            "nonce": "ab" * 32,
+        }
+        addresses: dict[str, Any] = {"token": place.address("robot"), "validator": "0x" + "00" * 20}
         market = await browser.get("market")
         lighthouse = market["lighthouse"]["address"]
         demand = Demand(**terms, **addresses, lighthouse=lighthouse, deadline=market["block"] + 100)
@@ -81,7 +87,7 @@ async def test_a_slow_tab_loses_old_ticks_of_the_market_and_nothing_else() -> No
 
     socket: Any = Slow()
     stream = Stream()
-    connection = Connection(stream, socket)
+    connection = StreamConnection(stream, socket)
     assert connection.subscribe('{"subscribe": ["market", "liability/0x00"]}')
     stream._connections.add(connection)
     stream.publish("liability/0x00", "paid", {})

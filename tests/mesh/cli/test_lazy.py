@@ -29,7 +29,7 @@ GROUPS = {
 }
 
 
-INSTALLED = ("board", "edge", "bridge ipfs")
+INSTALLED = ("board", "edge", "bridge ipfs", "web")
 
 
 def test_help_lists_every_command_without_importing_those_of_the_core() -> None:
