@@ -12,12 +12,15 @@ from aiohttp import ClientSession
 
 from bridges.web.components import opened
 from bridges.web.server import PageServer, WebOptions
+from tests.bridges.web.openapi import check, check_answer
 from tests.support.market import founded, place
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from contextlib import AbstractAsyncContextManager
     from pathlib import Path
+
+    from aiohttp import ClientResponse
 
     from tests.support.market import Place
 
@@ -36,18 +39,25 @@ class Browser:
     async def get(self, path: str, *, status: int = 200, **query: Any) -> Any:
         """The JSON at a path of the interface."""
         async with self.session.get(f"{self.server.url}/api/v1/{path}", params=query) as response:
-            body = await response.json()
-            assert response.status == status, body
-            return body
+            return await _checked("get", f"/api/v1/{path}", response, status)
 
     async def post(self, path: str, content: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> Any:
         """Post JSON, or bytes as they are."""
         data = content if isinstance(content, bytes) else msgspec.json.encode(content)
         url = f"{self.server.url}/{path}" if path == "rpc" else f"{self.server.url}/api/v1/{path}"
         async with self.session.post(url, data=data, headers=OWN if headers is None else headers) as response:
-            body = await response.json()
-            assert response.status == status, body
-            return body
+            return await _checked("post", url.removeprefix(self.server.url), response, status)
+
+
+async def _checked(method: str, path: str, response: ClientResponse, status: int) -> Any:
+    """The answer, which is as documented."""
+    body = await response.json()
+    assert response.status == status, body
+    if status < 300:
+        check_answer(method, path, body)
+    else:
+        check({"$ref": "#/components/schemas/Error"}, body, path)
+    return body
 
 
 @pytest.fixture
