@@ -22,7 +22,7 @@ COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 RERUNS := --reruns 1 --max-suite-reruns 3 --rerun-show-tracebacks
 
 .PHONY: help setup demo test simulate simulate-mutants compose-test crash-test lint peers bench contracts contracts-check \
-	slither firmware lock clean
+	page page-check slither firmware lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -63,13 +63,13 @@ compose-test: $(INSTALLED) ## the compose files in real containers (`make peers`
 crash-test: $(INSTALLED) ## the crash matrix: each role fails at each point of a job, by each fault (about an hour)
 	@CRASH_CELLS=$${CRASH_CELLS:-all} $(BIN)/pytest -v tests/crashes $(ARGS)
 
-lint: $(INSTALLED) ## style, types, the import rule, and the built contracts where node is there
+lint: $(INSTALLED) ## style, types, the import rule, and the built contracts and page where node is there
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy $(wildcard $(TYPED))
 	@$(BIN)/lint-imports --no-cache
-	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory contracts-check; \
-		else echo "contracts not checked: npm is not installed"; fi
+	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory contracts-check page-check; \
+		else echo "contracts and page not checked: npm is not installed"; fi
 
 peers: ## the real programs that some tests run against
 	@$(NEEDS_PYTHON)
@@ -89,6 +89,17 @@ contracts: contracts/node_modules/.package-lock.json ## compile the Solidity sou
 contracts-check: contracts/node_modules/.package-lock.json ## whether the built artifacts are those of the sources
 	@npm --prefix contracts run check
 
+bridges/web/app/node_modules/.package-lock.json: bridges/web/app/package-lock.json
+	@npm --prefix bridges/web/app ci --no-audit --no-fund
+	@touch $@
+
+page: bridges/web/app/node_modules/.package-lock.json ## build the page of `aira web` into bridges/web/static
+	@npm --prefix bridges/web/app run build
+
+page-check: bridges/web/app/node_modules/.package-lock.json ## whether the built page is that of its sources
+	@npm --prefix bridges/web/app run check
+	@npm --prefix bridges/web/app test
+
 slither: contracts/node_modules/.package-lock.json ## look for weaknesses in the contracts (`make peers` installs Slither)
 	@slither=$$($(PYTHON) -m peers.where slither) && SLITHER=$$slither npm --prefix contracts run --silent slither
 
@@ -107,4 +118,5 @@ lock: ## update the locked versions (needs uv)
 
 clean: ## remove what the targets above have made here; the peers' cache stays
 	@rm -rf .venv build dist *.egg-info .coverage .coverage.* htmlcov \
-		.pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis contracts/node_modules
+		.pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis contracts/node_modules \
+		bridges/web/app/node_modules

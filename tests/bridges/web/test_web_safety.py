@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -9,14 +10,13 @@ from yarl import URL
 
 from bridges.web.api import Api
 from bridges.web.errors import NotOpenToOthers
+from bridges.web.reference import reference
 from bridges.web.server import WebOptions
 from tests.bridges.web.conftest import OWN
 from tests.bridges.web.openapi import DOCUMENT
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tests.support.market import Place
 
 TOKEN = "a token of people 123"
@@ -144,3 +144,7 @@ async def test_every_route_is_documented(serve: Any) -> None:
     documented = {(method, path) for path, methods in DOCUMENT["paths"].items() for method in methods}
     assert documented - routes == {("post", "/api/v1/session")}
     assert routes <= documented
+
+
+def test_the_reference_is_that_of_the_interface() -> None:
+    assert (Path(__file__).parents[3] / "docs" / "api.md").read_text() == reference()
