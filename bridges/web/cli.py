@@ -23,7 +23,7 @@ from schemas import parse_cid
 
 if TYPE_CHECKING:
     from bridges.web.components import WebComponents
-    from bridges.web.server import WebOptions
+    from bridges.web.options import WebOptions
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -91,7 +91,7 @@ async def serve(settings: Settings, options: dict[str, Any]) -> None:
 
 def web_options(options: dict[str, Any]) -> WebOptions:
     """The options as the server takes them. Raises `InputError`, `InvalidListenAddress`."""
-    from bridges.web.server import WebOptions
+    from bridges.web.options import WebOptions
     from mesh.telemetry.health import listen_address
 
     host, port = listen_address(options["listen"])

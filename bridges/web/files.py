@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from bridges.web.errors import InvalidRequest, UploadTooLarge
 from bridges.web.recordings import summary
-from mesh.cli.model import description_in
 from mesh.recording import Limits, messages_in, pack, preflight
+from mesh.work.models import description_in
 from schemas import parse_cid
 from schemas.model import MAX_MODEL_SIZE, InvalidDescription
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from bridges.web.views import AccountRecord, liability_json, order_json, records_of, result_json
+from bridges.web.views import liability_json, result_json
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
 from mesh.evidence import Claim, Verdict, check_end, verify
@@ -200,7 +200,7 @@ class Views:
                 "health": _health(status),
                 "status": None if status is None else msgspec.json.decode(status.encode()),
                 "models": sorted(models.get(peer.address, ())) if peer.role == "agent" else [],
-                "offers": [order_json(order) for order in offers.get(peer.address, ())][:LISTED],
+                "offers": [order.json() for order in offers.get(peer.address, ())][:LISTED],
                 "record": records.get(peer.address, AccountRecord()).json(),
             }
             for peer, status in found.items()
@@ -229,3 +229,40 @@ def _health(status: RoleStatus | None) -> str:
     if isinstance(status, BridgeStatus):
         return "alive" if status.state in ("connected", "alone") else "degraded"
     return "alive" if all(state in (ALIVE, OFF) for state in status.parts.values()) else "degraded"
+
+
+class AccountRecord(msgspec.Struct):
+    """What the chain says of an account's jobs, as far as they were read: amounts are those of one token."""
+
+    created: int = 0
+    done: int = 0
+    failed: int = 0
+    open: int = 0
+    earned: int = 0
+    spent: int = 0
+
+    def json(self) -> dict[str, Any]:
+        """The record of a promisor."""
+        return {
+            "created": self.created,
+            "done": self.done,
+            "failed": self.failed,
+            "open": self.open,
+            "earned": str(self.earned),
+        }
+
+
+def records_of(jobs: list[SeenJob], token: str) -> dict[str, AccountRecord]:
+    """The record of each account: jobs as promisor, and what it spent as promisee in `token`."""
+    found: dict[str, AccountRecord] = {}
+    for job in jobs:
+        liability = job.liability
+        record = found.setdefault(liability.promisor, AccountRecord())
+        record.created += 1
+        record.open += not liability.is_finalized
+        record.failed += liability.is_finalized and not liability.is_success
+        record.done += liability.is_success
+        if liability.is_success and liability.token == token:
+            record.earned += liability.cost
+            found.setdefault(liability.promisee, AccountRecord()).spent += liability.cost
+    return found

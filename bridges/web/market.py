@@ -7,8 +7,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
 from bridges.web.contracts import ContractFollower
-from bridges.web.views import order_json
 from mesh.background import Background
 from mesh.errors import AiraError
 from mesh.flood import BoundedDict
@@ -33,6 +34,7 @@ STATEMENTS: Final = 32
 PROVIDERS_AGE: Final = 15.0
 """Seconds after which the list of providers is read again."""
 LONGEST_DETAIL: Final = 500
+AMOUNTS: Final = ("cost", "validatorFee", "lighthouseFee")
 
 
 @dataclass(eq=False)
@@ -55,6 +57,14 @@ class SeenOrder:
         """The order itself."""
         message: Demand | Offer = self.verified.message
         return message
+
+    def json(self) -> dict[str, Any]:
+        """The order with its hash and its signer."""
+        fields: dict[str, Any] = msgspec.to_builtins(self.message)
+        fields |= {name: str(fields[name]) for name in AMOUNTS if name in fields}
+        fields |= {"nonce": str(fields["nonce"]), "sender": fields.get("sender")}
+        about = {"kind": self.message.kind, "generation": self.message.generation}
+        return {"hash": self.hash, "signer": self.verified.signer, "at": self.at} | about | fields
 
     def state(self, head: int) -> str:
         """`open`, `withdrawn`, `contract` or `expired`."""
@@ -117,7 +127,7 @@ class Market(Lifecycle):
         if known is None or known.verified.signer != verified.signer:
             known = SeenOrder(verified, self._clock())
             known.liability = self.contracts.matched.get((order_hash, verified.signer), "")
-            self._stream.publish("market", "order", order_json(known))
+            self._stream.publish("market", "order", known.json())
         if posted:
             self._posted[order_hash] = known
         elif order_hash not in self._seen:
@@ -132,7 +142,7 @@ class Market(Lifecycle):
     def posted_json(self, order: SeenOrder) -> dict[str, Any]:
         """An order and what became of it."""
         return {
-            "order": order_json(order),
+            "order": order.json(),
             "state": order.state(self.head),
             "liability": order.liability or None,
             "statements": list(order.statements.values()),

@@ -74,7 +74,7 @@ def _schemas(document: dict[str, Any]) -> Iterator[str]:
 def _type(schema: dict[str, Any]) -> str:
     """A schema in a few words."""
     if "$ref" in schema:
-        return schema["$ref"].rpartition("/")[2]
+        return str(schema["$ref"]).rpartition("/")[2]
     if "oneOf" in schema:
         return f"{_type(schema['oneOf'][0])} or null"
     if "enum" in schema:

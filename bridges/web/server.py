@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-import ipaddress
 import logging
 import secrets
 import ssl
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 import msgspec
 from aiohttp import web
 
-from bridges.web.api import Api, answer, body_of
+from bridges.web.answers import answer, body_of
+from bridges.web.api import Api
 from bridges.web.errors import (
     InvalidRequest,
     LoginRequired,
-    NotOpenToOthers,
     PageNotFound,
     TooManyRequests,
     WrongHost,
@@ -31,6 +29,7 @@ from bridges.web.errors import (
 from bridges.web.files import Files
 from bridges.web.jobs import Views
 from bridges.web.market import Market
+from bridges.web.options import is_loopback
 from bridges.web.orders import OrderPublisher
 from bridges.web.stream import Stream
 from mesh.background import Background
@@ -44,12 +43,12 @@ if TYPE_CHECKING:
     from contextlib import AsyncExitStack
 
     from bridges.web.components import WebComponents
+    from bridges.web.options import WebOptions
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 log = logging.getLogger(__name__)
 
-STATIC: Final = Path(__file__).with_name("static")
 OWN_HEADER: Final = "X-Aira-Request"
 COOKIE: Final = "aira_session"
 REQUESTS: Final = Rate(per_second=50, burst=400)
@@ -65,38 +64,6 @@ AGENTS_INTERVAL: Final = 3.0
 """Seconds between two lists of agents on the stream."""
 OPEN_PATHS: Final = ("/api/v1/session", "/api/v1/openapi.json")
 """Parts of the interface that need no login."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class WebOptions:
-    """How the page is served."""
-
-    host: str = "127.0.0.1"
-    port: int = 8585
-    names: tuple[str, ...] = ()
-    """Names besides its own address by which browsers reach it (`HOST` or `HOST:PORT`)."""
-    token: str = field(default="", repr=False)
-    """What people log in with; empty: no login."""
-    operator_token: str = field(default="", repr=False)
-    certificate: str = ""
-    key: str = ""
-    embed: tuple[str, ...] = ()
-    """Origins that may show the page in a frame."""
-    robot: dict[str, Any] | None = None
-    """The one robot that the page orders from: see Robot in openapi.json."""
-    explorer: str = ""
-    from_block: int = 0
-    static: Path = STATIC
-
-    def check(self) -> None:
-        """Raise `NotOpenToOthers` for a server that other machines can reach without TLS and login."""
-        if is_loopback(self.host):
-            return
-        if not (self.certificate and self.key and (self.token or self.operator_token)):
-            raise NotOpenToOthers(
-                f"other machines can reach {self.host}: that needs TLS and a login",
-                hint="give --certificate, --key and --token-file, or listen on 127.0.0.1",
-            )
 
 
 class PageServer(Lifecycle):
@@ -283,14 +250,6 @@ class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A token to log in with."""
 
     token: str
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a host."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _failure(error: AiraError) -> web.Response:

@@ -11,7 +11,8 @@ import pytest
 from aiohttp import ClientSession
 
 from bridges.web.components import opened
-from bridges.web.server import PageServer, WebOptions
+from bridges.web.options import WebOptions
+from bridges.web.server import PageServer
 from tests.bridges.web.openapi import check, check_answer
 from tests.support.market import founded, place
 

@@ -10,8 +10,8 @@ from yarl import URL
 
 from bridges.web.api import Api
 from bridges.web.errors import NotOpenToOthers
+from bridges.web.options import WebOptions
 from bridges.web.reference import reference
-from bridges.web.server import WebOptions
 from tests.bridges.web.conftest import OWN
 from tests.bridges.web.openapi import DOCUMENT
 from tests.support.objectives import objective
