@@ -44,6 +44,7 @@ export function AppProvider(props: { market: Market; reloadMarket: () => void; c
   const [notes, setNotes] = useState<{ id: number; text: string; kind: string }[]>([]);
   const lastNote = useRef(0);
 
+  useEffect(() => setBlock((known) => Math.max(known, market.block)), [market.block]);
   useTopic("chain", (event) => event.kind === "block" && setBlock(event.data.number));
 
   const notify = useCallback((text: string, kind: "good" | "bad" = "good") => {

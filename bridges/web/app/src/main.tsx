@@ -61,7 +61,7 @@ function Shell() {
     <>
       <a class="skip" href="#main">{texts.skip}</a>
       {inFrame ? null : <Header route={route} />}
-      <main id="main" tabIndex={-1} class={route[0] ?? "order"}><Content route={route} /></main>
+      <main id="main" tabIndex={-1} class={`on-${route[0] ?? "order"}`}><Content route={route} /></main>
       <footer>
         <span>{plain(market.lighthouse.name, 60)}</span>
         <Connection />

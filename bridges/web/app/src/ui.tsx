@@ -23,7 +23,9 @@ export function Name(props: { text: string; href?: string; label?: string }) {
     <span class="name" title={props.text}>
       {props.href ? <a href={props.href}>{visible}</a> : <span>{visible}</span>}
       <button type="button" class="copy" aria-label={texts.copy(props.text)} onClick={copy}>
-        {copied ? "✓" : "⧉"}
+        <svg viewBox="0 0 16 16" width="14" height="14" aria-hidden="true" fill="none" stroke="currentColor" stroke-width="1.5">
+          {copied ? <path d="M3 8.500 6.500 12 13 4.500" /> : <path d="M5.500 5.500h8v8h-8zM10.500 5.500v-3h-8v8h3" />}
+        </svg>
       </button>
     </span>
   );

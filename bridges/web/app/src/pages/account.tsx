@@ -1,6 +1,6 @@
 import { useState, useEffect } from "preact/hooks";
 import { useApp, useData, useTopic } from "../app";
-import { clock, ether } from "../format";
+import { clock, ether, short } from "../format";
 import { withdraw } from "../ordering";
 import { texts } from "../texts";
 import type { AccountState, Liability, PostedOrder } from "../types";
@@ -62,7 +62,7 @@ export function AccountPage(props: { address: string }) {
   useTopic("chain", loaded.reload);
   return (
     <>
-      <h1>{account?.address === props.address ? texts.myAccount : texts.account} <Name text={props.address} /></h1>
+      <h1>{account?.address === props.address ? texts.myAccount : texts.account} <Name text={props.address} label={short(props.address)} /></h1>
       <Show of={loaded}>
         {(state) => (
           <>

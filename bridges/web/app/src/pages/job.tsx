@@ -34,7 +34,7 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
   const { liability } = job;
   const ended = liability.isFinalized;
   const failed = ended && liability.state !== "paid";
-  const done = ended ? (failed ? 4 : 5) : PHASES[job.phase];
+  const done = ended ? (failed ? 5 : 6) : PHASES[job.phase];
   const share = playback && playback.total ? playback.position / playback.total : undefined;
   return (
     <>

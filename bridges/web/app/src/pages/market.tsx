@@ -124,14 +124,15 @@ function Rate(props: { perSecond: number[] }) {
     const { ink, grid, lines } = plotColors(box.current!);
     const seconds = Array.from({ length: SECONDS }, (_, place) => place - SECONDS + 1);
     const axis = { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid } };
-    const measure = () => ({ width: Math.max(240, box.current!.clientWidth), height: 110 });
+    const frame = box.current!;
+    const measure = () => ({ width: Math.max(240, frame.clientWidth), height: 110 });
     const plot = new uPlot({
       ...measure(),
       cursor: { show: false },
       legend: { show: false },
       scales: { x: { time: false }, y: { range: (_, __, most) => [0, Math.max(5, most)] } },
       axes: [{ ...axis, values: (_, ticks) => ticks.map((tick) => `${tick} s`) }, { ...axis, size: 44 }],
-      series: [{}, { stroke: lines[0], fill: `${lines[0]}33`, width: 1.5, points: { show: false } }],
+      series: [{}, { stroke: lines[0], width: 1.5, points: { show: false } }],
     }, [seconds, [...props.perSecond]], box.current!);
     const resized = new ResizeObserver(() => plot.setSize(measure()));
     resized.observe(box.current!);

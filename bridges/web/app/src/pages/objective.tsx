@@ -53,7 +53,7 @@ function Chosen({ objective }: { objective: Objective }) {
     <div class="chosen-objective">
       <p>
         <Badge kind={preflight.ok ? "good" : "bad"}>{preflight.ok ? texts.fits : texts.fitsNot}</Badge>{" "}
-        <Name text={objective.cid} /> {texts.objectiveSummary(summary.messages, duration(Number(summary.durationNs) / 1e9), size(summary.size))}
+        <Name text={objective.cid} /> {texts.objectiveSummary(summary.messages, summary.durationNs === "0" ? "" : duration(Number(summary.durationNs) / 1e9), size(summary.size))}
       </p>
       {preflight.ok ? null : <p class="problem" role="alert"><Strange text={preflight.detail} /> <code>{preflight.reason}</code></p>}
       <ul class="inline">{summary.topics.slice(0, 12).map((topic) => <li key={topic.topic}><code><Strange text={topic.topic} most={60} /></code> {topic.messages}×</li>)}</ul>

@@ -94,7 +94,7 @@ function ModelCard(props: { cid: string; chosen: boolean; robots: Agent[]; choos
       <span class="meta">
         {best !== null ? <Badge kind="calm">{texts.offered(amount(best, market.token))}</Badge> : description?.price ? <Badge kind="calm">{texts.typically(plain(description.price, 40))}</Badge> : null}
         {description?.seconds ? <Badge kind="calm">{duration(description.seconds)}</Badge> : null}
-        <Badge kind={props.robots.some((robot) => robot.health === "alive") ? "good" : "warn"}>{texts.robotsPresent(props.robots.length)}</Badge>
+        <Badge kind={props.robots.some((robot) => robot.health === "alive") ? "good" : "calm"}>{texts.robotsPresent(props.robots.length)}</Badge>
         {done + failed ? <Badge kind={failed > done ? "warn" : "good"}>{texts.recordShort(done, failed)}</Badge> : null}
       </span>
     </button>

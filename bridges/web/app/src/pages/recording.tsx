@@ -113,7 +113,7 @@ function Plot(props: { cid: string; topic: TopicSummary }) {
   const [error, setError] = useState("");
   useEffect(() => {
     let plot: uPlot | null = null;
-    const resized = new ResizeObserver(() => plot?.setSize(measure(box.current!)));
+    const resized = new ResizeObserver(() => box.current && plot?.setSize(measure(box.current)));
     get<Values>(`files/${props.cid}/values${query({ topic: props.topic.topic })}`).then((values) => {
       if (!box.current || values.points < 2) return;
       plot = new uPlot(optionsOf(box.current, values), [values.at, ...values.columns.slice(0, SERIES).map((column) => column.values)], box.current);
@@ -130,9 +130,15 @@ function Plot(props: { cid: string; topic: TopicSummary }) {
 const measure = (box: HTMLElement) => ({ width: Math.max(240, box.clientWidth), height: 200 });
 
 export function plotColors(element: HTMLElement): { ink: string; grid: string; lines: string[] } {
-  const style = getComputedStyle(element);
-  const lines = Array.from({ length: SERIES }, (_, place) => style.getPropertyValue(`--line-${place + 1}`));
-  return { ink: style.getPropertyValue("--quiet"), grid: style.getPropertyValue("--edge"), lines };
+  const probe = element.appendChild(document.createElement("i"));
+  const color = (name: string) => {
+    probe.style.color = `var(--${name})`;
+    return getComputedStyle(probe).color;
+  };
+  const lines = Array.from({ length: SERIES }, (_, place) => color(`line-${place + 1}`));
+  const colors = { ink: color("quiet"), grid: color("edge"), lines };
+  probe.remove();
+  return colors;
 }
 
 function optionsOf(box: HTMLElement, values: Values): uPlot.Options {
