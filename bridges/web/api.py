@@ -23,6 +23,7 @@ from bridges.web.errors import OperatorsOnly, PageNotFound
 from bridges.web.file_api import FileApi
 from bridges.web.views import liability_json
 from mesh.agent.orders import default_lifetime
+from mesh.errors import ChainError
 from mesh.network import call
 from schemas import parse_address
 from schemas.rpc import FinishLiability, RestartLiability, StartLiability
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from bridges.web.orders import OrderPublisher
     from bridges.web.stream import Stream
 
+FACTS_AGE: Final = 10.0
+"""Seconds for which facts of the market are used."""
 LISTED: Final = 500
 """Things in one list."""
 OPENAPI: Final = Path(__file__).with_name("openapi.json")
@@ -138,12 +141,20 @@ class Api:
         )
 
     async def _market_facts(self) -> dict[str, Any]:
-        """What changes seldom; a few seconds old."""
-        if time.monotonic() - self._facts_at < 10.0:
-            return self._facts
+        """What changes seldom, a few seconds old; the last known while the node does not answer."""
+        if time.monotonic() - self._facts_at > FACTS_AGE:
+            try:
+                self._facts = await self._read_facts()
+            except ChainError:
+                if not self._facts:
+                    raise
+            self._facts_at = time.monotonic()
+        return self._facts
+
+    async def _read_facts(self) -> dict[str, Any]:
         parts, chain, settings = self._parts, self._parts.chain, self._parts.settings
         block_time = await chain.node.heads.block_time(100)
-        self._facts = {
+        return {
             "lighthouse": {"name": parts.channel.lighthouse, "address": parts.lighthouse},
             "chainId": chain.chain_id,
             "generation": settings.generation,
@@ -161,8 +172,6 @@ class Api:
             "version": mesh.__version__,
             "stream": self._server.stream.id,
         }
-        self._facts_at = time.monotonic()
-        return self._facts
 
     async def agents(self, request: web.Request) -> web.Response:
         return answer(await self._views.agents())

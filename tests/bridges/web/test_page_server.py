@@ -18,6 +18,7 @@ from tests.support.waiting import until_found
 if TYPE_CHECKING:
     from mesh.chain import Account
     from tests.support.market import Place
+    from tests.support.routers import EmbeddedRouter
 
 COST = 5_000
 
@@ -226,3 +227,27 @@ async def test_what_a_reorganisation_reverts_is_open_again(place: Place, serve: 
             async with asyncio.timeout(20):
                 while "open" not in events or "contract" not in events[events.index("open") :]:
                     events += [event["kind"] for event in json.loads((await socket.receive()).data)]
+
+
+async def test_the_page_goes_on_after_its_router_was_away(place: Place, router: EmbeddedRouter, serve: Any) -> None:
+    async with place.provider(), offering(place.agent("robot")), serve() as browser:
+        router.stop()
+
+        async def is_connected() -> bool:
+            return bool((await browser.get("market"))["connected"]["router"])
+
+        async def is_alone() -> bool:
+            return not await is_connected()
+
+        await until_found(is_alone, what="the loss of the router")
+        assert (await browser.get("agents"))["agents"] == []
+        made = await browser.post("objectives", objective(("/none", "on")), headers=DATA)
+        demand = await signed_demand(browser, place.market.accounts["person"], made["cid"], cost=0)
+        order_hash = (await browser.post("orders", demand, status=202))["order"]["hash"]
+        router.start()
+        await until_found(is_connected, what="the router")
+
+        async def matched() -> Any:
+            return (await browser.get(f"orders/{order_hash}"))["liability"]
+
+        await until_found(matched, what="a contract")
