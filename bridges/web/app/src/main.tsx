@@ -21,7 +21,7 @@ import { Action, Field } from "./ui";
 const TABS = ["order", "market", "jobs", "robots", "provider"] as const;
 
 function useRoute(): string[] {
-  const read = () => location.hash.replace(/^#\/?/, "").split("/").filter(Boolean).map(decodeURIComponent);
+  const read = () => location.hash.replace(/^#\/?/, "").split("/").filter(Boolean);
   const [route, setRoute] = useState(read);
   useEffect(() => {
     const changed = () => {

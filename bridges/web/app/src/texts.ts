@@ -180,6 +180,8 @@ export const texts = {
     failed: "The work was not done. The price went back.",
     "called-off": "The contract was called off. The price went back.",
   },
+  reason: { "no-result": "The robot sent no recording.", "recording-unavailable": "Its recording, which says why, is not here yet." } as Record<string, string>,
+  unchecked: "No description to check against",
   stepName: {
     created: "Contract created", ready: "Robot ready", playing: "Playback began", result: "Result sent", gone: "Robot not present",
     back: "Robot back", paid: "Paid", refunded: "Money back", reverted: "Taken back by the chain",

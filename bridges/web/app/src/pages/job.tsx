@@ -18,7 +18,9 @@ export function JobPage(props: { address: string }) {
     if (event.kind === "playing" && event.data?.total) setPlayback(event.data);
     else job.reload();
   });
-  useTopic("chain", () => job.data && !job.data.liability.isFinalized && job.reload());
+  // A failed job's recording, which says why, may come after the contract's end.
+  const unexplained = job.data?.liability.state === "failed" && job.data.liability.result !== "" && (job.data.reason?.code ?? UNAVAILABLE) === UNAVAILABLE;
+  useTopic("chain", () => job.data && (!job.data.liability.isFinalized || unexplained) && job.reload());
   return (
     <>
       <h1>{texts.job} <Name text={props.address} /></h1>
@@ -27,6 +29,7 @@ export function JobPage(props: { address: string }) {
   );
 }
 
+const UNAVAILABLE = "recording-unavailable";
 const PHASES = { incoming: 2, ready: 2, running: 3, complete: 4, finalized: 5 };
 
 export function JobView(props: { job: Job; playback: Job["playback"]; changed: () => void }) {
@@ -43,7 +46,7 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
         <JobState state={liability.state} /> {texts.jobStateLong[liability.state]}
         {playback && !ended ? ` ${texts.played(playback.position, playback.total)}` : ""}
       </p>
-      {job.reason ? <p class="problem"><Strange text={job.reason.text} /> <code>{job.reason.code}</code></p> : null}
+      {job.reason ? <p class="problem"><Strange text={job.reason.text || texts.reason[job.reason.code] || ""} /> <code>{job.reason.code}</code></p> : null}
       <Refund job={job} changed={props.changed} />
       <div class="columns">
         <section>

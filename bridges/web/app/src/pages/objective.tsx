@@ -36,7 +36,7 @@ export function ObjectiveChoice(props: Choice) {
       {way === "file" ? <FileChoice model={props.model} attempt={attempt} onError={onError} /> : null}
       {way === "cid" ? <CidChoice model={props.model} attempt={attempt} onError={onError} /> : null}
       {error ? <p class="problem" role="alert">{error}</p> : null}
-      {props.objective ? <Chosen objective={props.objective} /> : null}
+      {props.objective ? <Chosen objective={props.objective} described={props.model.described} /> : null}
     </>
   );
 }
@@ -47,12 +47,12 @@ interface Way {
   onError: (problem: unknown) => void;
 }
 
-function Chosen({ objective }: { objective: Objective }) {
+function Chosen({ objective, described }: { objective: Objective; described: boolean }) {
   const { summary, preflight } = objective;
   return (
     <div class="chosen-objective">
       <p>
-        <Badge kind={preflight.ok ? "good" : "bad"}>{preflight.ok ? texts.fits : texts.fitsNot}</Badge>{" "}
+        <Badge kind={!preflight.ok ? "bad" : described ? "good" : "calm"}>{!preflight.ok ? texts.fitsNot : described ? texts.fits : texts.unchecked}</Badge>{" "}
         <Name text={objective.cid} /> {texts.objectiveSummary(summary.messages, summary.durationNs === "0" ? "" : duration(Number(summary.durationNs) / 1e9), size(summary.size))}
       </p>
       {preflight.ok ? null : <p class="problem" role="alert"><Strange text={preflight.detail} /> <code>{preflight.reason}</code></p>}
@@ -85,7 +85,7 @@ function CidChoice({ model, attempt, onError }: Way) {
   const find = attempt(async () => {
     const [summary, preflight] = await Promise.all([
       get<Summary>(`files/${cid}/summary`),
-      get<Objective["preflight"]>(`files/${cid}/preflight${query({ model: model.cid })}`),
+      model.described ? get<Objective["preflight"]>(`files/${cid}/preflight${query({ model: model.cid })}`) : { ok: true, reason: "", detail: "" },
     ]);
     return { cid, size: summary.size, summary, preflight };
   });

@@ -30,10 +30,13 @@ export function OrderPage(props: { model: string }) {
       {model ? (
         <section class="step">
           <h2><span class="count">2</span> {texts.chooseObjective}</h2>
-          <Show of={described}>
-            {(known) => <ObjectiveChoice key={model} model={known} objective={objective} choose={setObjective} />}
-          </Show>
-          {described.error ? <ObjectiveChoice key={model} model={{ cid: model, described: false, description: null, text: null }} objective={objective} choose={setObjective} /> : null}
+          <Show of={described}>{() => null}</Show>
+          <ObjectiveChoice
+            key={`${model} ${described.data?.described}`}
+            model={described.data ?? { cid: model, described: false, description: null, text: null }}
+            objective={objective}
+            choose={setObjective}
+          />
         </section>
       ) : null}
       {model && objective ? (

@@ -1,0 +1,94 @@
+"""A market with a robot, and the page's server, each role in its own process; once for all tests of this folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from eth_account import Account
+
+from tests.support.commands import AIRA, Serving, aira
+from tests.support.ports import free_port
+from tests.web.browser import Browser, Wallet
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+HERE = Path(__file__).parent
+HOSTILE = '<img src=x onerror="document.title=1">\u202e\u0007<script>document.title = "hacked"</script>'
+
+
+@dataclass(frozen=True)
+class Site:
+    """What the tests use."""
+
+    url: str
+    model: str
+    node: str
+    person: bytes
+    variables: dict[str, str]
+    folder: Path
+
+    def wallet(self) -> Wallet:
+        """A wallet with the person's key."""
+        return Wallet(self.person, self.node)
+
+    def poor_wallet(self) -> Wallet:
+        """A wallet with a key that nobody has given anything."""
+        return Wallet(os.urandom(32), self.node)
+
+    @contextmanager
+    def page(self, *options: str, keyfile: bool = False, port: int = 0) -> Iterator[str]:
+        """Another server of the page; gives its address."""
+        port = port or free_port()
+        variables = dict(self.variables) | {"AIRA_DATA_DIR": str(self.folder / f"web-{port}")}
+        if keyfile:
+            variables["AIRA_KEYFILE"] = f"{self.folder}/development/person.json"
+        command = ("web", "--listen", f"127.0.0.1:{port}", *options)
+        with Serving(*AIRA, *command, says="page  ", variables=variables):
+            yield f"http://127.0.0.1:{port}"
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    folder, port = tmp_path_factory.mktemp("site"), free_port()
+    endpoint, node = f"tcp/127.0.0.1:{free_port()}", f"http://127.0.0.1:{port}"
+    variables = {
+        "AIRA_CONNECT": endpoint,
+        "AIRA_WEB3_HTTP_PROVIDER": node,
+        "AIRA_DATA_DIR": str(folder),
+        "AIRA_KEYFILE_PASSWORD_FILE": str(folder / "development" / "password"),
+    }
+    with ExitStack() as stack:
+        up = ("up", "--data-dir", folder, "--listen", endpoint, "--port", str(port))
+        stack.enter_context(Serving(*AIRA, *up, says="provider    0x"))
+        model = json.loads(aira("model", "new", HERE / "model.json", "--out", folder / "model.json", "--json").stdout)
+        robot = (sys.executable, HERE / "robot.py", folder / "model.json", HOSTILE)
+        keyfile = variables | {"AIRA_KEYFILE": f"{folder}/development/robot.json"}
+        stack.enter_context(Serving(*robot, says="robot 0x", variables=keyfile))
+        password = (folder / "development" / "password").read_text().strip()
+        key = Account.decrypt((folder / "development" / "person.json").read_text(), password)
+        site = Site("", model["cid"], node, bytes(key), variables, folder)
+        url = stack.enter_context(site.page())
+        yield Site(url, model["cid"], node, bytes(key), variables, folder)
+
+
+@pytest.fixture
+def browser(site: Site) -> Iterator[Browser]:
+    """A browser with the person's wallet."""
+    with Browser(site.url, site.wallet()) as browser:
+        yield browser
+
+
+@pytest.fixture
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where screenshots go: the folder PAGE_PICTURES, or one of pytest's."""
+    folder = Path(os.environ.get("PAGE_PICTURES") or tmp_path_factory.mktemp("pictures"))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

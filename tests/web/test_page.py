@@ -1,0 +1,243 @@
+"""The page in a real Chromium: orders by clicks, wallets that say no, a server that lies, strangers' texts."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support.commands import Serving
+from tests.support.ports import free_port
+from tests.web.browser import DESKTOP, PHONE, Browser
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.web.conftest import Site
+
+
+def fill_in(browser: Browser, site: Site, *, direction: str = "left") -> None:
+    """From the link to a model until the price is asked."""
+    browser.go(f"order/model/{site.model}")
+    browser.find("#make")
+    browser.driver.execute_script(
+        "const one = [...document.querySelectorAll('fieldset select')].at(-1); one.value = arguments[0];"
+        "one.dispatchEvent(new Event('change', { bubbles: true }))",
+        direction,
+    )
+    browser.click("#make")
+    browser.sees("Fits the model")
+
+
+def review(browser: Browser) -> str:
+    """From the price to the terms that are signed; gives the hash that is shown."""
+    browser.until(lambda: browser.all("#allow") or browser.all("#order:not([disabled])"), "a way to go on")
+    if browser.all("#allow"):
+        browser.click("#allow")
+    browser.click("#order:not([disabled])")
+    return browser.find("#hash").text
+
+
+def test_a_job_is_ordered_paid_and_checked_by_clicks(browser: Browser, site: Site) -> None:
+    browser.go()
+    browser.connect()
+    fill_in(browser, site)
+    review(browser)
+    browser.click("#sign")
+    browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
+    job = browser.driver.current_url
+    browser.driver.refresh()  # in the middle of the job
+    browser.sees("the robot was paid")
+    browser.until(lambda: len(browser.all(".findings .badge.good")) >= 19, "all checks")
+    assert not browser.all(".findings .badge.bad")
+    browser.until(lambda: browser.all(".plot canvas"), "the plot")
+    browser.until(lambda: len(browser.all(".images img")) == 3, "the pictures")
+    # What the robot said is a stranger's text: shown, and nothing else.
+    browser.sees("<script>")
+    assert "hacked" not in browser.driver.title
+    assert "\u202e" not in browser.text()
+    assert browser.violations() == []
+    assert browser.log() == []
+    assert browser.driver.current_url == job
+
+
+def test_what_failed_is_paid_back(browser: Browser, site: Site) -> None:
+    browser.go()
+    browser.connect()
+    fill_in(browser, site, direction="into the wall")
+    review(browser)
+    browser.click("#sign")
+    browser.sees("The price went back")
+    browser.sees("there is a wall")
+
+
+def test_a_no_in_the_wallet_sends_nothing(browser: Browser, site: Site) -> None:
+    assert browser.wallet
+    browser.wallet.rejects.add("personal_sign")
+    browser.go()
+    browser.connect()
+    fill_in(browser, site)
+    review(browser)
+    browser.click("#sign")
+    browser.sees("You said no in the wallet")
+    browser.wallet.rejects.clear()
+    browser.click("#sign")
+    browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
+
+
+def test_a_wrong_chain_is_fixed_by_a_button(browser: Browser, site: Site) -> None:
+    assert browser.wallet
+    browser.wallet.chain_id += 1
+    browser.go()
+    browser.connect()
+    fill_in(browser, site)
+    browser.click("#fix-chain")
+    browser.until(lambda: not browser.all("#fix-chain"), "the right chain")
+    assert "wallet_switchEthereumChain" in browser.wallet.calls
+
+
+def test_an_account_without_money_is_told(site: Site) -> None:
+    with Browser(site.url, site.poor_wallet()) as browser:
+        browser.go()
+        browser.connect()
+        fill_in(browser, site)
+        browser.sees("This account has 0 XRT")
+        assert not browser.find("#order").is_enabled()
+
+
+NOBODYS_MODEL = "QmS9JArPwa55ePgDnyg6TzX24mYTS1b1vLqWNebyVotKxQ"
+
+
+def test_an_open_order_is_withdrawn(browser: Browser, site: Site) -> None:
+    browser.go()
+    browser.connect()
+    fill_in(browser, site)
+    objective = browser.find(".chosen-objective .name").get_attribute("title")
+    browser.go(f"order/model/{NOBODYS_MODEL}")
+    browser.click("#way-cid")
+    browser.type("CID of the objective", objective or "")
+    browser.click("#take-cid")
+    browser.find(".chosen-objective")
+    review(browser)
+    browser.click("#sign")
+    browser.click("#withdraw")
+    browser.sees("You withdrew this order")
+
+
+def test_a_server_that_lies_about_a_job_is_caught(browser: Browser, site: Site) -> None:
+    """The page's own requests pass a script that changes the price in the answer about the job."""
+    browser.go()
+    browser.connect()
+    fill_in(browser, site)
+    review(browser)
+    browser.click("#sign")
+    browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
+    browser.sees("the robot was paid")
+    lie = """
+    const honest = window.fetch;
+    window.fetch = async (path, init) => {
+      const answer = await honest(path, init);
+      if (!/liabilities\\/0x\\w{40}$/.test(String(path))) return answer;
+      const job = await answer.json();
+      job.liability.cost = "1";
+      return new Response(JSON.stringify(job), { headers: answer.headers });
+    };
+    """
+    browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": lie})
+    browser.driver.refresh()
+    browser.find("#lie")
+
+
+LIE = """
+const honest = window.fetch;
+window.fetch = async (path, init) => {
+  const answer = await honest(path, init);
+  if (init?.method !== "POST" || !/v1\\/orders$/.test(String(path))) return answer;
+  const posted = await answer.json();
+  posted.order.hash = "ab".repeat(32);
+  return new Response(JSON.stringify(posted), { headers: answer.headers });
+};
+"""
+
+
+def test_a_server_that_answers_with_another_order_is_caught(browser: Browser, site: Site) -> None:
+    browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": LIE})
+    browser.go()
+    browser.connect()
+    fill_in(browser, site)
+    review(browser)
+    browser.click("#sign")
+    browser.sees("about another order than the one shown")
+
+
+def test_a_page_outlives_its_server(site: Site) -> None:
+    port = free_port()
+    with Browser(f"http://127.0.0.1:{port}", site.wallet()) as browser:
+        with site.page(port=port):
+            browser.go("market")
+            browser.sees("Live")
+        browser.sees("Connecting again")
+        with site.page(port=port):
+            browser.sees("Live")
+
+
+def test_an_order_shows_in_the_market_of_another_tab(browser: Browser, site: Site) -> None:
+    with Browser(site.url) as other:
+        other.go("market")
+        other.sees("Live")
+        browser.go()
+        browser.connect()
+        fill_in(browser, site)
+        review(browser)
+        browser.click("#sign")
+        other.until(lambda: other.all(".kind.demand") and other.all(".kind.offer"), "the demand and the offer")
+        assert other.log() == []
+
+
+def test_the_local_account_orders_and_is_labelled(site: Site) -> None:
+    with site.page(keyfile=True) as url, Browser(url) as browser:
+        browser.go()
+        browser.click("#connect")
+        browser.click("#use-local")
+        browser.sees("Local account")
+        fill_in(browser, site)
+        browser.sees("It signs without asking again")
+        browser.click("#order:not([disabled])")
+        browser.sees("the robot was paid")
+
+
+def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_path: Path, pictures: Path) -> None:
+    origin = f"http://127.0.0.1:{free_port()}"
+    with site.page("--model", site.model, "--cost", "2000000000", "--embed", origin) as url:
+        (tmp_path / "index.html").write_text(f'<!doctype html><iframe src="{url}/" width="500" height="800"></iframe>')
+        serve = (sys.executable, "-m", "http.server", "--bind", "127.0.0.1", "--directory", tmp_path)
+        with (
+            Serving(*serve, origin.rpartition(":")[2], says="Serving HTTP", variables={"PYTHONUNBUFFERED": "1"}),
+            Browser(origin, site.wallet()) as browser,
+        ):
+            browser.driver.get(origin)
+            browser.driver.switch_to.frame(0)
+            browser.sees("Drive a circle")
+            browser.sees("2 XRT")
+            browser.picture(pictures / "robot-frame.png")
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_each_page_is_accessible(site: Site, pictures: Path, size: tuple[int, int], dark: bool) -> None:
+    with Browser(site.url, site.wallet(), size=size, dark=dark) as browser:
+        browser.go()
+        browser.connect()
+        assert browser.wallet
+        routes = {name: name for name in ("order", "market", "jobs", "robots", "provider")}
+        routes |= {"account": f"account/{browser.wallet.address}", "form": f"order/model/{site.model}"}
+        for name, route in routes.items():
+            browser.go(route)
+            browser.until(lambda: not browser.all("[aria-busy=true]") and browser.all("h1"), name)
+            browser.picture(
+                pictures / f"{name}-{'phone' if size == PHONE else 'desktop'}-{'dark' if dark else 'light'}.png"
+            )
+            assert browser.violations() == [], name
+            wider = browser.driver.execute_script("return document.documentElement.scrollWidth - innerWidth")
+            assert wider <= 0, f"{name} is wider than the screen"
