@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from bridges.web.errors import InvalidRequest, UploadTooLarge
 from bridges.web.recordings import summary
+from mesh.errors import ContentError
 from mesh.recording import Limits, messages_in, pack, preflight
 from mesh.work.models import description_in
 from schemas import parse_cid
@@ -26,6 +27,8 @@ FETCHES: Final = 8
 """Files that are fetched at a time."""
 READERS: Final = 2
 """Recordings that are read at a time."""
+PATIENCE: Final = 4.0
+"""Seconds without a new block after which a file is not available."""
 MOST_LINES: Final = 10_000
 LONGEST_TEXT: Final = 20_000
 """Characters of a model without a description."""
@@ -43,11 +46,14 @@ class Files:
         self._reading = asyncio.Semaphore(READERS)
 
     async def fetch(self, cid: str) -> Path:
-        """The file with that CID, from the store or the mesh. Raises `InvalidCid`, `ContentError`."""
+        """The file with that CID, from the store or the mesh. Raises `InvalidCid`, `ContentError`.
+
+        A browser does not wait as long as an agent does.
+        """
         parse_cid(cid)
         settings = self._parts.settings
         async with self._fetching:
-            limit, timeout = settings.objective_expanded_limit, settings.fetch_timeout
+            limit, timeout = settings.objective_expanded_limit, min(settings.fetch_timeout, PATIENCE)
             return await self._parts.exchange.fetch(cid, size_limit=limit, timeout=timeout)
 
     async def in_thread(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
@@ -98,7 +104,8 @@ class Files:
         """Whether an objective fits a model (empty: any). A model that can't be fetched is not checked."""
         description = None
         if model:
-            description, _ = await asyncio.to_thread(_described, await self.fetch(model))
+            with suppress(ContentError):
+                description, _ = await asyncio.to_thread(_described, await self.fetch(model))
         outcome = await self.in_thread(preflight, path, self._limits, model=description)
         return {"ok": outcome.ok, "reason": outcome.reason, "detail": outcome.detail}
 

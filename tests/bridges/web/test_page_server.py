@@ -8,7 +8,7 @@ import secrets
 from typing import TYPE_CHECKING, Any
 
 from mesh import Job, String  # noqa: TC001  handlers are read at run time
-from schemas import ZERO_ADDRESS, Demand, Withdrawal, encode
+from schemas import ZERO_ADDRESS, Demand, Withdrawal, cid_of_bytes, encode
 from schemas.model import ModelDescription, ModelTopic
 from schemas.value_schema import ValueSchema
 from tests.support.market import MODEL, offering
@@ -189,6 +189,15 @@ async def test_a_form_becomes_an_objective_that_its_model_accepts(serve: Any) ->
         wrong = await browser.post("objectives/form", {"model": cid, "values": [{"topic": "/colour", "value": "puce"}]})
         assert wrong["preflight"]["reason"] == "unfit-message"
         assert await browser.get(f"files/{wrong['cid']}/preflight", model=cid) == wrong["preflight"]
+
+
+async def test_a_model_that_nobody_has_is_soon_reported_and_can_be_ordered(serve: Any) -> None:
+    unknown = cid_of_bytes(b"nobody has this")
+    async with asyncio.timeout(30), serve() as browser:
+        refused = await browser.get(f"models/{unknown}", status=404)
+        assert refused["error"]["code"] == "content-unavailable"
+        made = await browser.post(f"objectives?model={unknown}", objective(("/go", "on")), headers=DATA)
+        assert made["preflight"]["ok"]
 
 
 async def test_a_recording_is_listed_and_plotted(serve: Any) -> None:
