@@ -109,9 +109,8 @@ def test_an_account_without_money_is_told(site: Site) -> None:
 NOBODYS_MODEL = "QmS9JArPwa55ePgDnyg6TzX24mYTS1b1vLqWNebyVotKxQ"
 
 
-def test_an_open_order_is_withdrawn(browser: Browser, site: Site) -> None:
-    browser.go()
-    browser.connect()
+def order_of_nobodys_model(browser: Browser, site: Site) -> None:
+    """An order that stays open."""
     fill_in(browser, site)
     objective = browser.find(".chosen-objective .name").get_attribute("title")
     browser.go(f"order/model/{NOBODYS_MODEL}")
@@ -121,6 +120,12 @@ def test_an_open_order_is_withdrawn(browser: Browser, site: Site) -> None:
     browser.find(".chosen-objective")
     review(browser)
     browser.click("#sign")
+
+
+def test_an_open_order_is_withdrawn(browser: Browser, site: Site) -> None:
+    browser.go()
+    browser.connect()
+    order_of_nobodys_model(browser, site)
     browser.click("#withdraw")
     browser.sees("You withdrew this order")
 
@@ -177,9 +182,15 @@ def test_a_page_outlives_its_server(site: Site) -> None:
         with site.page(port=port):
             browser.go("market")
             browser.sees("Live")
+            browser.connect()
+            order_of_nobodys_model(browser, site)
+            browser.sees("Your order is in the market")
         browser.sees("Connecting again")
         with site.page(port=port):
             browser.sees("Live")
+            # The server knows the order again, because the page has posted it again.
+            browser.driver.refresh()
+            browser.sees("Your order is in the market")
 
 
 def test_an_order_shows_in_the_market_of_another_tab(browser: Browser, site: Site) -> None:
@@ -191,6 +202,7 @@ def test_an_order_shows_in_the_market_of_another_tab(browser: Browser, site: Sit
         fill_in(browser, site)
         review(browser)
         browser.click("#sign")
+        browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
         other.until(lambda: other.all(".kind.demand") and other.all(".kind.offer"), "the demand and the offer")
         assert other.log() == []
 

@@ -17,7 +17,8 @@ export function amount(units: string | bigint, token: Token): string {
 }
 
 export function ether(wei: string | bigint): string {
-  if (BigInt(wei) > 0n && BigInt(wei) < 10n ** 14n) return `${Number(formatUnits(BigInt(wei), 9)).toPrecision(3)} gwei`;
+  if (BigInt(wei) > 0n && BigInt(wei) < 10n ** 6n) return `${grouped(String(wei))} wei`;
+  if (BigInt(wei) > 0n && BigInt(wei) < 10n ** 14n) return `${Number(formatUnits(BigInt(wei), 9)).toLocaleString("en", { maximumSignificantDigits: 3 })} gwei`;
   const [whole, part = ""] = formatUnits(BigInt(wei), 18).split(".");
   return `${grouped(part ? `${whole}.${part.slice(0, 5)}` : whole)} ETH`;
 }

@@ -3,6 +3,7 @@ import { useEffect, useState } from "preact/hooks";
 import { post, ApiError } from "./api";
 import { AppProvider, useApp, useData, useLive, wordsOf } from "./app";
 import { plain } from "./format";
+import { postAgain } from "./ordering";
 import { AccountControl, AccountPage } from "./pages/account";
 import { FollowPage } from "./pages/follow";
 import { JobPage } from "./pages/job";
@@ -121,7 +122,9 @@ function Connection() {
     return () => clearInterval(timer);
   }, []);
   useEffect(() => {
-    if (live) reloadMarket();
+    if (!live) return;
+    reloadMarket();
+    postAgain(block);
   }, [live]);
   const broken = !live ? texts.reconnecting : !market.connected.router ? texts.noRouter : !market.connected.chain ? texts.noChain : "";
   return (

@@ -2,12 +2,12 @@
 
 import { zeroAddress } from "viem";
 import type { Address, Hex } from "viem";
-import { get, post, postText } from "./api";
+import { ApiError, get, post, postText } from "./api";
 import type { Account } from "./app";
 import { canonicalSignature, encodeWire, orderHash, randomNonce, signerOf, withdrawalHash } from "./messages";
 import type { Demand } from "./messages";
 import { texts } from "./texts";
-import { ServerLies, checkAsked, checkOrder, rememberOrder } from "./trust";
+import { ServerLies, checkAsked, checkOrder, ownOrders, rememberOrder } from "./trust";
 import type { AccountState, Market, Order, PostedOrder } from "./types";
 import { personalSign } from "./wallet";
 
@@ -45,10 +45,13 @@ export async function signAndPost(demand: Demand, shown: Hex, account: Account):
   if (hash !== shown) throw new ServerLies(texts.lieHash);
   const signature = canonicalSignature(await personalSign(account.wallet.provider, hash, account.address));
   if ((await signerOf(hash, signature)) !== account.address) throw new Error(texts.otherAccountSigned);
-  const posted = await postText<PostedOrder>("orders", encodeWire({ ...demand, signature }));
-  if (posted.order.hash !== hash.slice(2)) throw new ServerLies(texts.lieHash);
-  rememberOrder(posted.order.hash);
-  return posted.order.hash;
+  const wire = encodeWire({ ...demand, signature });
+  const own = hash.slice(2);
+  // Before it is posted: what is signed may become a job, whatever the server answers.
+  rememberOrder({ hash: own, deadline: Number(demand.deadline), wire });
+  const posted = await postText<PostedOrder>("orders", wire);
+  if (posted.order.hash !== own) throw new ServerLies(texts.lieHash);
+  return own;
 }
 
 /** Lets the server's local account order. Returns the order's hash. */
@@ -60,8 +63,21 @@ export async function orderLocally(draft: Draft, account: Address, market: Marke
   const { order } = await post<PostedOrder>("local/orders", fields);
   checkAsked(order, { model, objective, cost, account, market });
   await checkOrder(order);
-  rememberOrder(order.hash);
+  rememberOrder({ hash: order.hash, deadline: order.deadline, wire: "" });
   return order.hash;
+}
+
+/** Posts the open orders of this browser that the server does not know: it keeps them in memory only. */
+export async function postAgain(block: number): Promise<void> {
+  for (const order of ownOrders()) {
+    if (!order.wire || order.deadline <= block) continue;
+    try {
+      await get(`orders/${order.hash}`);
+    } catch (error) {
+      // Refused: it was used or withdrawn meanwhile, or can't be paid any more.
+      if (error instanceof ApiError && error.code !== "unreachable") await postText("orders", order.wire).catch(() => {});
+    }
+  }
 }
 
 export async function withdraw(order: Order, account: Account): Promise<void> {
@@ -74,4 +90,5 @@ export async function withdraw(order: Order, account: Account): Promise<void> {
   const hash = withdrawalHash({ order: `0x${order.hash}`, lighthouse, deadline });
   const signature = canonicalSignature(await personalSign(account.wallet.provider, hash, account.address));
   await postText("orders", encodeWire({ withdraws: order.hash, lighthouse, deadline, signature }));
+  rememberOrder({ hash: order.hash, deadline: order.deadline, wire: "" });
 }

@@ -53,16 +53,24 @@ export function checkAsked(order: Order, asked: { model: string; objective: stri
   if (!same) throw new ServerLies(texts.lieAsked);
 }
 
-export function rememberOrder(hash: string): void {
-  const known = ownOrders().filter((one) => one !== hash);
-  localStorage.setItem(REMEMBERED, JSON.stringify([hash, ...known].slice(0, MOST_REMEMBERED)));
+export interface OwnOrder {
+  hash: string;
+  deadline: number;
+  /** The signed message, to post it again; empty if it need not be. */
+  wire: string;
 }
 
-/** The hashes of the orders that this browser made, newest first. */
-export function ownOrders(): string[] {
+/** Keeps an order that this browser made, or what changed about it. */
+export function rememberOrder(order: OwnOrder): void {
+  const known = ownOrders().filter((one) => one.hash !== order.hash);
+  localStorage.setItem(REMEMBERED, JSON.stringify([order, ...known].slice(0, MOST_REMEMBERED)));
+}
+
+/** The orders that this browser made, newest first. */
+export function ownOrders(): OwnOrder[] {
   try {
     const known = JSON.parse(localStorage.getItem(REMEMBERED) ?? "[]");
-    return Array.isArray(known) ? known.filter((one) => typeof one === "string") : [];
+    return Array.isArray(known) ? known.filter((one) => typeof one?.hash === "string") : [];
   } catch {
     return [];
   }
@@ -122,7 +130,7 @@ async function checkContract({ liability }: Job, reader: Reader, independent: bo
 
 async function checkOwnOrder(job: Job, reader: Reader): Promise<Finding> {
   const hash = String(await read(reader, job.liability.address, "demandHash")).slice(2);
-  if (ownOrders().includes(hash)) return { name: "order", holds: true, detail: texts.ownOrder };
+  if (ownOrders().some((own) => own.hash === hash)) return { name: "order", holds: true, detail: texts.ownOrder };
   return { name: "order", holds: null, detail: texts.notOwnOrder };
 }
 

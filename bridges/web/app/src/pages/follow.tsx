@@ -13,7 +13,7 @@ export function FollowPage(props: { hash: string }) {
   const { account } = useApp();
   const posted = useData<PostedOrder>(`orders/${props.hash}`);
   useTopic(`order/${props.hash}`, posted.reload);
-  useTopic("chain", () => posted.data?.state === "open" && posted.reload());
+  useTopic("chain", () => (posted.data?.state ?? "open") === "open" && posted.reload());
   const [lie, setLie] = useState<unknown>(null);
   const { data } = posted;
   useEffect(() => {
