@@ -12,6 +12,7 @@ import urllib.request
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
+import pytest
 from eth_account import Account
 from eth_account.messages import encode_defunct
 from selenium import webdriver
@@ -260,7 +261,9 @@ class Browser:
         path.write_bytes(base64.b64decode(shot["data"]))
 
     def violations(self) -> list[str]:
-        """What axe finds against WCAG 2.2 AA on this page."""
+        """What axe finds against WCAG 2.2 AA on this page. Skips the test where axe is not installed."""
+        if not AXE.exists():
+            pytest.skip("axe is missing: `make page-check` installs it")
         self.driver.execute_script(AXE.read_text() + ";window.axe = axe;")
         tags = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]
         script = "const done = arguments[1]; axe.run({ runOnly: arguments[0] }).then((r) => done(r.violations))"

@@ -57,9 +57,9 @@ def test_a_job_is_ordered_paid_and_checked_by_clicks(browser: Browser, site: Sit
     browser.sees("<script>")
     assert "hacked" not in browser.driver.title
     assert "\u202e" not in browser.text()
-    assert browser.violations() == []
     assert browser.log() == []
     assert browser.driver.current_url == job
+    assert browser.violations() == []
 
 
 def test_what_failed_is_paid_back(browser: Browser, site: Site) -> None:
