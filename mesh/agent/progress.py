@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 OFFERS_SHOWN: Final = 64
-"""Most agents whose offers for a demand are reported."""
+"""Most offers for a demand, by different agents or on different terms, that are reported."""
 REPORTED: Final = Rate(per_second=4.0, burst=16)
 """Reports of an agent about one job."""
 REPORTS_WAITING: Final = 64
@@ -89,7 +89,7 @@ def report(on_progress: OnProgress, progress: Progress) -> None:
 
 @asynccontextmanager
 async def seen_offers(channel: Channel, order: Demand | Offer, on_progress: OnProgress) -> AsyncIterator[None]:
-    """Meanwhile report the offers of a demand's model and objective, also with other terms; each agent's once."""
+    """Meanwhile report the offers of a demand's model and objective, also with other terms; equal ones once."""
     if on_progress is nothing or isinstance(order, Offer):
         yield
         return
@@ -107,13 +107,11 @@ def stated(statement: Rejection | Decline) -> Progress:
 
 
 async def _report_offers(offers: Subscription[Offer], demand: Demand, on_progress: OnProgress) -> None:
-    seen: dict[str, Progress] = {}
+    seen: set[Progress] = set()
     async for offer in offers:
         said = _offered(offer.signer, offer.message, demand)
-        if offer.message.objective != demand.objective or seen.get(offer.signer) == said:
-            continue
-        if offer.signer in seen or len(seen) < OFFERS_SHOWN:
-            seen[offer.signer] = said
+        if offer.message.objective == demand.objective and said not in seen and len(seen) < OFFERS_SHOWN:
+            seen.add(said)
             report(on_progress, said)
 
 

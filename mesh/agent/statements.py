@@ -12,7 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 from mesh.background import Background, call_in_loop
-from mesh.flood import FairQueue
+from mesh.flood import FairQueue, Rate, RateLimiter
 from mesh.log_context import log_event
 from mesh.market.book import Refusal
 from mesh.network import PresentAgents
@@ -33,6 +33,10 @@ QUEUED: Final = 64
 """Most signed rejections, and most declines, that wait to be checked; more are dropped, since anybody can sign one."""
 QUEUED_OF_ONE: Final = 16
 """Of these, those of one agent or provider."""
+PER_AGENT: Final = Rate(per_second=1.0, burst=32)
+"""Declines by one agent that are looked at: it may decline many demands."""
+HEARD: Final = Rate(per_second=20.0, burst=200)
+"""Declines in all that are looked at."""
 
 S = TypeVar("S", Rejection, Decline)
 
@@ -76,12 +80,12 @@ async def received_declines(
 
     Yields a function to call when there is a demand: a robot that never demands does not subscribe.
     """
-    agents = PresentAgents(parts.channel, role="agent")
+    agents, limiter = PresentAgents(parts.channel, role="agent"), RateLimiter(per_sender=PER_AGENT, total=HEARD)
 
     async def check_all(queue: FairQueue[Decline]) -> None:
         while True:
             decline = await queue.get()
-            if not await agents.is_present(decline.agent):
+            if not limiter.allow(decline.agent) or not await agents.is_present(decline.agent):
                 parts.drops.count("declines", decline.agent)
             elif (order := orders.get(decline.order)) is not None and order.is_open and order.decline(decline):
                 facts = log_event("order-declined", order=decline.order, agent=decline.agent, code=decline.code)

@@ -21,7 +21,7 @@ from mesh.cli.existing import take_existing
 from mesh.cli.files import file_or_cid, require_model, require_readable, require_writable
 from mesh.cli.options import ADDRESS, with_json, with_settings
 from mesh.cli.order import withdraw_orders, withdrawal_lines
-from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress
+from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress, wait_for_broken_pipe
 from mesh.cli.waiting import JobPrinter, print_connection_changes
 from mesh.errors import AiraError
 from mesh.settings import ChainSettings, NetworkSettings, options_of
@@ -119,6 +119,7 @@ async def demand(
         with closing(JobPrinter(unit, as_json=as_json)) as printer:
             changes = print_connection_changes(agent.parts.network, before=printer.close)
             tasks.start(changes, "network losses")
+            tasks.start(wait_for_broken_pipe(), "readers of stdout")
             printer.line(f"demand by {agent.address} for {agent.model}")
             cid = source if isinstance(source, str) else await agent.add(source)
             if (examined := checked or await _check_held(agent, cid)) is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -37,7 +37,11 @@ class JobPrinter:
         self._declines: dict[str, str] = {}
 
     def __call__(self, seen: Progress) -> None:
-        """Print what happened."""
+        """Print what happened. What can't be printed because the reader has gone is lost."""
+        with suppress(BrokenPipeError):  # `wait_for_broken_pipe` ends the command
+            self._print(seen)
+
+    def _print(self, seen: Progress) -> None:
         if seen.kind == "offer" and not seen.code:
             self._offers.add(seen.agent)
         if seen.kind == "declined":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import secrets
 from typing import TYPE_CHECKING, Any
 
@@ -99,7 +100,7 @@ async def test_a_decline_is_believed_of_agents_that_are_present(place: Place) ->
         key = str(DeclineKey(person.channel.lighthouse, place.address("person")))
         absent = Decline(order=order.hash, code="busy", detail="", agent=stranger.address).signed_by(stranger)
         true = Decline(order=order.hash, code="busy", detail="", agent=robot.address).signed_by(robot.parts.signer)
-        forged = replace(absent, agent=robot.address)
+        forged = replace(absent, agent=robot.address, detail="forged")
         other = Decline(order="00" * 32, code="busy", detail="", agent=robot.address).signed_by(robot.parts.signer)
 
         def are_heard() -> bool:
@@ -109,6 +110,32 @@ async def test_a_decline_is_believed_of_agents_that_are_present(place: Place) ->
 
         await until(are_heard)
         assert heard == [Progress(kind="declined", agent=robot.address, code="busy")]
+        demand.cancel()
+        await asyncio.wait([demand])
+
+
+async def test_an_agent_that_goes_on_declining_is_not_heard(place: Place) -> None:
+    """Each of its declines differs from the one before."""
+    heard: list[Progress] = []
+    async with (
+        place.agent("robot") as robot,
+        place.agent("person") as person,
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+    ):
+        demand = asyncio.create_task(person.demand(OBJECTIVE, on_progress=heard.append))
+        await posted(person)
+        (order,) = person.orders()
+        key = str(DeclineKey(person.channel.lighthouse, place.address("person")))
+        signer, numbers = robot.parts.signer, itertools.count()
+
+        def are_dropped() -> bool:
+            for _ in range(10):
+                decline = Decline(order=order.hash, code="busy", detail=str(next(numbers)), agent=robot.address)
+                network.session.put(key, decline.signed_by(signer).encode())
+            return person.drops.totals().get("declines", 0) > 100
+
+        await until(are_dropped, pause=0.05)
+        assert 0 < len(heard) < next(numbers) - 100
         demand.cancel()
         await asyncio.wait([demand])
 
