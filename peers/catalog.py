@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from peers.recipes import Recipe
 
 CHAIN = NpmRecipe(name="anvil 1.7.1, solc 0.8.37", manifest="chain")
+AXE = NpmRecipe(name="axe-core 4.14.1", manifest="axe")
 IPFS = NpmRecipe(name="js-ipfs 0.66.1", manifest="ipfs")
 CLIENT_3 = NpmRecipe(name="robonomics-js 0.3.0", manifest="robonomics-3")
 CLIENT_5 = NpmRecipe(name="robonomics-js 0.6.3", manifest="robonomics-5")
@@ -36,6 +37,7 @@ BASE = DebianRecipe(name="base image", release="bookworm", packages=("python3", 
 # In this order they are installed: the quick ones first.
 RECIPES: tuple[Recipe, ...] = (
     CHAIN,
+    AXE,
     CLIENT_3,
     CLIENT_5,
     KUBO,
@@ -183,6 +185,12 @@ _ALL = (
     ),
     Peer(name="chromium", purpose="pages in a real browser", recipe=BROWSER, search=_command("chromium")),
     Peer(name="chromedriver", purpose="drives chromium", recipe=BROWSER, search=_command("chromedriver")),
+    Peer(
+        name="axe",
+        purpose="finds what keeps people from using a page",
+        recipe=AXE,
+        search=_within(AXE, "node_modules/axe-core/axe.min.js"),
+    ),
     Peer(name="podman", purpose="real containers", recipe=CONTAINERS, search=_command("podman")),
     Peer(name="runc", purpose="what podman runs containers with", recipe=CONTAINERS, search=_command("runc")),
     Peer(

@@ -9,10 +9,8 @@ import base64
 import json
 import time
 import urllib.request
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
-import pytest
 from eth_account import Account
 from eth_account.messages import encode_defunct
 from selenium import webdriver
@@ -24,13 +22,12 @@ from tests.support.peers import require
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from selenium.webdriver.remote.webelement import WebElement
 
 PATIENCE: Final = 60.0
 """Seconds until what a test waits for must have come, on a busy machine."""
-ROOT: Final = Path(__file__).parents[2]
-AXE: Final = ROOT / "bridges" / "web" / "app" / "node_modules" / "axe-core" / "axe.min.js"
 DESKTOP: Final = (1280, 900)
 PHONE: Final = (390, 844)
 
@@ -261,10 +258,8 @@ class Browser:
         path.write_bytes(base64.b64decode(shot["data"]))
 
     def violations(self) -> list[str]:
-        """What axe finds against WCAG 2.2 AA on this page. Skips the test where axe is not installed."""
-        if not AXE.exists():
-            pytest.skip("axe is missing: `make page-check` installs it")
-        self.driver.execute_script(AXE.read_text() + ";window.axe = axe;")
+        """What axe finds against WCAG 2.2 AA on this page."""
+        self.driver.execute_script(require("axe").read_text() + ";window.axe = axe;")
         tags = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]
         script = "const done = arguments[1]; axe.run({ runOnly: arguments[0] }).then((r) => done(r.violations))"
         found = self.driver.execute_async_script(script, tags)
