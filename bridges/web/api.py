@@ -19,13 +19,16 @@ from bridges.web.answers import (
     number_in,
     parse_text_cid,
 )
-from bridges.web.errors import OperatorsOnly, PageNotFound
+from bridges.web.errors import InvalidRequest, OperatorsOnly, PageNotFound
 from bridges.web.file_api import FileApi
 from bridges.web.views import liability_json
 from mesh.agent.orders import default_lifetime
 from mesh.errors import ChainError
 from mesh.network import call
+from mesh.watching.logs import LogReader
 from schemas import parse_address
+from schemas.agent_keys import RpcKey
+from schemas.logs import LEVELS
 from schemas.rpc import FinishLiability, RestartLiability, StartLiability
 
 if TYPE_CHECKING:
@@ -61,6 +64,12 @@ class LocalWithdrawal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The order that the local account withdraws."""
 
     order: str
+
+
+class LocalRefund(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The job whose cost the local account takes back."""
+
+    liability: str
 
 
 class AgentAction(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -113,11 +122,13 @@ class Api:
             get("/api/v1/orders/{hash}", self.order),
             post("/api/v1/local/orders", self.local_order),
             post("/api/v1/local/withdrawals", self.local_withdrawal),
+            post("/api/v1/local/refunds", self.local_refund),
             *FileApi(self._files).routes(),
             get("/api/v1/liabilities", self.liabilities),
             get("/api/v1/liabilities/{address}", self.job),
             get("/api/v1/liabilities/{address}/verification", self.verification),
             get("/api/v1/accounts/{address}", self.account),
+            get("/api/v1/agents/{address}/logs", self.logs),
             post("/api/v1/agents/{address}/{action}", self.drive),
             get("/api/v1/lighthouse", self.lighthouse),
             get("/api/v1/stream", self.stream),
@@ -215,6 +226,11 @@ class Api:
         order = await self._publisher.withdraw((await body_of(request, LocalWithdrawal)).order)
         return answer(self._market.posted_json(order))
 
+    async def local_refund(self, request: web.Request) -> web.Response:
+        address = parse_address((await body_of(request, LocalRefund)).liability)
+        await self._publisher.refund(address)
+        return answer({"liability": address})
+
     async def liabilities(self, request: web.Request) -> web.Response:
         query, limit = request.query, number_in(request, "limit", 50, most=LISTED)
         party = parse_address(query["party"]) if query.get("party") else ""
@@ -244,6 +260,19 @@ class Api:
 
     async def lighthouse(self, request: web.Request) -> web.Response:
         return answer(await self._views.lighthouse())
+
+    async def logs(self, request: web.Request) -> web.Response:
+        options = self._server.options
+        if (options.token or options.operator_token) and self._server.role_of(request) != "operator":
+            raise OperatorsOnly("only operators read logs", hint="log in as an operator")
+        level = request.query.get("level", "info")
+        if level not in LEVELS:
+            raise InvalidRequest(f"a level is one of {', '.join(LEVELS)}")
+        lines = number_in(request, "lines", 100, least=1, most=LISTED)
+        key = str(RpcKey(address_in(request), "logs"))
+        update = await LogReader(self._parts.network.session, key, lines=lines, level=level).poll(timeout=2.0)
+        events = [msgspec.to_builtins(event) for event in update.events[-lines:]]
+        return answer({"events": events, "answered": update.answered})
 
     async def drive(self, request: web.Request) -> web.Response:
         if self._server.role_of(request) != "operator":

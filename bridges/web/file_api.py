@@ -39,6 +39,7 @@ class FileApi:
             web.post("/api/v1/objectives", self.upload),
             web.post("/api/v1/objectives/form", self.form),
             web.get(file, self.file),
+            web.get(f"{file}/recording.{{format}}", self.file),
             web.get(f"{file}/summary", self.summary),
             web.get(f"{file}/preflight", self.preflight),
             web.get(f"{file}/messages", self.messages),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from bridges.web.contracts import ContractFollower
+from bridges.web.views import result_json
 from mesh.background import Background
 from mesh.errors import AiraError
 from mesh.flood import BoundedDict
@@ -34,6 +35,10 @@ STATEMENTS: Final = 32
 PROVIDERS_AGE: Final = 15.0
 """Seconds after which the list of providers is read again."""
 LONGEST_DETAIL: Final = 500
+ASKERS: Final = 1024
+"""Accounts whose latest question is remembered: a demand that pays nothing."""
+ANSWERS: Final = 8
+"""Answers to one question that are remembered."""
 AMOUNTS: Final = ("cost", "validatorFee", "lighthouseFee")
 
 
@@ -46,6 +51,8 @@ class SeenOrder:
     withdrawn: bool = False
     liability: str = ""
     statements: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
+    answers: list[dict[str, Any]] = field(default_factory=list)
+    """Results without a contract, if the order pays nothing."""
 
     @property
     def hash(self) -> str:
@@ -91,6 +98,7 @@ class Market(Lifecycle):
         self._clock = clock
         self.contracts = ContractFollower(components, stream, self, from_block=from_block, clock=clock)
         self._seen: BoundedDict[str, SeenOrder] = BoundedDict(ORDERS)
+        self._questions: BoundedDict[str, SeenOrder] = BoundedDict(ASKERS)
         self._posted: dict[str, SeenOrder] = {}
         """Orders that were posted here: they are remembered until their deadline."""
         self.dropped = 0
@@ -128,6 +136,8 @@ class Market(Lifecycle):
             known = SeenOrder(verified, self._clock())
             known.liability = self.contracts.matched.get((order_hash, verified.signer), "")
             self._stream.publish("market", "order", known.json())
+        if posted and isinstance(known.message, Demand) and not known.message.cost:
+            self._questions[verified.signer] = known
         if posted:
             self._posted[order_hash] = known
         elif order_hash not in self._seen:
@@ -146,6 +156,7 @@ class Market(Lifecycle):
             "state": order.state(self.head),
             "liability": order.liability or None,
             "statements": list(order.statements.values()),
+            "answers": order.answers,
         }
 
     async def providers(self) -> frozenset[str]:
@@ -179,6 +190,7 @@ class Market(Lifecycle):
         match event:
             case Verified(message=Result() as result):
                 self.contracts.take_result(Verified(result, event.hash, event.signer))
+                self._take_answer(Verified(result, event.hash, event.signer))
             case Verified():
                 self.add(event)
             case Rejection(order=order_hash, provider=agent, reason=code):
@@ -190,6 +202,16 @@ class Market(Lifecycle):
                 self.contracts.say(liability.address, agent, "ready", "")
             case JobEvent(agent, "complete", liability):
                 self.contracts.say(liability.address, agent, "result", liability.result)
+
+    def _take_answer(self, result: Verified[Result]) -> None:
+        """A Result for an account, not for a contract, answers the latest question of that account."""
+        order = self._questions.get(result.message.liability)
+        if order is None or len(order.answers) >= ANSWERS:
+            return
+        answer = result_json(result) | {"at": self._clock()}
+        if all(known["signature"] != answer["signature"] for known in order.answers):
+            order.answers.append(answer)
+            self.changed(order, "answered")
 
     def _state(self, order_hash: str, kind: str, agent: str, code: str, detail: str) -> None:
         """Remember and publish a rejection or a decline."""

@@ -11,6 +11,8 @@ import msgspec
 from bridges.web.errors import NoLocalAccount, OrderUnusable, PageNotFound, TooManyRequests
 from mesh.agent import OrderState
 from mesh.background import Background
+from mesh.cli.errors import NotRefundable
+from mesh.cli.liability import refund_words
 from mesh.retry import Backoff
 from mesh.role import Lifecycle
 from mesh.work.outbox import RESEND
@@ -97,6 +99,19 @@ class OrderPublisher(Lifecycle):
                 await mine.withdraw()
                 return self._withdrawn(order_hash, self._parts.agent.address)
         raise PageNotFound(f"the local account has no open order {order_hash}")
+
+    async def refund(self, address: str) -> None:
+        """The local account takes back the cost of its job. Raises `NotRefundable`, `NoLocalAccount`, `ChainError`."""
+        if self._parts.agent is None:
+            raise NoLocalAccount("this server has no account", hint="send the transaction from your wallet")
+        liabilities = self._parts.chain.liabilities
+        liability = await liabilities.get(address)
+        if liability.promisee != self._parts.agent.address:
+            raise NotRefundable(f"the local account did not order {address}")
+        state = await liabilities.refund_state(address)
+        if not state.is_refundable:
+            raise NotRefundable(f"{address} can't be refunded: {refund_words(state)}")
+        await liabilities.refund(address)
 
     def _withdrawn(self, order_hash: str, signer: str) -> SeenOrder:
         order = self._market.order(order_hash)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
+import re
 import secrets
 import ssl
 import time
@@ -62,6 +63,9 @@ LONGEST_BODY: Final = 1 << 18
 SESSION_SECONDS: Final = 12 * 3600.0
 AGENTS_INTERVAL: Final = 3.0
 """Seconds between two lists of agents on the stream."""
+VIEWERS: Final = ("https://app.foxglove.dev",)
+"""Sites that may read files here: a link of the page opens a recording there."""
+VIEWED: Final = re.compile(r"/api/v1/files/\w+/recording\.\w+")
 OPEN_PATHS: Final = ("/api/v1/session", "/api/v1/openapi.json")
 """Parts of the interface that need no login."""
 
@@ -133,7 +137,7 @@ class PageServer(Lifecycle):
         """Check a request, answer errors in JSON, and add the headers that protect the page."""
         try:
             self._check(request)
-            response = await handler(request)
+            response = web.Response(status=204) if _is_viewer(request, "OPTIONS") else await handler(request)
         except AiraError as error:
             response = _failure(error)
         except web.HTTPRequestEntityTooLarge:
@@ -149,6 +153,8 @@ class PageServer(Lifecycle):
         if not response.prepared:
             for name, value in self._headers().items():
                 response.headers.setdefault(name, value)
+            if _is_viewer(request):
+                response.headers.update(_VIEWER_HEADERS | {"Access-Control-Allow-Origin": request.headers["Origin"]})
             if request.path.startswith("/api/"):
                 response.headers.setdefault("Cache-Control", "no-store")
         return response
@@ -160,6 +166,14 @@ class PageServer(Lifecycle):
             raise TooManyRequests("too many requests", hint="wait a moment")
         if request.host not in self._hosts:
             raise WrongHost(f"this server is not {request.host[:80]!r}", hint="name it with --name")
+        if not _is_viewer(request):
+            self._check_site(request)
+        is_api = request.path.startswith("/api/") or request.path == "/rpc"
+        if is_api and request.path not in OPEN_PATHS and self._needs_login and self._session_of(request) is None:
+            raise LoginRequired("log in first", hint="the token is in the server's token file")
+
+    def _check_site(self, request: web.Request) -> None:
+        """Refuse pages of other sites."""
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc not in self._hosts:
             raise WrongOrigin("pages of other sites may not use this server")
@@ -171,8 +185,6 @@ class PageServer(Lifecycle):
                 raise WrongOrigin(f"the header {OWN_HEADER} is missing")
             if request.content_type not in ("application/json", "application/octet-stream"):
                 raise InvalidRequest("a body is application/json, or application/octet-stream for an objective")
-        if is_api and request.path not in OPEN_PATHS and self._needs_login and self._session_of(request) is None:
-            raise LoginRequired("log in first", hint="the token is in the server's token file")
 
     @property
     def _needs_login(self) -> bool:
@@ -250,6 +262,24 @@ class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A token to log in with."""
 
     token: str
+
+
+_VIEWER_HEADERS: Final = {
+    "Access-Control-Allow-Headers": "Range",
+    "Access-Control-Allow-Private-Network": "true",
+    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
+    "Cross-Origin-Resource-Policy": "cross-origin",
+    "Vary": "Origin",
+}
+
+
+def _is_viewer(request: web.Request, *methods: str) -> bool:
+    """Whether a site for recordings reads one. It gets no cookie: where people log in, it is refused."""
+    return (
+        request.headers.get("Origin") in VIEWERS
+        and VIEWED.fullmatch(request.path) is not None
+        and request.method in (methods or ("GET", "HEAD", "OPTIONS"))
+    )
 
 
 def _failure(error: AiraError) -> web.Response:
