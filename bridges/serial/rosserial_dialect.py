@@ -3,12 +3,16 @@
 A board acknowledges nothing and buffers 64 bytes. But it announces its topics when it reads a request for them; so each
 command is followed by that request, and the next command is sent after the answer: until then the board may still run
 the callback of the last one. The answer proves no more: the board skips a damaged command silently.
+
+If the cable is pulled during a command, nothing is asked when the board is back: one that was asked before and was not
+restarted speaks by itself within some seconds, so it is known that it reads on.
 """
 
 from __future__ import annotations
 
 import logging
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from bridges.serial import rosserial
@@ -49,25 +53,29 @@ LOST: Final = 10.0
 """Seconds of silence, without an active command, after which a board is lost."""
 FIRST_DELAY: Final = 0.2
 """Seconds after which the request behind a command is repeated; each further delay is twice as long."""
+CUT_OFF: Final = 0.1
+"""Seconds after a command was sent in which a pulled cable may have cut it off."""
+FORGETS: Final = 11.5
+"""Seconds after the last answer to a board's request for the time, after which it does not speak by itself any more."""
 MAX_REQUESTS: Final = 5
 """The most requests behind one command: more would fill the board's 64 bytes while a callback blocks."""
 
 
+@dataclass
 class _ActiveCommand:
     """The command that was sent and has not ended."""
 
-    def __init__(self, command: Command, topic: BoardTopic, now: float) -> None:
-        self.command = command
-        self.topic = topic
-        self.delay = FIRST_DELAY
-        self.repeat_at = now + FIRST_DELAY
-        self.requests = 1
-        self.answer: bytes | None = None
+    command: Command
+    topic: BoardTopic
+    sent_at: float
+    repeat_at: float
+    delay: float = FIRST_DELAY
+    requests: int = 1
+    answer: bytes | None = None
 
 
 class RosserialDialect(Dialect):
-    """rosserial. `parameters` are what a sketch may request, by name; `clock` gives the time that boards ask for.
-
+    """rosserial. `parameters` are what a sketch may request, by name; `clock` gives the time that boards ask for;
     `settle_time` is how long the next command waits, in seconds, if some answers to requests behind the last one are
     missing: longer for a board that runs slower than its line.
     """
@@ -87,10 +95,11 @@ class RosserialDialect(Dialect):
         self._decoder = RosserialDecoder(self.counters)
         self._topics = TopicTable(rosserial.longest_frame(baud))
         self._last_announced: tuple[int, int] | None = None
-        self._last_heard = self._last_asked = 0.0
+        self._last_heard = self._last_asked = self._remembers_until = 0.0
         self._settled_at: float | None = None
         self._answers_expected = 0
         self._active: _ActiveCommand | None = None
+        self._listens_until: float | None = None
 
     @property
     def next_tick(self) -> float:
@@ -100,22 +109,29 @@ class RosserialDialect(Dialect):
             due = min(due, self._active.repeat_at, self._active.command.deadline)
         if self._settled_at is not None:
             due = min(due, self._settled_at)
-        if self._is_open:
+        if self._listens_until is not None:
+            due = min(due, self._listens_until)
+        if self._is_open and self._active is None:
             quiet = self._last_heard + QUIET if self.info is not None else 0.0
             due = min(due, max(quiet, self._last_asked + ASK_INTERVAL))
         return due
 
     def opened(self, now: float) -> None:
-        """Request the topics; a board that is still starting does not hear it."""
+        """Request the topics, which a board that is starting does not hear; or listen what became of a command."""
         self._is_open, self._last_heard = True, now
         self._decoder.reset()
-        self._ask_topics(now)
+        if self._listens_until is None:
+            self._ask_topics(now)
 
     def closed(self, now: float) -> None:
-        """Fail the active command: it is not known whether the board has read it."""
+        """The active command waits if the board may still remember the host; otherwise it is in doubt."""
         self._is_open, self._settled_at = False, None
         self._out.clear()
-        self._lose_board("the line is closed")
+        active = self._active
+        until = None
+        if active is not None and active.topic.flow is Flow.SUBSCRIBES and active.sent_at + CUT_OFF <= now:
+            until, active.repeat_at = self._remembers_until, float("inf")
+        self._lose_board("the line is closed", until=until)
 
     def receive(self, data: bytes, now: float) -> None:
         """Decode messages and handle them."""
@@ -128,6 +144,8 @@ class RosserialDialect(Dialect):
         self._expire_queued(now)
         if self._settled_at is not None and self._settled_at <= now:
             self._settle(now)
+        if self._listens_until is not None and self._listens_until <= now:
+            self._lose_board("the board was restarted, or was silent for long")
         active = self._active
         if active is not None and active.command.deadline <= now:
             self._finish(CallStatus.FAILED, "doubt", "the board did not read on", now)
@@ -160,10 +178,13 @@ class RosserialDialect(Dialect):
         self._send(RosserialMessage(response_id, payload))
 
     def _handle(self, message: RosserialMessage, now: float) -> None:
+        if self._listens_until is not None and message.id not in (rosserial.LOG, rosserial.PARAMETER):
+            self._resume(now, ask=message.id not in rosserial.ANNOUNCEMENTS)
         try:
             if message.id in rosserial.ANNOUNCEMENTS:
                 self._handle_announcement(message.id, rosserial.decode_topic_info(message.data), now)
             elif message.id == rosserial.TIME:
+                self._remembers_until = now + FORGETS
                 self._send(rosserial.encode_time(self._clock()))
             elif message.id == rosserial.LOG:
                 self._events.append(BoardLogged(*rosserial.decode_log(message.data)))
@@ -227,7 +248,7 @@ class RosserialDialect(Dialect):
                 self._fail(command, "unfit", str(error))
                 continue
             command.begun = True
-            self._active = _ActiveCommand(command, topic, now)
+            self._active = _ActiveCommand(command, topic, now, now + FIRST_DELAY)
             self._send(message)
             if topic.flow is Flow.SUBSCRIBES:
                 self._out += ASK_TOPICS
@@ -236,27 +257,38 @@ class RosserialDialect(Dialect):
         """Repeat the request behind a command: it was damaged, or the board is running a callback."""
         active.delay *= 2
         active.repeat_at = now + active.delay
-        if self._is_open and active.requests < MAX_REQUESTS and active.topic.flow is Flow.SUBSCRIBES:
+        if active.requests < MAX_REQUESTS and active.topic.flow is Flow.SUBSCRIBES:
             active.requests += 1
             self.counters.repeated += 1
             self._out += ASK_TOPICS
 
     def _finish(self, status: CallStatus, reason: str, detail: str, now: float) -> None:
         assert self._active is not None
-        active, self._active = self._active, None
+        active, self._active, self._listens_until = self._active, None, None
         kind = active.topic.type if active.answer is not None else None
         self._events.append(CommandFinished(active.command, status, active.answer or b"", kind, reason, detail))
         self._send_next(now)
 
-    def _lose_board(self, why: str) -> None:
-        """The board is no longer ready. The active command is in doubt, queued ones stay queued."""
-        if self._active is not None:
+    def _lose_board(self, why: str, *, until: float | None = None) -> None:
+        """The board is no longer ready. The active command waits `until` then, or is in doubt; queued ones stay."""
+        self._listens_until = until
+        if self._active is not None and until is None:
             active, self._active = self._active, None
             self._fail(active.command, "doubt", f"{why}; it is not known whether the board had read it")
         if self.info is not None:
             self.info = None
             self._events.append(BoardLost(why))
-        self._topics.clear()
+        if until is None:
+            self._topics.clear()
+
+    def _resume(self, now: float, *, ask: bool) -> None:
+        """The board has not restarted: it is ready as before, and has read the active command or will."""
+        assert self._active is not None
+        self._listens_until, self.info = None, self._topics.device_info()
+        self._events.append(BoardReady(self.info))
+        if ask:
+            self._active.requests, self._active.delay, self._active.repeat_at = 1, FIRST_DELAY, now + FIRST_DELAY
+            self._out += ASK_TOPICS
 
     def _ask_topics(self, now: float) -> None:
         self._last_asked = now

@@ -32,11 +32,12 @@ from bridges.serial.rosserial import (
     RosserialMessage,
     encode_message,
 )
-from bridges.serial.rosserial_dialect import LOST, MAX_REQUESTS, SETTLE_TIME, RosserialDialect
+from bridges.serial.rosserial_dialect import CUT_OFF, FORGETS, LOST, MAX_REQUESTS, SETTLE_TIME, RosserialDialect
 from schemas.payloads import String
 
 STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
 EMPTY_MD5 = "d41d8cd98f00b204e9800998ecf8427e"
+
 NOW = 1000.5
 
 
@@ -302,3 +303,87 @@ def test_other_topics_than_before_are_another_board() -> None:
     assert isinstance(gone, BoardLost)
     assert isinstance(again, BoardReady)
     assert [topic.name for topic in again.info.topics] == ["/hear"]
+
+
+def unplugged() -> tuple[Bench, Command]:
+    """A bench whose cable was pulled for a second, a second after a command was sent."""
+    bench = ready()
+    command = bench.command()
+    assert bench.sent()
+    bench.after(1.0)
+    bench.dialect.closed(bench.now)
+    assert bench.dialect.events() == [BoardLost("the line is closed")]
+    bench.after(1.0)
+    bench.dialect.opened(bench.now)
+    return bench, command
+
+
+@pytest.mark.parametrize("kind", [TIME, 125], ids=["a question for the time", "a message"])
+def test_a_board_that_speaks_unasked_after_an_unplugged_cable_has_not_restarted(kind: int) -> None:
+    bench, command = unplugged()
+    assert bench.after(3.0) == []  # asked for its topics, a board that was restarted would speak too
+    bench.receive(kind, b"" if kind == TIME else text("on"))
+    happenings = bench.dialect.events()
+    assert isinstance(happenings[0], BoardReady)
+    assert [type(each) for each in happenings[1:]] == ([] if kind == TIME else [MessageReceived])
+    assert RosserialMessage(PUBLISHER) in bench.sent()
+    bench.announce(*TOPICS)
+    [ended] = bench.dialect.events()
+    assert isinstance(ended, CommandFinished)
+    assert (ended.command, ended.status) == (command, CallStatus.READ)
+
+
+def test_an_announcement_after_an_unplugged_cable_answers_the_request_behind_the_command() -> None:
+    bench, command = unplugged()
+    bench.announce(*TOPICS)
+    ended = bench.dialect.events()[-1]
+    assert isinstance(ended, CommandFinished)
+    assert (ended.command, ended.status) == (command, CallStatus.READ)
+
+
+def test_a_board_that_stays_silent_after_an_unplugged_cable_leaves_the_command_in_doubt() -> None:
+    bench, command = unplugged()
+    bench.receive(LOG, b"\x01" + text("setup"))  # a sketch may log before it was asked
+    bench.dialect.events()
+    while not (sent := bench.after(0.1)):
+        assert bench.now < 120.0 + FORGETS
+        assert bench.dialect.next_tick > bench.now
+    assert bench.now >= 100.0 + FORGETS
+    [ended] = bench.dialect.events()
+    assert isinstance(ended, CommandFinished)
+    assert (ended.command, ended.reason) == (command, "doubt")
+    assert sent == [RosserialMessage(PUBLISHER)]
+    bench.announce(*TOPICS)
+    bench.after(SETTLE_TIME)
+    assert isinstance(bench.dialect.events()[0], BoardReady)
+
+
+def test_a_command_that_an_unplugged_cable_may_have_cut_off_is_in_doubt_at_once() -> None:
+    bench = ready()
+    command = bench.command()
+    bench.after(CUT_OFF / 2)
+    bench.dialect.closed(bench.now)
+    [ended, lost] = bench.dialect.events()
+    assert isinstance(ended, CommandFinished)
+    assert (ended.command, ended.reason) == (command, "doubt")
+    assert isinstance(lost, BoardLost)
+
+
+def test_a_command_that_waits_for_its_board_ends_at_its_deadline() -> None:
+    bench = ready()
+    command = bench.command(seconds=5.0)
+    bench.after(1.0)
+    bench.dialect.closed(bench.now)
+    bench.dialect.events()
+    bench.after(4.0)
+    [ended] = bench.dialect.events()
+    assert isinstance(ended, CommandFinished)
+    assert (ended.command, ended.reason) == (command, "doubt")
+
+
+def test_a_board_that_is_busy_for_long_does_not_make_the_line_busy() -> None:
+    bench = ready()
+    bench.command()
+    for _ in range(100):
+        bench.after(0.1)
+        assert bench.dialect.next_tick > bench.now

@@ -1,7 +1,10 @@
-// rosserial: says on `said` what it hears on `hear`; `loud` is a parameter, `twice` a service, `work` takes 300 ms;
+// rosserial: says on `said` what it hears on `hear`; `loud` is a parameter, `twice` a service, `work` takes twice WORK;
 // `inquire` asks `weather` and says the answer, `garble` sends what a host can't know and a log that is no text.
 #include <MiniRosserial.h>
 
+#ifndef WORK
+#define WORK 150
+#endif
 #ifndef BAUD
 #define BAUD 57600
 #endif
@@ -29,9 +32,9 @@ void hear(const uint8_t *data, uint16_t size) { node.publish(0, data, size); }
 
 void work(const uint8_t *data, uint16_t size) {
   digitalWrite(13, HIGH);
-  delay(150);
+  delay(WORK);
   digitalWrite(13, LOW);
-  delay(150);
+  delay(WORK);
 }
 
 uint16_t twice(const uint8_t *data, uint16_t size, uint8_t *answer) {

@@ -1,0 +1,109 @@
+"""Rosserial boards whose cable is pulled during a command: what a job does depends on what the sketch lets it know."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+
+from bridges.serial.device import Device
+from bridges.serial.dialect import BoardLost, CallStatus, CommandFinished
+from bridges.serial.rosserial_dialect import RosserialDialect
+from mesh.recording import open_objective
+from schemas import Empty, String
+from schemas.payloads import decode_value
+from tests.support.boards import ROSSERIAL_ECHO, board, edge
+from tests.support.lines import LineClient
+from tests.support.market import founded, offering, place
+from tests.support.objectives import objective
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from bridges.serial.boards import SimulatedBoard
+    from mesh.agent import Agent
+    from mesh.work.job import Job
+    from tests.support.market import Place
+
+__all__ = ["founded", "place"]
+
+LONG = 60.0
+WORK = "WORK=600"
+"""The lamp is on, then off, for so many milliseconds."""
+
+
+def flashes(uno: SimulatedBoard) -> int:
+    """How often the lamp has gone out."""
+    return sum(not change.high for change in uno.changes(13))
+
+
+def unplug_during_a_command(uno: SimulatedBoard, *, reset: bool = False) -> None:
+    """Pull the cable while the board is in its callback, some time after it has read the command."""
+    uno.wait_until(lambda: flashes(uno) == 1, what="the first flash")
+    uno.unplug()
+    if reset:
+        uno.reset()
+    uno.plug()
+
+
+def test_a_command_is_read_although_the_cable_was_pulled_in_its_callback() -> None:
+    # On a busy machine the board runs slower than its line: allow it more time to announce its topics.
+    patient = RosserialDialect(baud=57_600, settle_time=3.0)
+    with board(ROSSERIAL_ECHO, WORK) as uno, LineClient(uno, patient) as client:
+        client.submit("/work")
+        client.submit("/work")
+        unplug_during_a_command(uno)
+        assert [client.next(CommandFinished).status for _ in range(2)] == [CallStatus.READ] * 2
+        uno.wait_until(lambda: flashes(uno) == 2, what="the second flash")
+        assert any(isinstance(event, BoardLost) for event in client.events)
+
+
+def test_a_command_is_in_doubt_if_the_board_has_restarted() -> None:
+    with board(ROSSERIAL_ECHO, WORK) as uno, LineClient(uno, RosserialDialect(baud=57_600)) as client:
+        client.submit("/work")
+        client.submit("/hear", String("next").encode())
+        unplug_during_a_command(uno, reset=True)
+        assert client.next(CommandFinished).reason == "doubt"
+        assert client.next(CommandFinished).status is CallStatus.READ
+
+
+def working(robot: Agent, in_doubt: Literal["fail", "again"] = "fail") -> Agent:
+    device = Device(robot, patience=LONG, in_doubt=in_doubt)
+
+    @robot.on("/work", Empty)
+    async def work(job: Job, message: Empty) -> None:
+        await device.call("/work", job=job)
+
+    return offering(robot)
+
+
+def recorded(recording: Path, topic: str) -> list[Any]:
+    messages = open_objective(recording).messages()
+    return [decode_value(message.payload, message.type) for message in messages if message.topic == topic]
+
+
+@pytest.mark.parametrize(
+    ("reset", "in_doubt", "success", "flashing"),
+    [(False, "fail", True, 1), (True, "fail", False, 1), (True, "again", True, 2)],
+    ids=["the board kept running", "the board was restarted", "what is in doubt is done again"],
+)
+async def test_a_job_waits_for_its_board_as_far_as_the_sketch_allows(
+    place: Place, reset: bool, in_doubt: Literal["fail", "again"], success: bool, flashing: int
+) -> None:
+    robot = working(place.agent("robot"), in_doubt)
+    source = place.save(objective(("/work", Empty())))
+    with board(ROSSERIAL_ECHO, WORK) as uno, edge(uno.port, place.address("robot"), place.endpoint):
+        async with place.at_work(robot) as person:
+            contract = await person.demand(source, cost=1)
+            await asyncio.to_thread(unplug_during_a_command, uno, reset=reset)
+            outcome = await contract.outcome()
+            recording = await contract.recording()
+        assert outcome.success is success
+        await until(lambda: flashes(uno) == flashing, what="the flashes", seconds=LONG)
+    assert recorded(recording, "/aira/device/board")[0] == String("absent: the line is closed")
+    if success:
+        assert String("present") in recorded(recording, "/aira/device/board")
+    else:
+        assert "(doubt)" in recorded(recording, "/aira/note")[0].data
