@@ -24,10 +24,10 @@ WAKE_INTERVAL: Final = 0.1
 """Seconds between two wake-ups of the event loop during cleanup, at which a second Ctrl-C takes effect."""
 
 
-def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
-    """Run a command; Ctrl-C and SIGTERM end it with exit code 130, errors with 1 or 2."""
+def run_to_end(main: Callable[[], Coroutine[Any, Any, object]], *, interrupted: int = INTERRUPTED) -> None:
+    """Run a command; Ctrl-C and SIGTERM end it with the exit code `interrupted`, errors with 1 or 2."""
     if not _run(main):
-        sys.exit(INTERRUPTED)
+        sys.exit(interrupted)
 
 
 def run_until_stopped(

@@ -42,9 +42,11 @@ class WebComponents:
 
 @asynccontextmanager
 async def opened(
-    settings: Settings, *, account: Account | None = None, chain: Chain | None = None
+    settings: Settings, *, account: Account | None = None, chain: Chain | None = None, agent: Agent | None = None
 ) -> AsyncIterator[WebComponents]:
     """The components, with the settings' account or `account`, on `chain` (open) or on the settings' own.
+
+    With `agent` (open) they are that agent's.
 
     Raises `ConfigurationError`, `NetworkUnavailable`, `ChainError`.
     """
@@ -52,13 +54,13 @@ async def opened(
     drops = Drops()
     async with AsyncExitStack() as stack:
         enter = stack.enter_async_context
-        if account is not None or settings.keyfile:
+        if agent is None and (account is not None or settings.keyfile):
             agent = await enter(Agent(settings=settings, account=account, chain=chain))
+        if agent is not None:
             parts = agent.parts
             network, channel, store, exchange = parts.network, parts.channel, parts.store, parts.exchange
             opened_chain, head, drops = parts.chain, ChainHead(await parts.chain.block_number()), parts.drops
         else:
-            agent = None
             opened_chain = await enter(chain_of(settings, None)) if chain is None else chain
             head = ChainHead(await opened_chain.block_number())
             network, channel = await enter(connected(settings, opened_chain, head, drops))

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import click
 
-from mesh.running import run_to_end
+from mesh.cli.options import PORT
+from mesh.page import PAGE_PORT
+from mesh.running import INTERRUPTED, run_to_end
 
 
 @click.command("demo")
@@ -19,20 +21,33 @@ from mesh.running import run_to_end
     type=click.Path(file_okay=False, path_type=Path),
     help="folder in which to keep the objective and the recording",
 )
+@click.option("--web", is_flag=True, help="serve the page of the market, and leave it open on the finished job")
+@click.option("--web-port", type=PORT, help=f"port of the page [{PAGE_PORT}, or a free one if it is taken]")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object per line; the last one is a summary")
-def command(objective: Path | None, generation: str, out: Path | None, as_json: bool) -> None:
+def command(
+    objective: Path | None, generation: str, out: Path | None, web: bool, web_port: int | None, as_json: bool
+) -> None:
     """Run one whole job: a person's demand and a robot's offer match, a contract holds the cost, the robot plays the
     objective to its device, records it and signs the result, and the contract pays. Everything is real and local:
-    Zenoh sessions, an EVM, signatures, files."""
+    Zenoh sessions, an EVM, signatures, files.
+
+    With --web the market stays open: the page shows the job, and orders more of the robot. Ctrl-C ends everything."""
     from tempfile import TemporaryDirectory
 
     from mesh.extras import needs_extra
 
     with needs_extra("demo", "the demo"):
         from mesh.demo.demo import Demo
+        from mesh.page import free_page_port, page_server
     from mesh.demo.narration import JsonNarrator, TextNarrator
 
+    port = None
+    if web:
+        page_server()  # what is missing is said before anything is done
+        port = free_page_port(web_port)
     narrator = JsonNarrator() if as_json else TextNarrator()
     with TemporaryDirectory(prefix="aira-demo-") as folder:
-        demo = Demo(Path(folder), objective=objective, generation=int(generation), out=out, narrator=narrator)
-        run_to_end(demo.run)
+        demo = Demo(
+            Path(folder), objective=objective, generation=int(generation), out=out, narrator=narrator, page=port
+        )
+        run_to_end(demo.run, interrupted=0 if web else INTERRUPTED)

@@ -5,20 +5,25 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
 from mesh.cli.errors import AnvilMissing
 from mesh.cli.options import BLOCK_TIME, PORT, with_json, with_settings
 from mesh.cli.output import announce, print_json
+from mesh.extras import PackageMissing
+from mesh.page import PAGE_PORT, free_page_port, page_server
 from mesh.running import run_until_stopped
 from mesh.settings import Settings, TelemetrySettings, options_of
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from mesh.devchain.development import DevelopmentChain
 
 
 def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,15 +71,58 @@ log = logging.getLogger(__name__)
     show_default=True,
     help="seconds between blocks; empty blocks are mined, too",
 )
+@click.option("--web/--no-web", "has_page", default=True, show_default=True, help="serve the page of the market")
+@click.option("--web-port", type=PORT, help=f"port of the page [{PAGE_PORT}, or a free one if it is taken]")
+@click.option("--local-account", is_flag=True, help="let the page order for the person's account, without a wallet")
 @with_engine
 @with_settings("listen", "data_dir", *options_of(TelemetrySettings))
-def command(settings: Settings, port: int, block_time: float, **engine: Any) -> None:
-    """Run a market for development: a Zenoh router, a chain with the contracts, and a provider. Ctrl-C stops it. The
-    chain is lost then, unless --state stores it.
+def command(
+    settings: Settings,
+    port: int,
+    block_time: float,
+    has_page: bool,
+    web_port: int | None,
+    local_account: bool,
+    **engine: Any,
+) -> None:
+    """Run a market for development: a Zenoh router, a chain with the contracts, a provider, and the page. Ctrl-C stops
+    it. The chain is lost then, unless --state stores it.
 
     Writes keyfiles of a funded robot and a funded person to the data folder, and prints how to use them.
     """
-    run_until_stopped(lambda: serve_market(settings, port, block_time, **engine), settings=settings, role="up")
+    served_page = MarketPage(web_port, local_account) if has_page else None
+    run_until_stopped(
+        lambda: serve_market(settings, port, block_time, page=served_page, **engine), settings=settings, role="up"
+    )
+
+
+class MarketPage(NamedTuple):
+    """The page of a development market. Without a `port` it is at the usual one, or at a free one if that is taken."""
+
+    port: int | None
+    has_account: bool
+
+    async def open(self, stack: AsyncExitStack, settings: Settings, served: DevelopmentChain) -> str:
+        """Serve it until `stack` closes; its address. Raises `PackageMissing`, `PortUnavailable`."""
+        from mesh.agent import Agent
+
+        serve, port = page_server(), free_page_port(self.port)
+        deployment = served.market.deployment
+        own = replace(
+            settings,
+            connect=settings.listen,
+            data_dir=str(settings.state_directory / "page"),
+            lighthouse_contract=deployment.lighthouse_name,
+            ens_contract=deployment.ens,
+            metrics_listen="",
+            enable_executor=False,
+        )
+        chain = await stack.enter_async_context(served.market.chain(served.url, "person"))
+        agent = None
+        if self.has_account:
+            account = served.market.accounts["person"]
+            agent = await stack.enter_async_context(Agent(settings=own, account=account, chain=chain))
+        return await stack.enter_async_context(serve(own, port=port, chain=chain, agent=agent))
 
 
 async def serve_market(
@@ -82,6 +130,7 @@ async def serve_market(
     port: int,
     block_time: float,
     *,
+    page: MarketPage | None = None,
     engine: str = "auto",
     anvil: Path | None = None,
     state: Path | None = None,
@@ -112,11 +161,25 @@ async def serve_market(
         ]
         process = ProviderProcess(network, chain, providers)
         stack.enter_context(telemetry.showing(measure=process.measure, health=process.health))
+        where = await _page_line(stack, page, settings, served)
         tasks = await stack.enter_async_context(asyncio.TaskGroup())
-        for market, provider in zip(markets, providers, strict=True):
-            tasks.create_task(provider.run(), name=f"provider of {market}")
-        words = f"router      {', '.join(settings.listen)}\n{served.describe()}\nprovider    {providers[0].address}"
-        announce(log, "market-started", words, **served.facts(), provider=providers[0].address)
+        for market, one in zip(markets, providers, strict=True):
+            tasks.create_task(one.run(), name=f"provider of {market}")
+        router, provider = ", ".join(settings.listen), providers[0].address
+        words = f"router      {router}\n{served.describe()}\n{where}provider    {provider}"
+        announce(log, "market-started", words, **served.facts(), provider=provider)
+
+
+async def _page_line(
+    stack: AsyncExitStack, page: MarketPage | None, settings: Settings, served: DevelopmentChain
+) -> str:
+    """Serve the page; the line that says where it is, or what it lacks."""
+    if page is None:
+        return ""
+    try:
+        return f"page        {await page.open(stack, settings, served)}\n"
+    except PackageMissing as error:
+        return f"page        none: {error}; {error.hint}\n"
 
 
 log = logging.getLogger(__name__)

@@ -17,6 +17,7 @@ from mesh.devchain.development import ROLES, DevelopmentMarket, deploy_market
 from mesh.errors import ConfigurationError, InputError, RemoteError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network, free_endpoint
+from mesh.page import page_server
 from mesh.recording import open_objective
 from mesh.settings import Settings
 from schemas import Demand, Verified, cid_of_bytes, cid_of_file
@@ -34,7 +35,8 @@ if TYPE_CHECKING:
 
 COST: Final = 42 * XRT
 """What the person pays, wn."""
-MODEL: Final = cid_of_bytes(b"aira-mesh demo: a lamp that blinks for each message\n")
+MODEL_TEXT: Final = b"aira-mesh demo: a lamp that blinks for each message\n"
+MODEL: Final = cid_of_bytes(MODEL_TEXT)
 """The model of the demo's robot; any content has a CID."""
 TIMEOUT: Final = 60.0
 """Seconds for the demand to become a contract, and for the job, in addition to its objective's duration."""
@@ -53,7 +55,8 @@ class Demo:
 
     `folder` is for its files while it runs; the caller removes it, once the event loop and its threads have ended.
     `objective` is a file (None: three blinks), `generation` that of the messages, `out` the folder where objective and
-    recording are kept (None: nowhere). `timeout` is in seconds (see `TIMEOUT`).
+    recording are kept (None: nowhere). `timeout` is in seconds (see `TIMEOUT`). With `page`, a port, the page of the
+    market is served, and `run` goes on until it is cancelled.
     """
 
     def __init__(
@@ -65,6 +68,7 @@ class Demo:
         out: Path | None,
         narrator: Narrator,
         timeout: float = TIMEOUT,
+        page: int | None = None,
     ) -> None:
         self._folder = folder
         self._path = objective
@@ -72,6 +76,7 @@ class Demo:
         self._out = out
         self._narrator = narrator
         self._timeout = timeout
+        self._page = page
         self._match: Match | None = None
         self._success = False
         self._finalized = asyncio.Event()
@@ -89,7 +94,10 @@ class Demo:
         try:
             async with AsyncExitStack() as stack:
                 await self._open(stack)
-                await self._do_job(objective, started)
+                url = "" if self._page is None else await self._open_page(stack, self._page)
+                contract = await self._do_job(objective, started)
+                if url:
+                    await self._show_page(f"{url}/#/job/{contract.address}")
         except TimeoutError:
             raise DemoStalled("the demo did not finish in time", hint="is this machine very busy? try again") from None
 
@@ -160,8 +168,25 @@ class Demo:
         if role == "robot":
             self._add_handlers(agent)
         await stack.enter_async_context(agent)
+        if role == "robot":
+            model = self._folder / "model.md"
+            await asyncio.to_thread(model.write_bytes, MODEL_TEXT)
+            await agent.add(model)
         self._report_account(role, agent.address, agent.parts.network.id)
         return agent
+
+    async def _open_page(self, stack: AsyncExitStack, port: int) -> str:
+        """Serve the page for the person, from before the job on so that it sees each step; its address."""
+        serve, person = page_server(), self._person
+        return await stack.enter_async_context(
+            serve(person.settings, port=port, chain=person.parts.chain, agent=person)
+        )
+
+    async def _show_page(self, url: str) -> None:
+        """Say where the page shows the job, and serve it until cancelled."""
+        self._narrator.chapter("The page")
+        self._narrator.event("person", "page", f"{url}\nshows this job; Ctrl-C ends everything", url=url)
+        await asyncio.Event().wait()
 
     def _report_account(self, role: str, address: str, zid: str) -> None:
         self._narrator.event(role, "account", f"account {address}, Zenoh id {zid}", address=address, zid=zid)
@@ -225,7 +250,7 @@ class Demo:
                 event("contract", "finalized", "liability is finalized", liability=address)
                 self._finalized.set()
 
-    async def _do_job(self, objective: Objective, started: float) -> None:
+    async def _do_job(self, objective: Objective, started: float) -> Contract:
         """Publish the demand, wait until the job is done and paid, and keep the recording."""
         before, path = await self._balances(), objective.path
         self._narrator.chapter("A person wants work done")
@@ -246,6 +271,7 @@ class Demo:
         words = f"has the recording {kept}\n{outcome.result}"
         event("person", "recording", words, result=outcome.result, path=kept)
         self._summarize(contract, outcome, cid, started)
+        return contract
 
     async def _balances(self) -> dict[str, int]:
         chain = self._person.parts.chain

@@ -14,7 +14,7 @@ from mesh.plugins import entry_points
 if TYPE_CHECKING:
     from pathlib import Path
 
-GROUPS = ("aira.commands", "aira.dialects", "aira.doctor_checks", "console_scripts")
+GROUPS = ("aira.commands", "aira.dialects", "aira.doctor_checks", "aira.pages", "console_scripts")
 
 
 @pytest.mark.parametrize("group", GROUPS)

@@ -1,0 +1,69 @@
+"""The page beside a market of one process: `aira up` and `aira demo --web`."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import sys
+import urllib.request
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.devchain.errors import PortUnavailable
+from mesh.extras import PackageMissing
+from mesh.page import free_page_port, page_server
+from tests.support.commands import AIRA, Serving, invoke, refused
+from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def answer(url: str) -> Any:
+    with urllib.request.urlopen(url, timeout=30) as response:
+        return json.load(response)
+
+
+def test_a_development_market_has_a_page_that_orders_for_the_person(tmp_path: Path) -> None:
+    where = ("--listen", f"tcp/127.0.0.1:{free_port()}", "--port", "0", "--data-dir", tmp_path, "--web-port", "0")
+    with Serving(*AIRA, "up", *where, "--engine", "embedded", "--local-account", says="provider    0x") as up:
+        told = dict(re.findall(r"^(page|person) +(.*)$", up.log(), re.MULTILINE))
+        market = answer(f"{told['page']}/api/v1/market")
+        assert market["account"] == told["person"].split()[-1]
+        assert market["connected"] == {"router": True, "chain": True}
+        code, _ = up.end(signal.SIGINT)
+        assert code == 0, up.log()
+
+
+def test_the_demo_leaves_the_page_open_on_its_finished_job() -> None:
+    with Serving(*AIRA, "demo", "--web", "--web-port", "0", says="Ctrl-C ends everything") as demo:
+        found = re.search(r"(http://\S+)/#/job/(0x\w{40})", demo.log())
+        assert found
+        job = answer(f"{found[1]}/api/v1/liabilities/{found[2]}")
+        assert [step["kind"] for step in job["timeline"]] == ["created", "ready", "playing", "result", "paid"]
+        assert answer(f"{found[1]}/api/v1/liabilities/{found[2]}/verification")["holds"]
+        code, _ = demo.end(signal.SIGINT)
+        assert code == 0, demo.log()
+
+
+def test_only_a_port_that_was_given_must_be_free() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        refused(invoke("demo", "--web", "--web-port", str(port)), PortUnavailable, port)
+        assert free_page_port(None) not in (0, port)
+
+
+def test_what_the_page_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith("bridges.web")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "aiohttp.web", None)
+    monkeypatch.delattr("aiohttp.web", raising=False)
+    with pytest.raises(PackageMissing) as caught:
+        page_server()
+    assert caught.value.extra == "web"
+    monkeypatch.setattr("mesh.page.entry_points", lambda group: {})
+    with pytest.raises(PackageMissing):
+        page_server()
