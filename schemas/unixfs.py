@@ -1,8 +1,8 @@
 """Files as trees of blocks, and their CIDs, as `ipfs add` has always made them by default.
 
-Chunks of 262,144 bytes, each a UnixFS file leaf in dag-pb; a balanced tree with at most 174 links per node; every block
-is named by its sha2-256 digest. The CIDv0 of the root is that of the file. The module ends with as much of the protobuf
-encoding as blocks need. Sources: the dag-pb and UnixFS specifications of IPFS; the CIDs of the legacy network.
+Chunks of 262,144 bytes, each a UnixFS file leaf in dag-pb; a balanced tree with at most 174 links per node. A block's
+name is its sha2-256 digest; the CIDv0 of the root is the file's. Sources: the dag-pb and UnixFS specifications of IPFS,
+and the CIDs of the legacy network.
 """
 
 from __future__ import annotations
@@ -121,10 +121,7 @@ def _blocks(stream: BinaryIO, *, with_data: bool) -> Iterator[UnixfsBlock]:
         block, child = _leaf(chunk, with_data=with_data)
         levels[0].append(child)
         yield block
-        if len(chunk) < CHUNK_SIZE:
-            break
-        chunk = _read_chunk(stream)
-        if not chunk:
+        if len(chunk) < CHUNK_SIZE or not (chunk := _read_chunk(stream)):
             break
     yield from _close_tree(levels)
 

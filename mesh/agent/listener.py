@@ -1,8 +1,8 @@
 """What happens on the chain, and what it means for the agent: its trade, its jobs, its token events.
 
-`ChainListener` reads the chain block by block and saves its position in the ledger, so nothing is missed while the
-agent is down. A block that was not handled to its end is handled again: handling is idempotent. What a reorganisation
-undoes is undone in the methods named `…_reverted`. `LateResults` finalizes what no provider does in time.
+`ChainListener` reads the chain block by block and saves its position in the ledger, so it misses nothing while the
+agent is down. Handling is idempotent: a block that was handled in part is handled again. The methods named `…_reverted`
+undo what a reorganisation reverts. `LateResults` finalizes a job if no provider does so in time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from mesh.work.outbox import result_identity
 from schemas import Result, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Sequence
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.trade import Trader
@@ -50,9 +50,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SHARE: Final = 4
-"""A Result is late when a quarter of the time that was left for it is left."""
+"""A Result is late when a quarter of the blocks before the refund are left …"""
 LEAST_BLOCKS: Final = 20
-"""It is late at this many blocks before the refund in any case."""
+"""… or fewer than this."""
 SOON: Final = 3
 """Blocks that leave a Result unsettled before the chain is asked when it would be late."""
 NEVER: Final = 2**63
@@ -81,8 +81,7 @@ class ChainListener:
             try:
                 await self._follow(token, backoff)
             except NoContracts as error:
-                # A contract is not there whose event is: its block was replaced, or another node is behind. Both are
-                # found when the block is read again.
+                # The event's contract is missing: its block was replaced, or another node is behind.
                 log.info("the block is read again: %s", error, extra=log_event("block-read-again", code=error.code))
                 await backoff.wait()
 
@@ -109,10 +108,7 @@ class ChainListener:
                 backoff.reset()
 
     async def finalize_ended(self) -> None:
-        """Finalize the jobs that ended while the agent was away, before any of them is continued.
-
-        Reading block by block would find them too, but only after a paid job was played to the device again.
-        """
+        """Finalize the jobs that ended while the agent was away, before any of them is played to the device again."""
         for job in await self._ledger.jobs(TO_BE_DONE):
             read = partial(self._chain.liabilities.get, job.liability.address)
             try:
@@ -135,8 +131,13 @@ class ChainListener:
         return last + 1, history
 
     async def handle_all(self, events: Sequence[ChainEvent]) -> None:
-        """Act on the events of a block; of new liabilities, on those that name this account."""
-        foreign = await self._foreign(events)
+        """Act on the events of a block, except on new liabilities between others."""
+        created = [event for event in events if isinstance(event, NewLiability)]
+        foreign: set[NewLiability] = set()
+        if len(created) > 1:  # one call for all
+            read = partial(self._chain.liabilities.parties, [event.liability for event in created])
+            parties = await self._chain.retrying(read, outages=self._parts.outages)
+            foreign = {event for event, named in zip(created, parties, strict=True) if self._account not in named}
         for event in events:
             if event not in foreign:
                 await self.handle(event)
@@ -162,18 +163,8 @@ class ChainListener:
             case Transfer() | Approval():
                 self.token_events.revert(event)
 
-    async def _foreign(self, events: Sequence[ChainEvent]) -> Collection[ChainEvent]:
-        """Those of several new liabilities in a block that are between others, found out in one call."""
-        created = [event for event in events if isinstance(event, NewLiability)]
-        if len(created) < 2:
-            return ()
-        read = partial(self._chain.liabilities.parties, [event.liability for event in created])
-        parties = await self._chain.retrying(read, outages=self._parts.outages)
-        return {event for event, named in zip(created, parties, strict=True) if self._account not in named}
-
     async def _read_new(self, address: str) -> None:
         """Read a new liability and, if it names this account, its orders."""
-
         read = partial(self._chain.liabilities.get_with_orders, address)
         try:
             liability, orders = await self._chain.retrying(read, outages=self._parts.outages)
@@ -186,10 +177,7 @@ class ChainListener:
 
     @with_liability_context
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
-        """A contract was created that names this account: as promisee, as promisor, or as both.
-
-        A job that is known already is left alone, unless its liability was reverted and created again.
-        """
+        """A contract was created that names this account: as promisee, as promisor, or as both."""
         await self._trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
         if liability.promisor != self._account or not self._parts.settings.enable_executor:
             return
@@ -236,10 +224,7 @@ class ChainListener:
 
     @with_liability_context
     async def finalization_reverted(self, address: str) -> None:
-        """A reorganisation reverted the end of a contract: the Result of its job is sent again.
-
-        A job without a Result stays ended: it was refunded, and will be refunded again.
-        """
+        """A reorganisation reverted the end of a contract: the Result of its job, if it has one, is sent again."""
         async with self._executor.halted(address) as job:
             if job is not None and job.result is not None:
                 log.warning("the finalization was reverted", extra=log_event("finalization-reverted"))
@@ -260,10 +245,9 @@ class ChainListener:
 
 
 class LateResults:
-    """Brings the account's own Results to the chain in time, if no provider does.
+    """Finalizes liabilities by the account's own Results before they can be refunded, if no provider does.
 
-    A provider may fail, or keep others from their turns, until the liability can be refunded. On the original
-    contracts, which offer no finalization without a turn, nothing is done.
+    The original contracts offer no finalization without a turn; there it does nothing.
     """
 
     def __init__(self, parts: AgentComponents) -> None:
@@ -300,13 +284,13 @@ class LateResults:
         except (NodeUnreachable, RequestRefused, NotALiability) as error:
             log.debug("looking at the result again after the next block: %s", error)
         except (NotOffered, Reverted) as error:
-            # The originals, a liability that has ended, or one whose validator must speak first.
+            # The originals, a liability that has ended, or one whose validator must confirm the result.
             self._late_from[address] = NEVER
-            log.debug("the result can't be brought without a provider: %s", error)
+            log.debug("only a provider can finalize this: %s", error)
         except ChainError as error:
             facts = log_event("late-result-waits", code=error.code)
-            log.warning("no provider has brought the result, and it can't be brought now: %s", error, extra=facts)
+            log.warning("no provider finalized the contract, and finalizing it failed: %s", error, extra=facts)
         else:
             self._late_from[address] = NEVER
             facts = log_event("late-result-finalized", success=result.success, gas=settled.gas_used)
-            log.warning("finalized without a provider, as none did in time", extra=facts)
+            log.warning("finalized without a provider, because none did in time", extra=facts)

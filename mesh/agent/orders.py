@@ -33,9 +33,9 @@ LIFETIME: Final = 600.0
 """Seconds for which an order is valid by default."""
 FEWEST_BLOCKS: Final = 50
 MOST_BLOCKS: Final = 20_000
-"""The bounds of that in blocks, whatever time was measured between two blocks."""
+"""The bounds of the default lifetime, whatever block time was measured."""
 MEASURED_BLOCKS: Final = 100
-"""The latest blocks, from which the time between two blocks is measured."""
+"""The latest blocks, whose times give the block time."""
 
 
 class OrderState(StrEnum):
@@ -60,7 +60,7 @@ class TradedOrder:
     state: OrderState = OrderState.OPEN
     liability: str = ""
     created: asyncio.Future[Contract] | None = None
-    """What those wait for who asked for its contract."""
+    """Resolves to its contract; None while nobody waits for it."""
     rejections: dict[str, Rejection] = field(default_factory=dict)
     """The last rejection by each provider."""
     declines: dict[str, Decline] = field(default_factory=dict)
@@ -161,15 +161,12 @@ class OrderActions(Protocol):
 
     async def withdraw(self, order: TradedOrder) -> Order:
         """See `Order.withdraw`."""
-        ...
 
     async def withdraw_on_chain(self, order: TradedOrder) -> Order:
         """See `Order.withdraw_on_chain`."""
-        ...
 
     async def contract_of(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
         """See `Order.contract`."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -43,9 +43,8 @@ ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: o
 class Trader(Lifecycle):
     """Trades for one account: `async with Trader(components) as trader`.
 
-    The orders of the ledger are open again when it opens: those of an earlier run, which are sent once their allowance
-    is ensured, and those of other programs of the account. Leaving fails everything that is waited for with
-    `ClosedError`; open orders stay in the ledger. The runtime reports what happens on the chain.
+    Entering takes up the ledger's orders, those of earlier runs and of the account's other programs, and sends them
+    once their allowance is ensured. Leaving ends every wait with `ClosedError`; open orders stay in the ledger.
     """
 
     title = "trader"
@@ -66,8 +65,8 @@ class Trader(Lifecycle):
 
     def orders(self, *states: OrderState) -> list[Order]:
         """The orders that can still become contracts, oldest first: open or withdrawn."""
-        chosen = [order for order in self._orders.values() if order.state in states]
-        return [order.shown(self) for order in sorted(chosen, key=lambda order: order.posted)]
+        by_age = sorted(self._orders.values(), key=lambda order: order.posted)
+        return [order.shown(self) for order in by_age if order.state in states]
 
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.push_async_callback(self._close)
@@ -101,7 +100,7 @@ class Trader(Lifecycle):
         if kind is Demand:
             self._hear_declines()
         try:
-            await self._ensure_allowance(order)
+            await self._allowances.ensure(order, self._chain.costs.of(order.signed))
         except BaseException:
             self._forget(order)
             raise
@@ -120,10 +119,8 @@ class Trader(Lifecycle):
         """See `Order.contract`."""
         if order.state is OrderState.MATCHED:
             contract = await self.contracts.read(order.liability)
-        elif not order.is_open:
-            raise order.why_closed
-        elif not self.is_open:
-            raise ENDED()
+        elif not (order.is_open and self.is_open):
+            raise ENDED() if order.is_open else order.why_closed
         else:
             async with seen_offers(self._parts.channel, order.signed, on_progress):
                 contract = await order.contract(on_progress)
@@ -157,9 +154,9 @@ class Trader(Lifecycle):
         return order.shown(self)
 
     async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
-        """A contract was created from these orders: stop sending ours.
+        """A contract was created from orders with these hashes: stop sending ours.
 
-        In generation 3 somebody else may have signed the terms of ours; ours then has the same hash and is still open.
+        In generation 3 another account may have signed the same terms; our order, with the same hash, is still open.
         """
         demand = demand_hash.hex() if liability.promisee == self._address else ""
         offer = offer_hash.hex() if liability.promisor == self._address else ""
@@ -168,9 +165,7 @@ class Trader(Lifecycle):
         known = self.contracts.created(liability, demand or offer)
         for identity in filter(None, (demand, offer)):
             if (order := self._orders.get(identity)) is not None:
-                log.info(
-                    "created from our %s %s", order.state, order, extra=log_event("contract-created", order=identity)
-                )
+                log.info("matched our %s %s", order.state, order, extra=log_event("contract-created", order=identity))
                 order.state, order.liability = OrderState.MATCHED, liability.address
                 self._forget(order)
             await self._parts.outbox.spend(identity, liability.address)
@@ -180,10 +175,7 @@ class Trader(Lifecycle):
                 await self._renew_overtaken(order.nonce)
 
     async def liability_reverted(self, address: str) -> None:
-        """A reorganisation reverted the contract at `address`: its orders are open again, until their deadline.
-
-        It may have reverted the approval of their allowance too: they are sent once that is ensured.
-        """
+        """A reorganisation reverted the contract at `address`: its orders are open again, and sent when covered."""
         orders = await self._parts.outbox.unspend(address)
         if not orders:
             return
@@ -193,7 +185,7 @@ class Trader(Lifecycle):
         await self._parts.outbox.release({order.identity for order in orders} - {order.identity for order in again})
 
     def reorganised(self) -> None:
-        """A reorganisation may have reverted the approval of open orders' allowance: they wait until it is ensured."""
+        """A reorganisation may have reverted the allowance of open orders: they wait until it is ensured."""
         orders = [order for order in self._orders.values() if order.is_open]
         self._send_when_covered([order for order in orders if any(self._chain.costs.of(order.signed).values())])
 
@@ -207,22 +199,19 @@ class Trader(Lifecycle):
         self.contracts.expire(block)
         await self.load()
 
-    async def _ensure_allowance(self, order: TradedOrder) -> None:
-        await self._allowances.ensure(order, self._chain.costs.of(order.signed))
-
     def _send_when_covered(self, orders: Collection[TradedOrder]) -> None:
         """Send these orders of the ledger when the factory has the allowance for them, in a task."""
         self._parts.outbox.hold(order.identity for order in orders)
         costly = [order for order in orders if any(self._chain.costs.of(order.signed).values())]
-        free = {order.identity for order in orders} - {order.identity for order in costly}
-        if free:
+        if free := {order.identity for order in orders} - {order.identity for order in costly}:
             self._tasks.start(self._parts.outbox.release(free), "resume free orders")
         for order in costly:
             self._tasks.start(self._cover_and_send(order), f"resume {order.identity}")
 
     async def _cover_and_send(self, order: TradedOrder) -> None:
+        ensure = partial(self._allowances.ensure, order, self._chain.costs.of(order.signed))
         try:
-            await self._chain.retrying(partial(self._ensure_allowance, order), outages=self._parts.outages)
+            await self._chain.retrying(ensure, outages=self._parts.outages)
         except AiraError as error:
             facts = log_event("order-not-covered", order=order.identity, code=error.code)
             log.warning("the %s is open, but no provider can use it now: %s", order, error, extra=facts)
@@ -251,10 +240,9 @@ class Trader(Lifecycle):
         return new
 
     async def _rejected(self, rejection: Rejection) -> None:
-        """A provider says that it can't use an order, or honours its withdrawal. An order that is open stays valid.
+        """A provider says that it can't use an order, or honours its withdrawal. An open order stays valid.
 
-        In generation 5 the nonce may be used; whether by this order is known once this agent has read the chain up to
-        the block at which the nonce was read.
+        A generation-5 nonce may be used; by which order is known when this agent has read the chain that far.
         """
         identity, provider, reason = rejection.order, rejection.provider, rejection.reason
         order = self._orders.get(identity)
@@ -270,8 +258,7 @@ class Trader(Lifecycle):
             await self._renew_overtaken(used - 1)
         elif order.reject(rejection):
             facts = log_event("order-rejected", order=identity, provider=provider, reason=reason)
-            why = f"{reason}: {rejection.detail}"
-            log.warning("provider %s can't use the %s now (%s)", provider, order, why, extra=facts)
+            log.warning("%s can't use the %s now (%s: %s)", provider, order, reason, rejection.detail, extra=facts)
 
     async def _renew_overtaken(self, used: int | None) -> None:
         """Sign the orders of generation 5 again whose nonce another order of the account has used."""
@@ -289,7 +276,7 @@ class Trader(Lifecycle):
         """Replace an order by one with the same terms and a fresh nonce."""
         async with self._changing:
             signed = await self.writer.sign_again(order.signed)
-            await self._ensure_allowance(order)
+            await self._allowances.ensure(order, self._chain.costs.of(order.signed))
             identity = order.identity
             if not order.is_open or self._orders.pop(identity, None) is None:
                 return
@@ -300,7 +287,7 @@ class Trader(Lifecycle):
         log.info("the order %s is signed again as %s", identity, order.identity, extra=facts)
 
     async def _give_up(self, identity: str) -> None:
-        """Don't send an offer any more. What providers have of it may still become a contract."""
+        """Stop sending an offer. Providers that have it may still create its contract."""
         if (order := self._orders.get(identity)) is not None:
             self._forget(order)
             order.close(OrderState.WITHDRAWN)

@@ -18,9 +18,10 @@ from mesh.chain.abi import MalformedAbi, decode
 from mesh.chain.errors import RequestRefused
 from mesh.errors import ChainError
 from schemas import keccak256
-from schemas.address import checksum_address
+from schemas.address import checksum_address, parse_address
 from schemas.cid import format_cid
 from schemas.errors import InvalidCid
+from schemas.records import Liability
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -34,6 +35,11 @@ NO_TRANSACTIONS: Final = bytes.fromhex("56e81f171bcc55a6ff8345e692c0f86e5b48e01b
 BLOOM_BITS: Final = 2_048
 LONGEST_TEXT: Final = 1_000
 """Characters of a text, such as an error message, that are kept."""
+LIABILITY_GETTERS: Final = (
+    *("model", "objective", "result", "promisee", "promisor", "lighthouse", "lighthouseFee"),
+    *("token", "cost", "validator", "validatorFee", "isSuccess", "isFinalized", "demandHash", "offerHash"),
+)
+"""The functions of a liability that return its record, and the hashes of its orders."""
 
 
 class SpoiledAnswer(ValueError):
@@ -204,6 +210,26 @@ def decode_cid(data: bytes) -> str:
         return format_cid(data)
     except InvalidCid:
         return ""
+
+
+def liability_record(address: str, held: Mapping[str, Any]) -> Liability:
+    """The record of a liability, by what its `LIABILITY_GETTERS` returned."""
+    return Liability(
+        address=address,
+        model=decode_cid(held["model"]),
+        objective=decode_cid(held["objective"]),
+        result=decode_cid(held["result"]),
+        promisee=parse_address(held["promisee"]),
+        promisor=parse_address(held["promisor"]),
+        lighthouse=parse_address(held["lighthouse"]),
+        lighthouse_fee=held["lighthouseFee"],
+        token=parse_address(held["token"]),
+        cost=held["cost"],
+        validator=parse_address(held["validator"]),
+        validator_fee=held["validatorFee"],
+        is_success=held["isSuccess"],
+        is_finalized=held["isFinalized"],
+    )
 
 
 @lru_cache(maxsize=1_024)

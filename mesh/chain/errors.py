@@ -18,12 +18,12 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "ERC20InsufficientAllowance": "approve the spender for that amount first",
         "ERC20InsufficientBalance": "send the account the missing tokens, or lower the amount",
-        "ERC20InvalidReceiver": "check the address that the tokens are to go to",
+        "ERC20InvalidReceiver": "check the address that receives the tokens",
         "DeadlineReached": "the order has expired; sign a new one with a later deadline",
-        "OrderUsed": "an order makes one contract only, and none when it is withdrawn; sign a new one",
+        "OrderUsed": "an order makes at most one contract, and none once it is withdrawn; sign a new one",
         "WrongNonce": "of several orders, withdraw the one with the lowest nonce first",
         "ValidatorIsLighthouse": "name a validator that is no lighthouse, or none",
-        "WrongSigner": "the signature is another account's than the first address says, or of other terms",
+        "WrongSigner": "another account signed it, or the terms differ from those that were signed",
         "InvalidSignature": "a signature is 65 bytes with v 27 or 28 and a low s",
         "NotAProvider": "stake on the lighthouse first: only its providers may send to it",
         "NotTheValidator": "the contract names a validator, and only that account can finalize it",
@@ -33,7 +33,7 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
         "InvalidName": "a name is 1 to 32 of a to z, 0 to 9 and -; no - at its ends, nor -- after two characters",
         "InvalidStake": "the minimal stake is at least 1 wn",
         "InvalidTimeout": "the timeout is at least 1 block",
-        "StakeTooSmall": "stake the lighthouse's minimum at least",
+        "StakeTooSmall": "stake at least the lighthouse's minimum",
         "InsufficientStake": "no more can be withdrawn than was staked",
         "OutOfGas": "the contract's state has changed since it was asked; send it again",
     }
@@ -159,8 +159,7 @@ class InsufficientTokens(ChainError, code="insufficient-tokens"):
             f"{account} has {balance} of the token {token}, and {needed} are needed",
             hint="send it the missing tokens, or ask for less",
         )
-        self.account = account
-        self.token = token
+        self.account, self.token = account, token
         self.balance = balance
         self.needed = needed
 
@@ -230,11 +229,10 @@ class ChainWentBack(ChainError, code="chain-went-back"):
 
     def __init__(self, cursor: int, head: int) -> None:
         super().__init__(
-            f"block {cursor} was to be read next, but the chain ends at block {head}",
+            f"the next block to read is {cursor}, but the chain ends at block {head}",
             hint="wait for the node to sync; if the chain was started afresh, start with a fresh data_dir too",
         )
-        self.cursor = cursor
-        self.head = head
+        self.cursor, self.head = cursor, head
 
 
 class ReorganisedTooDeep(ChainWentBack, code="reorganised-too-deep"):
@@ -246,13 +244,10 @@ class ReorganisedTooDeep(ChainWentBack, code="reorganised-too-deep"):
     is_final = True
 
     def __init__(self, cursor: int, head: int) -> None:
-        ChainError.__init__(
-            self,
-            f"the chain has no block {cursor} as it was read, nor any read after it; it ends at block {head}",
-            hint="check which chain the node is on; if it was started afresh, start with a fresh data_dir too",
-        )
-        self.cursor = cursor
-        self.head = head
+        why = f"the chain has no block {cursor} as it was read, nor any read after it; it ends at block {head}"
+        hint = "check which chain the node is on; if the chain was started afresh, start with a fresh data_dir too"
+        ChainError.__init__(self, why, hint=hint)
+        self.cursor, self.head = cursor, head
 
 
 class NoAccount(ConfigurationError, code="no-account"):

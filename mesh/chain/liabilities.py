@@ -5,32 +5,28 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from mesh.chain.answers import decode_cid
+from mesh.chain.answers import LIABILITY_GETTERS, liability_record
 from mesh.chain.errors import NoContracts, NotALiability, OrderAlreadyUsed, Reverted
 from mesh.chain.events import NewLiability, liability_created, xrt_minted
 from mesh.chain.following import retrying
 from mesh.chain.multicall import getters
 from mesh.chain.reader import list_created
 from mesh.errors import InvalidMessage
-from schemas.address import parse_address
-from schemas.records import Liability
 from schemas.signing import recover
 from schemas.wire import cancellation_hash, message_hash, order_abi
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from mesh.chain.abi import ContractCall
     from mesh.chain.contracts import Contracts
     from mesh.chain.node import Node
     from mesh.chain.transactions import Receipt
     from schemas.messages import Demand, Offer, Order, Result
+    from schemas.records import Liability
 
-GETTERS: Final = (
-    *("model", "objective", "result", "promisee", "promisor", "lighthouse", "lighthouseFee"),
-    *("token", "cost", "validator", "validatorFee", "isSuccess", "isFinalized", "demandHash", "offerHash"),
-)
 READ_AT_ONCE: Final = 8
 """How many records a listing asks the node for at the same time."""
 
@@ -190,24 +186,21 @@ class Liabilities:
     async def finalize(self, lighthouse: str, result: Result) -> Settled:
         """Finalize a liability by its signed result, as a provider of the lighthouse."""
         functions = await self._contracts.lighthouse_contract(lighthouse)
-        receipt = await self._contracts.send(self._contracts.version.finalization(functions, result))
-        return self._settled(receipt)
+        return await self._settle(self._contracts.version.finalization(functions, result))
 
     async def finalize_without_turn(self, result: Result) -> Settled:
         """Finalize a liability by its signed result as any account, when no provider does; nothing is minted.
 
         Raises `NotOffered` for the original contracts, `Reverted` (`WrongSigner`, `AlreadyFinalized`, …).
         """
-        receipt = await self._contracts.send(self._contracts.version.finalization_without_turn(result))
-        return self._settled(receipt)
+        return await self._settle(self._contracts.version.finalization_without_turn(result))
 
     async def validate(self, result: Result, *, agree: bool) -> Settled:
         """Finalize a generation-3 liability as the validator that it names.
 
         Without `agree` the promisee is paid back, as for a result without success.
         """
-        receipt = await self._contracts.send(self._contracts.version.validation(result, agree=agree))
-        return self._settled(receipt)
+        return await self._settle(self._contracts.version.validation(result, agree=agree))
 
     async def cancel(
         self, liability: str, *, promisee_signature: str | bytes, promisor_signature: str | bytes
@@ -220,9 +213,7 @@ class Liabilities:
         """
         address = await self._contracts.names.address(liability)
         signatures = [_signature_bytes(address, given) for given in (promisee_signature, promisor_signature)]
-        call = self._contracts.version.cancellation(await self._recognised(address), *signatures)
-        receipt = await self._contracts.send(call)
-        return self._settled(receipt)
+        return await self._settle(self._contracts.version.cancellation(await self._recognised(address), *signatures))
 
     async def refund_state(self, liability: str) -> RefundState:
         """Whether a liability can be refunded, and from which block on. Raises `NotALiability`, `NotOffered`."""
@@ -241,10 +232,10 @@ class Liabilities:
 
     async def refund(self, liability: str) -> Settled:
         """Pay back the promisee of a liability that was never finalized."""
-        receipt = await self._contracts.send(self._contracts.version.refund(liability))
-        return self._settled(receipt)
+        return await self._settle(self._contracts.version.refund(liability))
 
-    def _settled(self, receipt: Receipt) -> Settled:
+    async def _settle(self, call: ContractCall) -> Settled:
+        receipt = await self._contracts.send(call)
         minted = xrt_minted(receipt.logs, xrt=self._contracts.xrt, account=self._contracts.own_address)
         return Settled(receipt.tx, receipt.gas_used, receipt.wei, minted)
 
@@ -292,32 +283,13 @@ async def _read(node: Node, address: str, *, block: int | str = "latest") -> tup
 async def _read_all(
     node: Node, addresses: Sequence[str], *, block: int | str = "latest"
 ) -> list[tuple[Liability, tuple[bytes, bytes]]]:
-    calls = [call for address in addresses for call in getters("Liability", address, GETTERS)]
+    calls = [call for address in addresses for call in getters("Liability", address, LIABILITY_GETTERS)]
     values = await node.read_all(calls, block=block)
     found = []
     for number, address in enumerate(addresses):
-        held = dict(zip(GETTERS, values[number * len(GETTERS) :], strict=False))
-        found.append((_record(address, held), (held["demandHash"], held["offerHash"])))
+        held = dict(zip(LIABILITY_GETTERS, values[number * len(LIABILITY_GETTERS) :], strict=False))
+        found.append((liability_record(address, held), (held["demandHash"], held["offerHash"])))
     return found
-
-
-def _record(address: str, held: Mapping[str, Any]) -> Liability:
-    return Liability(
-        address=address,
-        model=decode_cid(held["model"]),
-        objective=decode_cid(held["objective"]),
-        result=decode_cid(held["result"]),
-        promisee=parse_address(held["promisee"]),
-        promisor=parse_address(held["promisor"]),
-        lighthouse=parse_address(held["lighthouse"]),
-        lighthouse_fee=held["lighthouseFee"],
-        token=parse_address(held["token"]),
-        cost=held["cost"],
-        validator=parse_address(held["validator"]),
-        validator_fee=held["validatorFee"],
-        is_success=held["isSuccess"],
-        is_finalized=held["isFinalized"],
-    )
 
 
 def _signature_bytes(liability: str, given: str | bytes) -> bytes:

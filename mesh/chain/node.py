@@ -195,6 +195,11 @@ class Node:
         except RequestRefused:
             return False
 
+    async def has_mined(self, tx: str) -> bool:
+        """Whether the node has a transaction that waits, or was mined with success."""
+        receipt = await self.receipt(tx)
+        return await self.has_transaction(tx) if receipt is None else receipt.status == 1
+
     async def receipt(self, tx: str) -> MinedTransaction | None:
         """The receipt of a transaction; None if it is not mined."""
         receipt: MinedTransaction | None = await self._ask("eth_getTransactionReceipt", tx)

@@ -37,6 +37,13 @@ if TYPE_CHECKING:
     from mesh.watching import MarketCounters, MarketEvent, MarketWatch
     from schemas import Liability, Offer
 
+LONGEST_TEXT: Final = 200
+"""The most characters of a text from others that are shown."""
+HASH_DIGITS: Final = 8
+"""Digits of an order's hash in a line; JSON has all 64."""
+EVENT_WIDTH: Final = 9
+"""Columns of the event's name."""
+
 
 @click.command("watch")
 @click.option("--model", help="print only events of this model (CID)")
@@ -170,18 +177,6 @@ async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> 
         found = await statuses(session, channel, await present(channel, "provider"))
     named = {how.xrt for how in found.values() if isinstance(how, Status) and how.xrt}
     return named.pop() if len(named) == 1 else None
-
-
-LONGEST_TEXT: Final = 200
-"""The most characters of a text from others that are shown."""
-
-
-HASH_DIGITS: Final = 8
-"""Digits of an order's hash in a line; JSON has all 64."""
-
-
-EVENT_WIDTH: Final = 9
-"""Columns of the event's name."""
 
 
 def event_json(seen: MarketEvent, *, time: str) -> dict[str, Any]:

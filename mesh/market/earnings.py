@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
+from mesh.log_context import liability_context, log_event
+
 if TYPE_CHECKING:
     from mesh.chain import Created, Reverted, Settled
+
+log = logging.getLogger(__name__)
 
 REASONS: Final = 64
 """Rejection reasons that are counted apart; further ones, which a stranger's contract may invent, count as `OTHER`."""
@@ -97,6 +102,12 @@ class EarningsLedger:
     def matched(self) -> None:
         """A demand and an offer matched."""
         self._matches += 1
+
+    def creation_reverted(self, liability: str, tx: str) -> None:
+        """A reorganisation reverted the transaction that created a liability."""
+        with liability_context(liability):
+            log.warning("a reorganisation reverted the contract", extra=log_event("contract-reverted"))
+        self.reverted(tx)
 
     def reverted(self, tx: str) -> None:
         """A reorganisation reverted a transaction, perhaps not ours."""

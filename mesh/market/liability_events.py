@@ -13,7 +13,7 @@ from collections import deque
 from contextlib import aclosing
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain import (
     Finalized,
@@ -25,15 +25,15 @@ from mesh.chain import (
     Reorganisation,
     RequestRefused,
 )
-from mesh.flood import KnownSenders
-from mesh.log_context import liability_context, log_event
+from mesh.flood import BoundedDict, KnownSenders
+from mesh.log_context import log_event
 from mesh.market.book import order_id
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff
 from schemas import Demand, Offer, Result, address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Callable, Sequence
 
     from mesh.chain import BlockEvents, Chain
     from mesh.market.book import OrderBook
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from schemas import Liability, Verified
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 OPEN_LIABILITIES: Final = 65_536
 """Records of liabilities that are kept until they are finalized; others are read when their result arrives."""
@@ -55,21 +53,18 @@ MISSING_CHECKS: Final = 3
 
 @dataclass(slots=True)
 class _Entry:
-    """`liability` is where the message is used, as far as known; `block` that of the event, 0 while none was read.
-
-    `is_sending`: a transaction for the message waits, or waits for its event.
-    """
-
     message: Verified[Any]
     is_sending: bool = False
+    """A transaction for the message waits, or waits for its event."""
     liability: str = ""
     block: int = 0
+    """The block of the event that used the message; 0 while none was read."""
 
 
 class Unconfirmed:
     """The messages under settlement; used ones are kept until their event is `depth` blocks deep, `limit` at most.
 
-    A message is identified by its hash and signer (`order_id`).
+    `order_id` identifies a message.
     """
 
     def __init__(self, depth: int, *, limit: int = USED_KEPT) -> None:
@@ -86,8 +81,7 @@ class Unconfirmed:
 
     def get(self, identity: bytes) -> Verified[Any] | None:
         """The message with this identity; None if it is not under settlement."""
-        entry = self._entries.get(identity)
-        return None if entry is None else entry.message
+        return entry.message if (entry := self._entries.get(identity)) else None
 
     def begin(self, *messages: Verified[Any]) -> None:
         """A transaction with these messages will be sent."""
@@ -150,18 +144,18 @@ class Unconfirmed:
             self._used.append((block, order_id(entry.message)))
 
     def _place(self, entry: _Entry, liability: str) -> None:
-        self._unplace(entry)
-        entry.liability = liability
-        self._at.setdefault(liability, set()).add(order_id(entry.message))
-
-    def _unplace(self, entry: _Entry) -> None:
+        """Note where a message is used; an empty `liability` means nowhere."""
+        identity = order_id(entry.message)
         if (placed := self._at.get(entry.liability)) is not None:
-            placed.discard(order_id(entry.message))
+            placed.discard(identity)
             if not placed:
                 del self._at[entry.liability]
+        entry.liability = liability
+        if liability:
+            self._at.setdefault(liability, set()).add(identity)
 
     def _remove(self, entry: _Entry) -> None:
-        self._unplace(entry)
+        self._place(entry, "")
         del self._entries[order_id(entry.message)]
 
     def _entries_at(self, liability: str, kinds: tuple[type[Any], ...]) -> list[_Entry]:
@@ -170,10 +164,7 @@ class Unconfirmed:
 
 
 class LiabilityEvents:
-    """Reads the events of the liabilities at `lighthouse` (address) after block `head`: `await events.follow()`.
-
-    `reverted` is called with each message that must be settled again, because a reorganisation reverted its effect.
-    """
+    """Reads the events of the liabilities at `lighthouse` (address) after block `head`."""
 
     def __init__(
         self,
@@ -181,37 +172,35 @@ class LiabilityEvents:
         lighthouse: str,
         *,
         book: OrderBook,
-        unconfirmed: Unconfirmed,
         withdrawals: Withdrawals,
         earnings: EarningsLedger,
         head: int,
-        reverted: Callable[[Verified[Any]], None],
         forget: Callable[[Verified[Any]], None],
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
         self.head, self.read_at = head, time.monotonic()
         """The latest block that was read, and when, on the monotonic clock."""
-        self.outages: Final = OutageLog(log, "chain")
-        """Outages of the node while the chain is followed."""
-        self.lookups: Final = OutageLog(log, "node")
-        """Outages of the node while single facts are asked of it."""
-        self.open: Final[dict[str, Liability]] = {}
+        self.outages, self.lookups = OutageLog(log, "chain"), OutageLog(log, "node")
+        """Outages of the node while the chain is followed, and while single facts are asked of it."""
+        self.open: Final[BoundedDict[str, Liability]] = BoundedDict(open_limit)
         """Liabilities that were not finalized when they were read, by address; `open_limit` of them at most."""
+        self.unconfirmed: Final = Unconfirmed(chain.node.timing.reorg_depth)
+        """The messages under settlement."""
         self._chain = chain
         self._lighthouse = lighthouse
         self._book = book
-        self._unconfirmed = unconfirmed
         self._withdrawals = withdrawals
         self._earnings = earnings
-        self._reverted = reverted
         self._forget = forget
         self.parties: Final = KnownSenders()
         """Accounts that a liability was created for."""
-        self._open_limit = open_limit
         self._history = History(chain.node.timing.reorg_depth)
 
-    async def follow(self) -> None:
-        """Read until cancelled, through outages of the node."""
+    async def follow(self, reverted: Callable[[Verified[Any]], None]) -> None:
+        """Read until cancelled, through outages of the node.
+
+        `reverted` is called with each message that must be settled again, because a reorganisation reverted its effect.
+        """
         backoff = Backoff(self._chain.node.timing.outage_retry)
         while True:
             try:
@@ -219,7 +208,8 @@ class LiabilityEvents:
                 async with aclosing(blocks):
                     async for block in blocks:
                         if isinstance(block, Reorganisation):
-                            self._revert(block)
+                            for message in self._revert(block):
+                                reverted(message)
                         else:
                             await self._take_block(block)
                         backoff.reset()
@@ -228,21 +218,16 @@ class LiabilityEvents:
                 self.outages.failed(error, f"the chain can't be read on from block {self.head + 1}")
                 await backoff.wait()
 
-    def creation_reverted(self, address: str, tx: str) -> None:
-        """A reorganisation reverted the liability that a transaction created."""
-        with liability_context(address):
-            log.warning("a reorganisation reverted the contract", extra=log_event("contract-reverted"))
-        self._earnings.reverted(tx)
-
     async def is_confirmed(self, messages: Sequence[Verified[Any]], tx: str) -> bool:
         """Wait until the event that used the messages has its confirmations; False if their transaction vanished."""
         timing, missing = self._chain.node.timing, 0
+        has_mined = partial(self._chain.node.has_mined, tx)
         while missing < MISSING_CHECKS:
-            if all(self._unconfirmed.is_read(one, until=self.head - timing.confirmations + 1) for one in messages):
+            if all(self.unconfirmed.is_read(one, until=self.head - timing.confirmations + 1) for one in messages):
                 return True
             await asyncio.sleep(timing.poll_interval)
-            is_there = all(self._unconfirmed.is_read(one, until=self.head) for one in messages)
-            missing = 0 if is_there or await self._has_mined(tx) else missing + 1
+            is_there = all(self.unconfirmed.is_read(one, until=self.head) for one in messages)
+            missing = 0 if is_there or await self._chain.retrying(has_mined, outages=self.lookups) else missing + 1
         return False
 
     async def liability(self, address: str) -> Liability | None:
@@ -250,29 +235,19 @@ class LiabilityEvents:
         if (known := self.open.get(address)) is not None:
             return known
         try:
-            return await self._ask(partial(self._chain.liabilities.get, address))
+            read = partial(self._chain.liabilities.get, address)
+            return await self._chain.retrying(read, outages=self.lookups, errors=(NodeUnreachable,))
         except (NotALiability, NoContracts, RequestRefused) as error:  # or a reorganisation took it
             log.debug("a result waits to be sent again: %s", error)
             return None
 
     async def is_used(self, order: Verified[Demand | Offer]) -> bool:
         """Whether an order became a liability, or was withdrawn on the chain."""
-        question = partial(self._chain.liabilities.is_used, order.message, order_hash=order.hash, signer=order.signer)
+        ask = partial(self._chain.liabilities.is_used, order.message, order_hash=order.hash, signer=order.signer)
         try:
-            return await self._ask(question)
+            return await self._chain.retrying(ask, outages=self.lookups, errors=(NodeUnreachable,))
         except RequestRefused:
             return False  # a used order is rejected when its next match fails
-
-    async def _ask(self, question: Callable[[], Awaitable[T]]) -> T:
-        return await self._chain.retrying(question, outages=self.lookups, errors=(NodeUnreachable,))
-
-    async def _has_mined(self, tx: str) -> bool:
-        """Whether the node has a transaction, waiting or mined with success."""
-        node = self._chain.node
-        receipt = await self._chain.retrying(partial(node.receipt, tx), outages=self.lookups)
-        if receipt is not None:
-            return receipt.status == 1
-        return await self._chain.retrying(partial(node.has_transaction, tx), outages=self.lookups)
 
     async def _take_block(self, block: BlockEvents) -> None:
         created = [event.liability for event in block.events if isinstance(event, NewLiability)]
@@ -284,46 +259,41 @@ class LiabilityEvents:
                 self._take_created(*records[event.liability], block.block_number)
             elif isinstance(event, Finalized):
                 self.open.pop(event.liability, None)
-                self._unconfirmed.finalized(event.liability, block.block_number)
+                self.unconfirmed.finalized(event.liability, block.block_number)
         self.head, self.read_at = block.block_number, time.monotonic()
-        self._unconfirmed.confirm(self.head)
+        self.unconfirmed.confirm(self.head)
         self._withdrawals.expire(self.head)
         for order in self._book.expire(self.head):
             self._forget(order)  # its deadline may be later than the book's limit
-            expired = log_event("order-expired", order=order.hash.hex(), signer=order.signer)
-            log.info("expired order %s of %s", order.hash.hex(), order.signer, extra=expired)
+            facts = {"order": order.hash.hex(), "signer": order.signer}
+            log.info("expired order %(order)s of %(signer)s", facts, extra=log_event("order-expired", **facts))
 
     def _take_created(self, liability: Liability, order_hashes: tuple[bytes, bytes], block: int) -> None:
         """Take the orders of a new liability, created in that block, out of the book."""
         if liability.lighthouse != self._lighthouse:
             return
-        self.parties.add(liability.promisee)
-        self.parties.add(liability.promisor)
         for digest, signer in zip(order_hashes, (liability.promisee, liability.promisor), strict=True):
+            self.parties.add(signer)
             identity = digest + address_bytes(signer)
-            order = self._book.remove(identity) or self._unconfirmed.get(identity)
+            order = self._book.remove(identity) or self.unconfirmed.get(identity)
             if order is not None:
-                self._unconfirmed.created(liability.address, block, order)
+                self.unconfirmed.created(liability.address, block, order)
         if not liability.is_finalized:
             self.open[liability.address] = liability
-            if len(self.open) > self._open_limit:
-                del self.open[next(iter(self.open))]
 
-    def _revert(self, block: Reorganisation) -> None:
-        """Settle again what a reorganisation reverted. What happened again by itself, the contracts refuse."""
+    def _revert(self, block: Reorganisation) -> list[Verified[Any]]:
+        """The messages whose effect a reorganisation reverted. The contracts refuse those that were used again."""
         self.head = block.block_number
         created = [event for event in block.reverted_events if isinstance(event, NewLiability)]
         finalized = [event for event in block.reverted_events if isinstance(event, Finalized)]
-        counts = {"created": len(created), "finalized": len(finalized)}
-        event = log_event("chain-reorganised", head=self.head, **counts)
-        log.warning("a reorganisation reverted %d new contracts, %d finalizations", *counts.values(), extra=event)
+        facts = log_event("chain-reorganised", head=self.head, created=len(created), finalized=len(finalized))
+        log.warning("a reorganisation reverted %d contracts, %d payments", len(created), len(finalized), extra=facts)
         again: list[Verified[Any]] = []
         for creation in created:
-            self.creation_reverted(creation.liability, creation.tx)
+            self._earnings.creation_reverted(creation.liability, creation.tx)
             self.open.pop(creation.liability, None)
-            again += self._unconfirmed.reverted(creation.liability, Demand, Offer)
+            again += self.unconfirmed.reverted(creation.liability, Demand, Offer)
         for end in finalized:
             self._earnings.reverted(end.tx)
-            again += self._unconfirmed.reverted(end.liability, Result)
-        for message in again:
-            self._reverted(message)
+            again += self.unconfirmed.reverted(end.liability, Result)
+        return again

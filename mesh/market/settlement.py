@@ -1,10 +1,9 @@
-"""Settlement: creating liabilities from matching orders, and finalizing them by results.
+"""Settlement: creates liabilities from matching orders, and finalizes them by results.
 
-Other providers do the same, and the chain may replace its last blocks. So settlement follows the chain, and a receipt
-settles nothing. Orders that others used leave the book. A match or result stays under settlement (`Unconfirmed`) until
-its event was read on the followed chain and is `Timing.confirmations` deep; if it vanishes before, or is reverted
-later, it is settled again. What leaves for another reason (it is refused, another provider was first) is forgotten by
-its subscription, so that the copy that its sender repeats next gets through.
+Other providers do the same, and the chain may replace its last blocks, so a receipt settles nothing. A match or result
+stays under settlement (`Unconfirmed`) until its event was read on the followed chain and is `Timing.confirmations`
+deep; if the event vanishes, it is settled again. A message that leaves for another reason (a contract refused it,
+another provider was first) is forgotten by its subscription, so that the next copy gets through.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from mesh.flood import UNFUNDED_POLLS
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import Added, Match, Refusal, order_id
 from mesh.market.funding import Commitments, UnfundedOrders, creation_stakes
-from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents, Unconfirmed
+from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
 from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
 from mesh.market.withdrawals import withdrawn_id
 from schemas import ZERO_ADDRESS, Result
@@ -50,6 +49,9 @@ class Settlement:
     `matched` is called with each match. `forget` lets the next copy of a message through, as `Subscription.forget`.
     """
 
+    blocked: frozenset[str] = frozenset()
+    """The signers whose orders are not taken, as `block` was last called."""
+
     def __init__(
         self,
         chain: Chain,
@@ -66,8 +68,8 @@ class Settlement:
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
         assert chain.account is not None
-        assert channel.address is not None
         self._chain = chain
+        assert channel.address is not None
         self._lighthouse = channel.address
         self._book = book
         self._queue = queue
@@ -76,20 +78,14 @@ class Settlement:
         self._forget = forget
         self._withdrawals = withdrawals
         self._drops = drops
-        self.blocked: frozenset[str] = frozenset()
-        """The signers whose orders are not taken, as `block` was last called."""
-        self._publisher = RejectionPublisher(channel, chain.account, earnings, drops)
-        self.reject: Final = self._publisher.reject
-        self._unconfirmed = Unconfirmed(chain.node.timing.reorg_depth)
+        self.rejections: Final = RejectionPublisher(channel, chain.account, earnings, drops)
         self.events: Final = LiabilityEvents(
             chain,
             channel.address,
             book=book,
-            unconfirmed=self._unconfirmed,
             withdrawals=withdrawals,
             earnings=earnings,
             head=head,
-            reverted=self._settle_again,
             forget=forget,
             open_limit=open_limit,
         )
@@ -100,7 +96,7 @@ class Settlement:
     def start(self, tasks: asyncio.TaskGroup) -> None:
         """Follow the chain, and from now on settle what is added, in tasks of this group."""
         self._tasks = tasks
-        tasks.create_task(self.events.follow(), name="provider chain")
+        tasks.create_task(self.events.follow(self._settle_again), name="provider chain")
         tasks.create_task(self._unfunded.run(), name="provider unfunded orders")
 
     def add(self, order: Verified[Order]) -> Refusal | None:
@@ -116,16 +112,15 @@ class Settlement:
             self._drops.count("book-full", evicted.signer)
             self._forget(evicted, after=self._pause)
         if isinstance(outcome, Match):
-            demand, offer = outcome.demand.hash.hex(), outcome.offer.hash.hex()
-            event = log_event("orders-matched", demand=demand, offer=offer)
-            log.info("matched demand %s and offer %s", demand, offer, extra=event)
+            facts = {"demand": outcome.demand.hash.hex(), "offer": outcome.offer.hash.hex()}
+            log.info("matched demand %(demand)s and offer %(offer)s", facts, extra=log_event("orders-matched", **facts))
             self._earnings.matched()
             self._matched(outcome)
-            self._unconfirmed.begin(*outcome)
+            self.events.unconfirmed.begin(*outcome)
             self._tasks.create_task(self._create(outcome))
         elif isinstance(outcome, Refusal):
             if outcome is not Refusal.DUPLICATE:
-                self.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
+                self.rejections.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
             if outcome not in (Refusal.DUPLICATE, Refusal.WITHDRAWN):
                 self._forget(order, after=self._pause if outcome is Refusal.FULL else 0.0)
             return outcome
@@ -134,7 +129,8 @@ class Settlement:
     def set_aside(self, order: Verified[Order], reason: str) -> None:
         """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
         if self._refusal(order) is None and order_id(order) not in self._book and self._unfunded.add(order):
-            self.reject(order, reason, "its maker does not have, or does not allow the factory to take, what it costs")
+            why = "its maker does not have, or does not allow the factory to take, what it costs"
+            self.rejections.reject(order, reason, why)
         self._forget(order, after=self._pause)
 
     def _settle_again(self, message: Verified[Any]) -> None:
@@ -148,7 +144,7 @@ class Settlement:
             self._unfunded.hasten(order)
             self._forget(order, after=self._pause)
             return Refusal.DUPLICATE
-        if order in self._unconfirmed:
+        if order in self.events.unconfirmed:
             return Refusal.DUPLICATE
         return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None
 
@@ -160,12 +156,12 @@ class Settlement:
         identity = withdrawn_id(withdrawal)
         if not self._withdrawals.add(withdrawal, is_open=identity in self._book):
             self._drops.count("withdrawals", withdrawal.signer)
-            self.reject(withdrawal, Refusal.FULL.value, "too many withdrawals")
+            self.rejections.reject(withdrawal, Refusal.FULL.value, "too many withdrawals")
             self._forget(withdrawal)
             return
         self._book.remove(identity)
-        if self._unconfirmed.get(identity) is None:
-            self._publisher.honour(withdrawal)
+        if self.events.unconfirmed.get(identity) is None:
+            self.rejections.honour(withdrawal)
 
     def block(self, signers: frozenset[str]) -> None:
         """Take no orders of these signers, and drop those in the book. A transaction that was sent can't be stopped."""
@@ -182,14 +178,14 @@ class Settlement:
         """Finalize the liability that a result names, if the result may do that."""
         with liability_context(result.message.liability):
             liability = await self.events.liability(result.message.liability)
-            if result in self._unconfirmed:
+            if result in self.events.unconfirmed:
                 return
             if liability is None or liability.is_finalized:  # which may not be confirmed either
                 self._forget(result)
             elif result.signer != liability.promisor and liability.validator == ZERO_ADDRESS:
-                self.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
+                self.rejections.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
             else:
-                self._unconfirmed.begin(result)
+                self.events.unconfirmed.begin(result)
                 self._tasks.create_task(self._finalize(result, priority=self._chain.costs.worth(liability)))
 
     async def _create(self, match: Match) -> None:
@@ -210,12 +206,11 @@ class Settlement:
             await self._not_created(match, match, error)
         else:
             self._earnings.created(created, fee=offer.message.lighthouse_fee)
-            orders = {"demand": demand.hash.hex(), "offer": offer.hash.hex()}
-            event = log_event("contract-created", gas=created.gas_used, **orders)
+            facts = {"gas": created.gas_used, "demand": demand.hash.hex(), "offer": offer.hash.hex()}
             with liability_context(created.liability):
-                log.info("created, gas %d", created.gas_used, extra=event)
+                log.info("created, gas %(gas)d", facts, extra=log_event("contract-created", **facts))
             if not await self.events.is_confirmed(match, created.tx):
-                self.events.creation_reverted(created.liability, created.tx)
+                self._earnings.creation_reverted(created.liability, created.tx)
             self._put_back(match)
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
@@ -227,9 +222,8 @@ class Settlement:
 
         async def attempt() -> Created:
             nonlocal may_be_sent
-            if not may_be_sent and any(
-                order_id(order) in self._withdrawals or order.signer in self.blocked for order in match
-            ):
+            is_taken_back = any(order_id(one) in self._withdrawals or one.signer in self.blocked for one in match)
+            if is_taken_back and not may_be_sent:
                 raise MatchWithdrawn("an order was withdrawn before its contract was created, or its signer blocked")
             try:
                 return await self._chain.liabilities.create(self._lighthouse, match.demand.message, match.offer.message)
@@ -242,7 +236,7 @@ class Settlement:
     def _put_back(self, match: Match) -> None:
         """No transaction of a match waits any more: put its orders back into the book unless they were used."""
         for order in match:
-            if not self._unconfirmed.end(order):
+            if not self.events.unconfirmed.end(order):
                 self.add(order)
 
     async def _set_aside_unfunded(self, match: Match, reason: str, detail: str) -> bool:
@@ -250,13 +244,13 @@ class Settlement:
         shortages = await self.shortages(match, fresh=True)
         unfunded = [order for order, shortage in zip(match, shortages, strict=True) if shortage]
         for order in match if unfunded else ():
-            if self._unconfirmed.end(order):
+            if self.events.unconfirmed.end(order):
                 continue
             if order not in unfunded or order_id(order) in self._withdrawals:
                 self.add(order)
                 continue
             self._unfunded.add(order)
-            self.reject(order, reason, detail)
+            self.rejections.reject(order, reason, detail)
             self._forget(order, after=self._pause)
         return bool(unfunded)
 
@@ -266,7 +260,6 @@ class Settlement:
         return await self._chain.retrying(question, outages=self.events.lookups)
 
     async def _funding(self, holdings: Sequence[Holding]) -> Mapping[Holding, Funding | None]:
-        """What there is of holdings now."""
         question = partial(self._chain.funds.of, holdings, fresh=True)
         return await self._chain.retrying(question, outages=self.events.lookups)
 
@@ -274,9 +267,9 @@ class Settlement:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""
         reason = reason_of(error)
         for order in match:
-            was_used = self._unconfirmed.end(order)
+            was_used = self.events.unconfirmed.end(order)
             if order in rejected and (reason == ORDER_USED or not was_used):
-                self.reject(order, reason, str(error))
+                self.rejections.reject(order, reason, str(error))
             if was_used:
                 continue
             if order in rejected or await self.events.is_used(order):
@@ -293,8 +286,8 @@ class Settlement:
                     finalized = await self._queue.send(finalize, priority=priority)
             except (Reverted, NodeUnreachable, RequestRefused) as error:
                 if not isinstance(error, Reverted) or error.reason != "AlreadyFinalized":
-                    self.reject(result, reason_of(error), str(error))
-                if not self._unconfirmed.end(result):
+                    self.rejections.reject(result, reason_of(error), str(error))
+                if not self.events.unconfirmed.end(result):
                     self._forget(result)
             else:
                 self._earnings.finalized(finalized)
@@ -302,5 +295,5 @@ class Settlement:
                 log.info("finalized, success %s, gas %d", message.success, finalized.gas_used, extra=event)
                 if not await self.events.is_confirmed((result,), finalized.tx):
                     self._earnings.reverted(finalized.tx)
-                if not self._unconfirmed.end(result):
+                if not self.events.unconfirmed.end(result):
                     await self.add_result(result)

@@ -1,7 +1,7 @@
-"""A lighthouse's channel: the market's messages, published, and received verified from subscriptions.
+"""A lighthouse's channel: publishes the market's messages, and receives them verified.
 
-Zenoh keeps no messages. The providers' order books do, and answer queries with the open orders: subscribe first and
-then call `Subscription.recall`, and you miss nothing.
+Zenoh keeps no messages; the providers' order books answer queries with the open orders. To miss nothing, subscribe
+first, then call `Subscription.recall`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from mesh.background import call_in_loop
 from mesh.errors import ClosedError, InputError, InvalidKey
 from mesh.flood import Drops, FairQueue, Rate, RateLimiter
 from mesh.network import sending
+from mesh.network.lookups import M, Unresolved
 from mesh.network.pump import BATCH, Pump
-from mesh.network.validation import M, MessageValidator, Unresolved, ValidationStatistics, message_key
+from mesh.network.validation import MessageValidator, ValidationStatistics, message_key
 from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, parse_key
 from schemas.selectors import lighthouse_selector, market_selector, presence_selector
@@ -40,8 +41,8 @@ RECALL_LIMIT: Final = 65_536
 RECALL_BYTES: Final = 64 * 1024 * 1024
 """Bytes of messages accepted from one recall, at most."""
 LOOKUP_LIMIT: Final = 256
-"""Messages about which the chain has to be asked that may wait for it, half of them from one signer. More are rejected:
-anybody may send unknown names. Those whose signer is not known, because they contain names, share one signer's part."""
+"""Messages that may wait for an answer of the chain, half of them from one signer; more are rejected. Messages with
+names, whose signer is not known yet, share one signer's part."""
 LOOKUP_RATE: Final = Rate(10, 64)
 """Messages of one signer about which a subscription asks the chain."""
 LOOKUP_RATE_IN_TOTAL: Final = Rate(40, 256)
@@ -52,9 +53,9 @@ class Channel:
 
     `lighthouse` is the ENS name of the market. `address`, if given, is the lighthouse that orders must name;
     `resolver` resolves ENS names in messages; `validators` knows which validators orders may name (None: any); `head`
-    returns the latest block number, for deadlines; messages of `blocked` signers are rejected; what is dropped is
-    counted in `drops`. Leaving `async with` withdraws the presence tokens and ends the watches; the caller closes the
-    session. Raises `InvalidKey` for a name that no key may contain.
+    returns the latest block number, for deadlines; messages of `blocked` signers are rejected; `drops` counts what is
+    dropped. Leaving `async with` withdraws the presence tokens and ends the watches, but does not close the session.
+    Raises `InvalidKey` for a name that no key may contain.
     """
 
     def __init__(
@@ -194,24 +195,17 @@ def _presence_keys(texts: list[str]) -> Iterator[PresenceKey]:
 class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
     """The verified messages of one kind, as an async iterator: `async with channel.subscribe(Demand) as demands`.
 
-    Messages about which the chain has to be asked (ENS names, unknown validators) are delivered after that, so later
-    ones may overtake them.
+    A message about which the chain must be asked (ENS names, unknown validators) may be overtaken by later ones.
     """
 
     def __init__(
         self, session: zenoh.Session, selector: str, validator: MessageValidator[M], drops: Drops | None = None
     ) -> None:
-        super().__init__(
-            session,
-            selector,
-            copy=self._copy,
-            convert_all=validator.check_all,
-            payload_limit=MAX_MESSAGE_SIZE,
-            drops=drops,
-        )
+        copy, check, limit = self._copy, validator.check_all, MAX_MESSAGE_SIZE
+        super().__init__(session, selector, copy=copy, convert_all=check, payload_limit=limit, drops=drops)
         self._validator: MessageValidator[M] = validator
-        self.kind: Final = validator.kind.__name__.lower()
-        """The kind of message: `demand`, `offer` or `result`."""
+        self.kind: Final = validator.kind.kind
+        """The kind of message: `demand`, `offer`, `withdrawal` or `result`."""
         self._unresolved: FairQueue[Unresolved[M]] = FairQueue(per_sender=LOOKUP_LIMIT // 2, total=LOOKUP_LIMIT)
         self._lookup_rate = RateLimiter(per_sender=LOOKUP_RATE, total=LOOKUP_RATE_IN_TOTAL)
         self._queries: set[zenoh.CancellationToken] = set()
@@ -248,8 +242,8 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
     async def recall(self) -> None:
         """Ask the providers for the open orders; the iterator yields each new one once.
 
-        Returns when all providers have answered or after `RECALL_TIMEOUT`; having no provider is not an error.
-        Cancelling this call or leaving `async with` ends the query.
+        Returns when all providers have answered, or after `RECALL_TIMEOUT`, also without a provider. Cancelling this
+        call or leaving `async with` ends the query.
         """
         self.check_entered()
         query = zenoh.CancellationToken()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeVar
 
 from mesh.clock import SYSTEM_CLOCK
 from mesh.errors import InvalidMessage
 from mesh.flood import BoundedDict
+from schemas import SignedMessage, names_in
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -15,12 +16,30 @@ if TYPE_CHECKING:
 
     Resolver = Callable[[str], Awaitable[str]]
 
+M = TypeVar("M", bound=SignedMessage)
+
 KEPT: Final = 60.0
 """Seconds for which the address of a name is used."""
 FAILURE_KEPT: Final = 10.0
 """Seconds for which a name that could not be resolved is not asked about again."""
 NAMES: Final = 4096
 """Names that are remembered; the oldest are forgotten first."""
+
+
+class Unresolved(NamedTuple, Generic[M]):
+    """A message about which the chain has to be asked first: it contains ENS names, without which it can't be hashed
+    and verified, or is verified and names a validator that is not known yet."""
+
+    message: M
+    key: str
+    fingerprint: int
+    signer: str = ""
+    """The signer of a verified message."""
+
+    @property
+    def question(self) -> str:
+        """What has to be asked, `name` or `validator`: the reason of its rejection if that fails."""
+        return "name" if names_in(self.message) else "validator"
 
 
 class ValidatorCheck(Protocol):

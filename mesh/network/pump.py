@@ -1,12 +1,9 @@
 """The pump: samples from a Zenoh subscriber into asyncio, fast, with bounded memory.
 
-One thread moves samples from Zenoh's queue into a ring, as copies, because a sample keeps the buffer alive in which it
-was received. Then it converts them (signature checks run here, off the event loop) and passes them to the loop in
-batches. At most two batches are in flight; while the consumer is busy, or more arrives than can be converted, the ring
-fills up and drops the *oldest* samples, which are counted. That costs no memory and never stalls the session, because
-the thread keeps emptying Zenoh's queue.
-
-A sample that gets through a full ring waits no longer than a ring takes to fill. Its copy goes first: `ReceiveRing`.
+One thread copies samples from Zenoh's queue into a ring (a sample keeps its receive buffer alive), converts them
+(signature checks run here, off the event loop) and passes them to the loop in batches, at most two at a time. When more
+arrives than is converted or consumed, the ring drops the *oldest* samples and counts them. The thread keeps emptying
+Zenoh's queue, so the session never stalls.
 """
 
 from __future__ import annotations
@@ -46,10 +43,7 @@ BATCH: Final = 256
 BATCHES_IN_FLIGHT: Final = 2
 """Batches between the pump's thread and the consumer, at most."""
 ZENOH_QUEUE: Final = 512
-"""Capacity of Zenoh's own queue. Each sample in it may keep 64 KiB alive. The thread empties it many times faster than
-samples arrive; when it is full nevertheless, Zenoh stops reading from the router for a moment."""
-TAKEN_AT_ONCE: Final = 8192
-"""Samples taken from Zenoh's queue before the next conversion, at most."""
+"""Samples in Zenoh's own queue; each may keep 64 KiB alive. While it is full, Zenoh stops reading from the router."""
 SLOT_WAIT: Final = 0.002
 """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
 
@@ -82,11 +76,10 @@ class _Lane(deque[tuple[Any, int]]):
 class ReceiveRing:
     """Received items that wait for their conversion, the oldest of which are dropped when there are too many.
 
-    With `second_chance`, which needs hashable items, there is a lane for first copies, one for second ones, and so on.
-    All get the same share of the conversions, but for what others leave. Of copies the newest go first, and fewer wait:
-    `capacity` and `capacity_bytes` by `COPIES` in each lane. Honest senders send again what has no effect. So in a
-    flood of ever new messages their second copy gets through at once, also while the first waits; in a flood of second
-    copies the third does.
+    With `second_chance`, which needs hashable items, first copies have a lane, second copies another, and so on. Each
+    lane gets the same share of the conversions, and what the others leave. In the lanes of copies the newest go first,
+    and fewer wait: `capacity` and `capacity_bytes` divided by `COPIES`. Honest senders repeat what has no effect, so in
+    a flood of new messages their second copy gets through at once, and in a flood of second copies the third does.
     """
 
     def __init__(self, capacity: int, capacity_bytes: int, *, second_chance: bool) -> None:
@@ -121,13 +114,13 @@ class ReceiveRing:
 class Pump(Generic[T]):
     """An async iterator over the converted samples on `selector`: `async with Pump(session, selector, convert)`.
 
-    `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, give two functions
-    instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `BATCH` copies
-    while others wait in the ring, and yields some of them every few milliseconds, so that Zenoh's queue is emptied in
-    between. They run on the pump's own thread; the iterator raises what they raise. Items arrive in order, but for
-    copies. `capacity` and `capacity_bytes` bound the ring. Samples with more than `payload_limit` bytes are refused.
-    What is dropped or refused is counted in `drops`. Leaving `async with` ends the subscription, the thread and the
-    iteration; undelivered samples are lost. Supports one consumer. Raises `ClosedError` before it is entered.
+    `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, pass two functions
+    instead: `copy` takes what is needed out of a sample, and `convert_all` makes items of up to `BATCH` copies and
+    yields some of them every few milliseconds, so that the thread can empty Zenoh's queue in between. They run on the
+    pump's thread; the iterator raises what they raise. Items arrive in order, except copies. `capacity` and
+    `capacity_bytes` bound the ring. Samples of more than `payload_limit` bytes are refused. `drops` counts what is
+    dropped or refused. Leaving `async with` ends the subscription, the thread and the iteration; undelivered samples
+    are lost. There is one consumer. Raises `ClosedError` before it is entered.
     """
 
     def __init__(
@@ -218,12 +211,12 @@ class Pump(Generic[T]):
 
     def copy(self, sample: zenoh.Sample) -> Any | None:
         """What `feed` takes of a sample from elsewhere (a query's reply), on any thread; None if it is refused."""
-        is_refused = self._payload_limit is not None and len(sample.payload) > self._payload_limit
         with self._lock:
             self.received += 1
-        if is_refused:
+        if self._payload_limit is not None and len(sample.payload) > self._payload_limit:
             self._drops.count("too-large")
-        return None if is_refused else self._copy(sample)
+            return None
+        return self._copy(sample)
 
     def feed(self, copies: list[Any]) -> None:
         """Convert and deliver what `copy` returned, beside the ring, on any thread, without waiting."""
@@ -250,8 +243,8 @@ class Pump(Generic[T]):
             if not self._stopping:
                 call_in_loop(loop, self.fail, ClosedError("the network session of a subscription was closed"))
         except Exception as error:
-            failed = log_event("subscription-failed", selector=self.selector)
-            log.exception("the subscription to %s failed", self.selector, extra=failed)
+            facts = log_event("subscription-failed", selector=self.selector)
+            log.exception("the subscription to %s failed", self.selector, extra=facts)
             call_in_loop(loop, self.fail, error)
             with suppress(zenoh.ZError):  # a full queue would stall the session
                 while True:
@@ -278,7 +271,7 @@ class Pump(Generic[T]):
                     self._copy_failure = error
                     break
                 dropped += 0 if copied is None else ring.append(copied, size)
-            sample = queue.try_recv() if received < TAKEN_AT_ONCE else None
+            sample = queue.try_recv() if received < RING_CAPACITY else None
         sending.received(self._session)
         with self._lock:
             self.received += received

@@ -1,8 +1,7 @@
 """Validation of the channel's messages: every sample is checked here before anything else sees it.
 
-Checks run from cheap to expensive, so that invalid input costs little: the JSON decodes, its key is the one that its
-content requires (which rules out wildcards), the message is new, its deadline lies ahead. The signature is verified
-last, and once; only an order whose validator the chain has to be asked about is verified again after that.
+Checks run from cheap to expensive, so that invalid input costs little: the JSON decodes, its content fits its key, the
+message is new, its deadline lies ahead. The signature is verified last.
 """
 
 from __future__ import annotations
@@ -11,14 +10,14 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, Generic
 
 import msgspec
 
 from mesh.clock import SYSTEM_CLOCK
 from mesh.errors import AiraError, InvalidMessage
 from mesh.flood import RecentDict
-from mesh.network.lookups import NameCache
+from mesh.network.lookups import M, NameCache, Unresolved
 from schemas import (
     ZERO_ADDRESS,
     Demand,
@@ -44,8 +43,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-M = TypeVar("M", bound=SignedMessage)
-
 AMBIGUOUS_NONCE: Final = "00" * 12
 """No nonce of generation 3 may start like this: the contracts would read it as a generation-5 order."""
 DEDUPLICATION_LIMIT: Final = 65_536
@@ -61,24 +58,8 @@ def message_key(lighthouse: str, message: SignedMessage) -> str:
     return market_key(lighthouse, message.kind, message.key_model)
 
 
-class Unresolved(NamedTuple, Generic[M]):
-    """A message about which the chain has to be asked first: it contains ENS names, without which it can't be hashed
-    and verified, or is verified and names a validator that is not known yet."""
-
-    message: M
-    key: str
-    fingerprint: int
-    signer: str = ""
-    """The signer of a verified message."""
-
-    @property
-    def question(self) -> str:
-        """What has to be asked, `name` or `validator`: the reason of its rejection if that fails."""
-        return "name" if names_in(self.message) else "validator"
-
-
 class ValidationStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """Counts of one subscription's messages: `invalid` by reason; `dropped` before validation, the oldest first."""
+    """Counts of one subscription's messages: `invalid` by reason; `dropped` before validation."""
 
     received: int
     accepted: int
@@ -88,17 +69,17 @@ class ValidationStatistics(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Prepared(msgspec.Struct, Generic[M], frozen=True, gc=False):
-    """A message that only lacks the check of its signature."""
+    """A message whose signature is not checked yet. `identity` is the same for copies, `fingerprint` for equal bytes.
+
+    `is_complete`: the chain need not be asked about it.
+    """
 
     message: M
     key: str
     fingerprint: int
-    """The hash of its bytes."""
     hash: bytes
     identity: int
-    """The hash of what makes it one message: copies of it have the same."""
     is_complete: bool
-    """Whether the chain need not be asked about it."""
     signed: SignedDigest
 
 
@@ -106,15 +87,14 @@ class MessageValidator(Generic[M]):
     """Verifies the messages of one kind, and counts those that it rejects.
 
     `lighthouse` is the market's name in keys; `address`, if given, must be the orders' lighthouse. `head` returns the
-    latest block number, or 0 when it isn't known (then no deadline is checked); `resolver` resolves ENS names;
+    latest block number, or 0 if it isn't known (then no deadline is checked); `resolver` resolves ENS names;
     `validators` knows which validators orders may name (None: any); messages of `blocked` signers are rejected.
     Thread-safe, except `complete`.
 
-    A message is a duplicate when hash and signature equal those of one of the last accepted messages, of
-    `deduplication_limit` at most and half of them at least, that were not forgotten since; equal generation-3 terms
-    from two signers are two messages. A copy with the same bytes is recognized before it is decoded. The rule for
-    consumers: hold a message until the chain has confirmed its effect, or `forget` it. Senders repeat a message until
-    they see its effect, so the copy that arrives next takes the place of the one that had none.
+    A message is a duplicate if its hash and signature equal those of one of the last accepted messages
+    (`deduplication_limit` at most, half of that at least) that were not forgotten since; equal generation-3 terms from
+    two signers are two messages. A copy with the same bytes is recognized before it is decoded. Consumers hold a
+    message until the chain has confirmed its effect, or `forget` it, and then the sender's next copy gets through.
     """
 
     def __init__(
@@ -163,8 +143,7 @@ class MessageValidator(Generic[M]):
     def check_all(self, received: Iterable[tuple[str, bytes]]) -> Iterator[list[Verified[M] | Unresolved[M]]]:
         """The messages among keys and payloads, as `check` finds them, some of them every few milliseconds.
 
-        All are decoded before signatures are verified: each of the two is twice as fast when it is not interrupted by
-        the other, because its code stays in the processor's caches.
+        All are decoded before signatures are verified: each is twice as fast while its code stays in the CPU's caches.
         """
         prepared = [each for key, payload in received if (each := self._prepare(key, payload)) is not None]
         for start in range(0, len(prepared), SLICE):
@@ -192,8 +171,7 @@ class MessageValidator(Generic[M]):
 
     def _verify_all(self, prepared: list[_Prepared[M] | Unresolved[M]]) -> list[Verified[M] | Unresolved[M]]:
         """Verify signatures: that of each message once, even if copies of it come together."""
-        seen = self._seen
-        new = [each for each in prepared if isinstance(each, _Prepared) and each.identity not in seen]
+        new = [each for each in prepared if isinstance(each, _Prepared) and each.identity not in self._seen]
         signed = {each.identity: each.signed for each in new}
         keys = dict(zip(signed, recover_keys(signed.values()), strict=True))
         with self._lock:
@@ -262,7 +240,7 @@ class MessageValidator(Generic[M]):
     def forget(self, verified: Verified[M], *, after: float = 0.0) -> None:
         """Accept an accepted message once more when it is sent again: its consumer no longer holds it.
 
-        With `after`, copies remain duplicates for so many seconds, in which looking at one again would be in vain.
+        With `after`, copies remain duplicates for that many seconds.
         """
         identity = hash((verified.hash, verified.message.signature))
         with self._lock:

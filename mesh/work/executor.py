@@ -1,7 +1,7 @@
 """The executor: takes the liabilities that name this agent as promisor through every phase, to a signed Result.
 
-Objectives of several jobs are fetched at once; jobs run one at a time. A missing or bad objective fails its own job,
-which refunds the promisee, and delays no other. What happens is written to the ledger before anyone is notified.
+Objectives of several jobs are fetched at once; jobs run one at a time. A missing or bad objective fails its own job
+only. The ledger has each change before anyone is notified.
 """
 
 from __future__ import annotations
@@ -102,9 +102,8 @@ class Executor:
     def prepare(self, liability: Liability) -> None:
         """Fetch and check a job's objective in a task. Then the job is ready, or complete without success."""
         address = liability.address
-        task = self._preparing[address] = self._task_group().create_task(
-            self._fetch(liability), name=f"prepare {address}"
-        )
+        task = self._task_group().create_task(self._fetch(liability), name=f"prepare {address}")
+        self._preparing[address] = task
         task.add_done_callback(partial(self._drop_task, address))
 
     @asynccontextmanager
@@ -134,8 +133,7 @@ class Executor:
         """Play the objective of a ready job. Returns when the playback has begun. Raises `WrongPhase`."""
         await self._wait_until_prepared(address)
         async with self._changing:
-            job = await self._startable(address, asked="start", phases=(Phase.READY,))
-            await self._begin(job)
+            await self._begin(await self._startable(address, asked="start", phases=(Phase.READY,)))
 
     @with_liability_context
     async def restart(self, address: str) -> None:
@@ -162,9 +160,8 @@ class Executor:
     async def read(self, address: str) -> Liability:
         """The record of a job's liability as the ledger has it. Raises `WrongPhase` for a liability without a job."""
         job = await self._job(address, asked="read")
-        is_success, is_finalized = bool(job.success), job.phase is Phase.FINALIZED
-        result = job.result or job.liability.result
-        return replace(job.liability, result=result, is_success=is_success, is_finalized=is_finalized)
+        ended = {"is_success": bool(job.success), "is_finalized": job.phase is Phase.FINALIZED}
+        return replace(job.liability, result=job.result or job.liability.result, **ended)
 
     @with_liability_context
     async def finish(self, address: str, *, success: bool, note: str = "") -> str:
@@ -225,12 +222,12 @@ class Executor:
     async def _resume_to_end(self, address: str) -> None:
         """Resume a job and wait for its end. It may be restarted in between."""
         await self.resume(address)
-        while (playback := await self._current_playback(address)) is not None:
+        while True:
+            async with self._changing:
+                playback = self._playbacks.task(address)
+            if playback is None:
+                return
             await asyncio.wait([playback])
-
-    async def _current_playback(self, address: str) -> asyncio.Task[None] | None:
-        async with self._changing:
-            return self._playbacks.task(address)
 
     async def _begin(self, job: JobRecord) -> None:
         objective = self._fetched[job.liability.address]
@@ -261,8 +258,8 @@ class Executor:
 
     async def _release_ended(self) -> None:
         """The same for all jobs: a crash may have come between their end and `_release`."""
-        pins = await asyncio.to_thread(self._store.pins)
-        for label in (await asyncio.to_thread(self._playbacks.recorded)).union(*pins.values()):
+        pins, recorded = await asyncio.to_thread(self._store.pins), await asyncio.to_thread(self._playbacks.recorded)
+        for label in recorded.union(*pins.values()):
             if label.startswith("0x"):  # other labels belong to others
                 await self._release(label)
 

@@ -1,8 +1,7 @@
 """The ledger: an agent's jobs, its unsent messages, and how far it has read the chain, in one SQLite file.
 
 Every write survives `kill -9` once the call has returned, and a power loss unless it can be repeated: see "What
-survives a crash" in docs/architecture.md. Writes are idempotent: handling the same block or message twice changes
-nothing.
+survives a crash" in docs/architecture.md. Writes are idempotent.
 """
 
 from __future__ import annotations
@@ -183,10 +182,8 @@ class Ledger:
         """The jobs in the given phases, oldest first."""
         wanted = tuple(phases)
         marks = ",".join("?" * len(wanted))
-        rows = await self._database.rows(
-            f"SELECT * FROM jobs WHERE phase IN ({marks}) AND NOT aside ORDER BY rowid", wanted
-        )
-        return [_job(row) for row in rows]
+        statement = f"SELECT * FROM jobs WHERE phase IN ({marks}) AND NOT aside ORDER BY rowid"
+        return [_job(row) for row in await self._database.rows(statement, wanted)]
 
     async def jobs_by_phase(self) -> dict[str, int]:
         """The number of jobs in each phase that has any."""
@@ -230,12 +227,9 @@ class Ledger:
     async def unspend(self, liability: str) -> None:
         """Move the orders of a reverted contract back into the outbox. Withdrawn ones stay withdrawn."""
         columns = "identity, kind, payload, deadline, posted"
+        back = f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent WHERE liability = ?"
         await self._database.run_together(
-            (
-                f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent"
-                " WHERE liability = ? AND identity NOT IN (SELECT identity FROM withdrawn)",
-                (liability,),
-            ),
+            (f"{back} AND identity NOT IN (SELECT identity FROM withdrawn)", (liability,)),
             ("DELETE FROM spent WHERE liability = ?", (liability,)),
             ("UPDATE withdrawn SET used_by = '' WHERE used_by = ?", (liability,)),
             sync=False,

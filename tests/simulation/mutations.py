@@ -263,7 +263,7 @@ CANDIDATES: Final = (
         "the provider does not see a reorganisation",
         "mesh.market.liability_events:LiabilityEvents._revert",
         "created = [",
-        "return\n    created = [",
+        "return []\n    created = [",
         REORGANISATIONS,
     ),
     Mutation(

@@ -14,8 +14,7 @@ from mesh.chain import UnknownName
 from mesh.errors import AiraError, RemoteError
 from mesh.flood import Drops
 from mesh.network import Channel, message_key
-from mesh.network.lookups import FAILURE_KEPT, KEPT, NameCache
-from mesh.network.validation import Unresolved
+from mesh.network.lookups import FAILURE_KEPT, KEPT, NameCache, Unresolved
 from schemas import Demand, Offer, Verified, encode, message_hash
 from tests.mesh.network.validating import NAME, check, counted, validator
 from tests.support.clocks import SECOND, SetClock

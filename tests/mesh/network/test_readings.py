@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mesh.network import MessageValidator, message_key
-from mesh.network.validation import Unresolved
+from mesh.network.lookups import Unresolved
 from schemas import (
     ZERO_ADDRESS,
     AiraError,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mesh.network import MessageValidator, message_key
-from mesh.network.validation import Unresolved
+from mesh.network.lookups import Unresolved
 from schemas import Demand, SignedMessage, Verified, encode
 from tests.support.orders import LIGHTHOUSE, MARKET
 

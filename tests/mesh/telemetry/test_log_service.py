@@ -116,7 +116,7 @@ async def test_a_rejected_order_is_logged_with_its_hash(place: Place, kept: LogH
         order = await robot.offer(objective=OBJECTIVE, cost=1)
         await until(lambda: len(provider.book), what="the order in the book")
         (message,) = provider.book.orders()
-        provider.settlement.reject(message, "expired", "too late")
+        provider.settlement.rejections.reject(message, "expired", "too late")
         (event,) = (await logs(place, "provider", level="warning")).entries
     assert (event.facts["order"], event.facts["reason"]) == (order, "expired")
 
