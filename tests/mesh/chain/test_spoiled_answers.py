@@ -87,6 +87,15 @@ async def test_each_method_is_asked_again_after_a_spoiled_answer(
     assert spoiled >= ANSWERS.keys() - {"eth_chainId"}
 
 
+async def test_a_node_that_says_it_has_no_latest_block_is_asked_again(anvil: Anvil) -> None:
+    """Every chain has one, so a null is a spoiled answer."""
+    spoiling: dict[str, Any] = {"methods": frozenset({"eth_getBlockByNumber"}), "kinds": ("null",), "rate": 0.5}
+    async with SpoilingProxy(anvil.url, seed=1, **spoiling) as proxy, Node(proxy.url, timing=PATIENT) as node:
+        for _ in range(20):
+            await node.latest_header()
+        assert proxy.spoiled.total()
+
+
 @pytest.mark.parametrize("method", ANSWERS)
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_that_spoils_every_answer_to_a_method_is_unreachable(
