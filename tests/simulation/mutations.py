@@ -339,7 +339,7 @@ CANDIDATES: Final = (
     Mutation(
         "a result under settlement is settled again",
         "mesh.market.settlement:Settlement.add_result",
-        "if result in self._unconfirmed:",
+        "if result in self.events.unconfirmed:",
         "if False:",
         "duplicate,replay",
     ),
