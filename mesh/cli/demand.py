@@ -28,7 +28,6 @@ from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract, Order
-    from mesh.amounts import Unit
     from mesh.recording import Objective
     from mesh.settings import Settings
 HELD_TIMEOUT: Final = 3.0
@@ -122,10 +121,11 @@ async def demand(
             tasks.start(wait_for_broken_pipe(), "readers of stdout")
             printer.line(f"demand by {agent.address} for {agent.model}")
             cid = source if isinstance(source, str) else await agent.add(source)
-            if (examined := checked or await _check_held(agent, cid)) is not None:
-                size = f"{plural(examined.count, 'message')}, {format_duration(examined.duration_ns)}"
-                printer.line(f"objective {cid}: {size}")
-            order = await _post(agent, cid, unit, printer, validator_fee=fee, existing=existing, **terms)
+            terms |= {"cost": unit.parse(terms["cost"]), "validator_fee": fee}
+            order = await take_existing(agent, cid, existing, quiet=as_json, **terms)
+            if order is None:
+                await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
+                order = await _post(agent, cid, checked, printer, **terms)
             contract = await _contract(agent, order, printer, withdraw_on_exit=withdraw_on_exit)
             await _wait_for_end(agent, contract, printer, out)
 
@@ -153,24 +153,12 @@ async def _check_held(agent: Agent, cid: str) -> Objective | None:
     return None
 
 
-async def _post(
-    agent: Agent,
-    objective: str,
-    unit: Unit,
-    printer: JobPrinter,
-    *,
-    cost: str,
-    validator_fee: int,
-    existing: str | None,
-    **terms: Any,
-) -> Order | Contract:
-    """Publish the demand, or take one that is open, or its contract. Prints which."""
-    terms |= {"cost": unit.parse(cost), "validator_fee": validator_fee}
-    found = await take_existing(agent, objective, existing, quiet=printer.as_json, **terms)
-    if found is not None:
-        return found
-    await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
-    order = await agent.order(objective, **terms)
+async def _post(agent: Agent, cid: str, checked: Objective | None, printer: JobPrinter, **terms: Any) -> Order:
+    """Publish the demand; first check its objective, unless that was done."""
+    if (objective := checked or await _check_held(agent, cid)) is not None:
+        size = f"{plural(objective.count, 'message')}, {format_duration(objective.duration_ns)}"
+        printer.line(f"objective {cid}: {size}")
+    order = await agent.order(cid, **terms)
     printer.line(f"posted {order.hash}, valid until block {order.deadline:,}")
     return order
 

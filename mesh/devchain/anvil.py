@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.background import Background
-from mesh.devchain.anvil_state import STATE_SECONDS, copy_states, prepare_state, settle_state
+from mesh.devchain.anvil_state import STATE_SECONDS, copy_states, prepare_state
 from mesh.devchain.errors import NotAProgram
 from mesh.devchain.ports import check_port
 from mesh.errors import ConfigurationError, RemoteError
@@ -141,7 +141,6 @@ async def serve_anvil(
         if state is not None:
             await asyncio.to_thread(prepare_state, state)
             command += ["--state", str(state), "--state-interval", str(STATE_SECONDS)]
-            stack.push_async_callback(asyncio.to_thread, settle_state, state)
         elif load is not None:
             command += ["--load-state", str(load)]
         node = Anvil(program, await _start(program, command), host=host, port=port)

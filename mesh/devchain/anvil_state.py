@@ -1,8 +1,7 @@
 """The file in which anvil keeps a chain, protected against crashes.
 
 Anvil rewrites the file in place again and again; a process that is killed while it writes leaves half a chain. So a
-copy of the last whole state is kept beside the file, and used instead of a damaged one. A chain that was killed while
-its contracts were deployed holds half a market and nothing that anybody could miss: it is started again from nothing.
+copy of the last whole state is kept beside the file, and used instead of a damaged one.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import asyncio
 import json
 import logging
 import os
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.devchain.errors import InvalidChainState
@@ -19,14 +17,12 @@ from mesh.errors import ConfigurationError
 from mesh.log_context import log_event
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
 log = logging.getLogger(__name__)
 
 STATE_SECONDS: Final = 2
 """Seconds between two saves of the state: a power cut costs at most two of these."""
-DEPLOYED: Final = "the contracts are made"
 
 
 def prepare_state(state: Path) -> None:
@@ -36,14 +32,6 @@ def prepare_state(state: Path) -> None:
     """
     try:
         state.parent.mkdir(parents=True, exist_ok=True)
-        if deployment_mark(state).exists():
-            log.warning(
-                "%s was not saved with all its contracts: starting a new chain",
-                state,
-                extra=log_event("chain-state-discarded", path=state),
-            )
-            for file in (state, state_copy(state), deployment_mark(state)):
-                file.unlink(missing_ok=True)
         if not state.exists() or _is_chain(state.read_bytes()):
             return
         whole = state_copy(state).read_bytes() if state_copy(state).exists() else b""
@@ -70,21 +58,13 @@ async def copy_states(state: Path) -> NoReturn:
             raise ConfigurationError(f"can't keep the chain in {state_copy(state)}: {error.strerror}") from None
 
 
-@contextmanager
-def deploying(state: Path | None) -> Iterator[None]:
-    """Mark the chain as incomplete while the body deploys the contracts, and until they are saved.
-
-    Raises `ConfigurationError` when the mark can't be written.
-    """
-    _mark(state, "the contracts are being made\n")
-    yield
-    _mark(state, f"{DEPLOYED}, and not saved yet\n")
-
-
-def settle_state(state: Path) -> None:
-    """Remove the mark after anvil's end, which saved the state once more."""
-    if state.exists():
-        _unmark(deployment_mark(state), saved=state.stat().st_mtime_ns)
+def write_state(state: Path, content: bytes) -> None:
+    """Write a whole chain to `state` in one step, and its copy. Raises `ConfigurationError` when it can't."""
+    try:
+        _replace(state_copy(state), content)
+        _replace(state, content)
+    except OSError as error:
+        raise ConfigurationError(f"can't keep the chain in {state}: {error.strerror}") from None
 
 
 def state_copy(state: Path) -> Path:
@@ -92,32 +72,12 @@ def state_copy(state: Path) -> Path:
     return state.with_name(f"{state.name}.kept")
 
 
-def deployment_mark(state: Path) -> Path:
-    """The file that exists until a chain is saved with all its contracts."""
-    return state.with_name(f"{state.name}.founding")
-
-
 def _copy_state(state: Path, seen: int) -> int:
     """Copy a whole state, unless it was `seen`; the time of its last change (nanoseconds)."""
     written = state.stat().st_mtime_ns if state.exists() else seen
     if written != seen and _is_chain(content := state.read_bytes()):
         _replace(state_copy(state), content)
-        _unmark(deployment_mark(state), saved=written)
     return written
-
-
-def _mark(state: Path | None, words: str) -> None:
-    if state is not None:
-        try:
-            deployment_mark(state).write_text(words)
-        except OSError as error:
-            raise ConfigurationError(f"can't keep the chain in {state}: {error.strerror}") from None
-
-
-def _unmark(mark: Path, *, saved: int) -> None:
-    """Remove the mark if the contracts were deployed before the state was `saved` (nanoseconds since the epoch)."""
-    if mark.exists() and mark.stat().st_mtime_ns < saved and mark.read_text().startswith(DEPLOYED):
-        mark.unlink()
 
 
 def _replace(path: Path, content: bytes) -> None:

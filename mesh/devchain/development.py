@@ -24,7 +24,7 @@ from mesh.chain import (
     write_keyfile,
 )
 from mesh.devchain.anvil import serve_anvil
-from mesh.devchain.anvil_state import deploying, prepare_state
+from mesh.devchain.anvil_state import prepare_state, write_state
 from mesh.devchain.embedded import EmbeddedChain
 from mesh.devchain.errors import KeyfilesNotWritable, MarketMissing
 from mesh.devchain.ports import check_port
@@ -198,36 +198,32 @@ async def serve_chain(
 
 @asynccontextmanager
 async def _new_market(anvil: Path, state: Path | None) -> AsyncIterator[Path | None]:
-    """The state of a new chain with a market, which is in the file `state` if it is given; None if that has a chain.
+    """A file with a new chain and a market on it, which is also written to `state`; None if that has a chain already.
 
-    Anvil listens as soon as it runs, so a chain is made at a port that nobody knows, and only then served.
+    Anvil listens as soon as it runs, so the contracts are deployed at a port that nobody knows. And `state` gets the
+    chain when they all are there: whatever happens before, the next start begins with nothing.
     """
-    async with AsyncExitStack() as stack:
-        if state is None:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-market-"))
-            new = Path(folder) / "chain.json"
-        else:
-            await asyncio.to_thread(prepare_state, state)
-            if await asyncio.to_thread(state.exists):
-                yield None
-                return
-            new = state
+    if state is not None:
+        await asyncio.to_thread(prepare_state, state)
+        if await asyncio.to_thread(state.exists):
+            yield None
+            return
+    with tempfile.TemporaryDirectory(prefix="aira-market-") as folder:
+        new = Path(folder) / "chain.json"
         async with serve_anvil(anvil, host="127.0.0.1", port=0, block_time=None, state=new) as node:
-            with deploying(new):
-                await deploy_market(node.url, node.funded_keys)
+            await deploy_market(node.url, node.funded_keys)
+        if state is not None:
+            await asyncio.to_thread(write_state, state, new.read_bytes())
         yield new
 
 
 async def _load_or_deploy(url: str, keys: tuple[bytes, ...], state: Path | None) -> DevelopmentMarket:
-    """The market of a chain that was loaded from `state`, or a newly deployed one if the chain is new."""
+    """The market of a chain that was loaded from `state`; deployed now if nobody has used that chain yet."""
     try:
         market = await load_market(url, keys)
     except NoContracts:
         raise MarketMissing(state) from None
-    if market is not None:
-        return market
-    with deploying(state):
-        return await deploy_market(url, keys)
+    return market or await deploy_market(url, keys)
 
 
 def _accounts_of(keys: Sequence[bytes]) -> dict[str, Account]:

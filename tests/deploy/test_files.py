@@ -47,9 +47,10 @@ def stages() -> dict[str, tuple[str, str]]:
 
 
 def versions(lock: str) -> dict[str, set[str]]:
-    """The requirements of a lock, each with its hashes."""
+    """The packages of a lock (`name==version`), each with its hashes."""
     text = (ROOT / "requirements" / lock).read_text().replace("\\\n", " ")
-    return {line.split(" --hash")[0].strip(): set(re.findall(r"--hash=(\S+)", line)) for line in text.splitlines()}
+    hashes = re.compile(r"--hash=(\S+)")
+    return {re.split(" ;| --hash", line)[0].strip(): set(hashes.findall(line)) for line in text.splitlines()}
 
 
 @pytest.mark.parametrize("lock", ["edge.txt", "server.txt"])

@@ -169,7 +169,8 @@ class Job:
         said = self.market.log_of(self.container)
         code = self.market.engine("inspect", "--format", "{{.State.ExitCode}}", self.container)
         assert code == "0\n", self.market.report(said)
-        printed: dict[str, Any] = json.loads(said[said.index("{") :])
+        *_, last = (line for line in said.splitlines() if line.startswith("{"))
+        printed: dict[str, Any] = json.loads(last)
         (end,) = [event for event in self.market.happened(Finalized) if event not in self.before]
         assert (end.liability, end.success) == (printed["liability"], printed["success"])
         made = [event.liability for event in self.market.happened(NewLiability)]

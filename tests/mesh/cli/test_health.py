@@ -153,11 +153,9 @@ def test_an_impossible_host_is_one_clear_line_and_code_1() -> None:
 
 
 def test_a_demand_does_not_serve_metrics(listen: str, tmp_path: Path) -> None:
-    objective = tmp_path / "nothing.mcap"
-    objective.write_bytes(b"")
     host, _, port = listen.rpartition(":")
     with socket.create_server((host, int(port))):
-        options = ("--model", "Qm" + "a" * 44, "--objective", objective, "--keyfile", tmp_path / "none.json")
+        options = ("--model", "Qm" + "a" * 44, "--objective", "Qm" + "b" * 44, "--keyfile", tmp_path / "none.json")
         password = ("--keyfile-password-file", tmp_path / "none")
         done = invoke("demand", *options, *password, AIRA_METRICS_LISTEN=listen)
 

@@ -7,17 +7,22 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import Account, Node, TransactionSender
+from mesh.devchain import development
 from mesh.devchain.anvil import serve_anvil
-from mesh.devchain.anvil_state import deploying, deployment_mark, prepare_state, state_copy
+from mesh.devchain.anvil_state import prepare_state, state_copy
 from mesh.devchain.development import serve_chain
 from mesh.devchain.errors import InvalidChainState
+from mesh.errors import AiraError
 from mesh.settings import Settings
 from tests.support.log_events import logged_events
 from tests.support.peers import require
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
     from pathlib import Path
+
+    from mesh.devchain.development import DevelopmentChain
 
 NEW_ACCOUNT = "0x00000000000000000000000000000000000000AA"
 
@@ -46,24 +51,23 @@ async def test_a_damaged_state_is_replaced_by_the_last_whole_copy(
     assert "chain-state-restored" in logged_events(caplog)
 
 
-async def test_a_chain_that_was_killed_while_deploying_is_discarded(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    program, state = require("anvil"), tmp_path / "state.json"
-    settings = Settings(data_dir=str(tmp_path))
-    async with (
-        serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
-        Node(node.url) as client,
-    ):
-        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NEW_ACCOUNT, data=b"", value=7)
-        with pytest.raises(RuntimeError, match="killed"), deploying(state):
-            raise RuntimeError("killed")
-    async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=program, state=state) as chain:
-        assert "chain-state-discarded" in logged_events(caplog)
-        await until(lambda: not deployment_mark(state).exists(), what="the contracts to be saved", seconds=30)
-        made = chain.market.deployment.lighthouse
-    async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=program, state=state) as chain:
-        assert chain.market.deployment.lighthouse == made
+async def test_a_chain_is_kept_only_with_all_its_contracts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = tmp_path / "state.json"
+
+    def served() -> AbstractAsyncContextManager[DevelopmentChain]:
+        settings, anvil = Settings(data_dir=str(tmp_path)), require("anvil")
+        return serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=anvil, state=state)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(development, "STAKE", development.ALLOWANCE * 10**9)  # the last step of the deployment fails
+        with pytest.raises(AiraError):
+            await served().__aenter__()
+    assert not state.exists()
+    lighthouses = []
+    for _ in range(4):  # stopped at once each time
+        async with served() as chain:
+            lighthouses.append(chain.market.deployment.lighthouse)
+    assert lighthouses == [lighthouses[0]] * 4
 
 
 def test_without_a_copy_a_damaged_state_is_an_error_and_is_not_changed(tmp_path: Path) -> None:
