@@ -30,7 +30,7 @@ FIRST_TRIAL: Final = 3.0
 """Seconds at the first baud rate after the port was opened: opening it resets most boards, which takes almost two."""
 TRIAL: Final = 0.8
 """Seconds at each further baud rate."""
-LONGEST_TRIAL: Final = 5.0
+LONGEST_TRIAL: Final = 10.0
 """Seconds at a baud rate at which whole frames arrive, until the board has introduced itself."""
 SEARCH_AGAIN: Final = 15.0
 """Seconds without an answer in the protocol that was found, after which the search begins again."""

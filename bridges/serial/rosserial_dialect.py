@@ -107,11 +107,11 @@ class RosserialDialect(Dialect):
         due = self._next_expiry
         if self._active is not None:
             due = min(due, self._active.repeat_at, self._active.command.deadline)
-        if self._settled_at is not None:
-            due = min(due, self._settled_at)
         if self._listens_until is not None:
             due = min(due, self._listens_until)
-        if self._is_open and self._active is None:
+        if self._settled_at is not None:
+            due = min(due, self._settled_at)
+        elif self._is_open and self._active is None:
             quiet = self._last_heard + QUIET if self.info is not None else 0.0
             due = min(due, max(quiet, self._last_asked + ASK_INTERVAL))
         return due
@@ -151,7 +151,7 @@ class RosserialDialect(Dialect):
             self._finish(CallStatus.FAILED, "doubt", "the board did not read on", now)
         elif active is not None and active.repeat_at <= now:
             self._repeat_request(active, now)
-        if not self._is_open:
+        if not self._is_open or self._settled_at is not None:
             return
         quiet = self.info is None or self._last_heard + QUIET <= now
         if quiet and active is None and self._last_asked + ASK_INTERVAL <= now:
@@ -171,9 +171,7 @@ class RosserialDialect(Dialect):
         response_id = self._topics.response_id(topic)
         if response_id is None or len(payload) > self._topics.max_data(response_id):
             dropped = log_event("response-dropped", topic=topic.name, bytes=len(payload))
-            log.warning(
-                "the response on %s, %d bytes, does not fit the board's buffer", topic.name, len(payload), extra=dropped
-            )
+            log.warning("the response on %s, %d bytes, is too long", topic.name, len(payload), extra=dropped)
             return
         self._send(RosserialMessage(response_id, payload))
 
@@ -197,6 +195,8 @@ class RosserialDialect(Dialect):
             log.info("a message of the board can't be decoded: %s", error, extra=log_event("message-undecodable"))
 
     def _handle_announcement(self, kind: int, info: TopicInfo, now: float) -> None:
+        if self._topics.last is None:
+            self._ask_topics(now)  # to learn from the second answer where the first one ends
         if not self._topics.add(kind, info):
             self._lose_board("the board has other topics now")
             self._topics.add(kind, info)
@@ -210,9 +210,9 @@ class RosserialDialect(Dialect):
                 self._settle(now)
 
     def _settle(self, now: float) -> None:
-        """The announcements have ended."""
+        """The announcements have ended; if they have not been repeated yet, they are requested again."""
         self._settled_at = None
-        if self.info is None:
+        if self.info is None and self._topics.is_complete:
             self.info, self._last_announced = self._topics.device_info(), self._topics.last
             self._events.append(BoardReady(self.info))
         self._send_next(now)

@@ -114,13 +114,20 @@ class TopicTable:
         self._rejected: set[TopicInfo] = set()
         self.last: tuple[int, int] | None = None
         """The kind and id of the last announcement; a board announces in the same order each time."""
+        self._first: tuple[int, int] | None = None
+        self._final: tuple[int, int] | None = None
 
     def clear(self) -> None:
         """Forget the topics: another board may come."""
         self._topics.clear()
         self._response_ids.clear()
         self._buffers.clear()
-        self.last = None
+        self.last = self._first = self._final = None
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the last announcement is that after which the first one has come again: the board has no other."""
+        return self._final is not None and self.last == self._final
 
     def device_info(self) -> DeviceInfo:
         """What the board has reported about itself."""
@@ -128,7 +135,10 @@ class TopicTable:
 
     def add(self, kind: int, info: TopicInfo) -> bool:
         """Add an announced topic; false if it contradicts an earlier one. Invalid ones are left out with a warning."""
+        if (kind, info.id) == self._first:
+            self._final = self.last
         self.last = (kind, info.id)
+        self._first = self._first or self.last
         if (name := self._valid_name(info)) is None:
             return True
         self._buffers[info.id] = info.buffer

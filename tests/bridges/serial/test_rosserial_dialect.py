@@ -71,6 +71,12 @@ class Bench:
         """Receive a message of the board."""
         self.dialect.receive(encode_message(RosserialMessage(topic, data)), self.now)
 
+    def get_ready(self, *topics: tuple[int, bytes]) -> None:
+        """Receive announcements of all topics, twice: then the host knows that these are all."""
+        for _ in range(2):
+            self.announce(*topics)
+        self.after(SETTLE_TIME)
+
     def announce(self, *topics: tuple[int, bytes]) -> None:
         """Receive announcements of topics."""
         self.receive(TIME)
@@ -94,8 +100,7 @@ def ready(*topics: tuple[int, bytes], baud: int = 57_600) -> Bench:
     """A bench whose board is ready and has these topics."""
     bench = Bench(baud=baud)
     bench.dialect.opened(bench.now)
-    bench.announce(*(topics or TOPICS))
-    bench.after(SETTLE_TIME)
+    bench.get_ready(*(topics or TOPICS))
     [happening] = bench.dialect.events()
     assert isinstance(happening, BoardReady)
     bench.sent()
@@ -122,11 +127,32 @@ def test_a_board_is_ready_when_it_has_announced_its_topics() -> None:
 def test_a_slow_line_has_time_for_each_announcement() -> None:
     bench = Bench(baud=9_600)
     bench.dialect.opened(bench.now)
-    for topic in TOPICS:
+    assert bench.sent() == [RosserialMessage(PUBLISHER)]
+    topics = [(PUBLISHER, info(125 + number, f"t{number}", "std_msgs/String", STRING_MD5)) for number in range(15)]
+    requests = 0
+    for topic in topics * 2:
         assert bench.dialect.events() == []
         bench.announce(topic)
-        bench.after(0.12)  # which an announcement of 115 bytes takes
+        sent = bench.sent() + bench.after(0.12)  # which an announcement of 115 bytes takes
+        requests += sent.count(RosserialMessage(PUBLISHER))
+    assert requests == 1  # each one more would make the line busy for 1.8 s
     bench.after(1.0)
+    [happening] = bench.dialect.events()
+    assert isinstance(happening, BoardReady)
+    assert len(happening.info.topics) == len(topics)
+
+
+def test_a_board_that_pauses_between_its_topics_is_not_ready_before_it_has_announced_all() -> None:
+    bench = Bench()
+    bench.dialect.opened(bench.now)
+    bench.announce(CHATTER)
+    bench.after(1.0)
+    bench.announce(BLINK, HEAR)
+    assert RosserialMessage(PUBLISHER) in bench.after(1.0)
+    assert bench.dialect.events() == []
+    assert bench.dialect.next_tick > bench.now
+    bench.announce(*TOPICS)
+    bench.after(SETTLE_TIME)
     [happening] = bench.dialect.events()
     assert isinstance(happening, BoardReady)
     assert len(happening.info.topics) == len(TOPICS)
@@ -225,8 +251,7 @@ def test_commands_wait_for_an_absent_board_and_expire() -> None:
     assert isinstance(ended, CommandFinished)
     assert ended.reason == "expired"
     bench.dialect.opened(bench.now)
-    bench.announce(*TOPICS)
-    assert bench.after(SETTLE_TIME)[:0] == []
+    bench.get_ready(*TOPICS)
     assert later.begun
 
 
@@ -297,8 +322,7 @@ def test_a_request_of_the_board_is_delivered_and_its_response_sent() -> None:
 
 def test_other_topics_than_before_are_another_board() -> None:
     bench = ready()
-    bench.receive(SUBSCRIBER, info(101, "hear", "std_msgs/Empty", EMPTY_MD5))
-    bench.after(SETTLE_TIME)
+    bench.get_ready((SUBSCRIBER, info(101, "hear", "std_msgs/Empty", EMPTY_MD5)))
     gone, again = bench.dialect.events()
     assert isinstance(gone, BoardLost)
     assert isinstance(again, BoardReady)
@@ -353,8 +377,7 @@ def test_a_board_that_stays_silent_after_an_unplugged_cable_leaves_the_command_i
     assert isinstance(ended, CommandFinished)
     assert (ended.command, ended.reason) == (command, "doubt")
     assert sent == [RosserialMessage(PUBLISHER)]
-    bench.announce(*TOPICS)
-    bench.after(SETTLE_TIME)
+    bench.get_ready(*TOPICS)
     assert isinstance(bench.dialect.events()[0], BoardReady)
 
 
