@@ -116,11 +116,7 @@ async def working(
             chain = await enter(chain_of(settings, account))
         directory = await state_folder(settings, chain, account.address)
         ledger = await enter(Ledger(directory / LEDGER))
-        # What an earlier run has not read may have made contracts of orders that have expired meanwhile.
-        handled, _ = await ledger.cursor()
-        if handled is not None:
-            await _check_length(chain, handled)
-        chain_head = ChainHead(await chain.block_number() if handled is None else handled)
+        chain_head = ChainHead(await _handled(ledger, chain))
         network, channel = await enter(connected(settings, chain, chain_head, drops))
         store = await asyncio.to_thread(
             Store, directory.parent / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
@@ -146,13 +142,21 @@ async def working(
         yield parts
 
 
-async def _check_length(chain: Chain, handled: int) -> None:
-    """Raise `ChainWentBack` if the chain lacks blocks that were handled, and more than it may replace."""
+async def _handled(ledger: Ledger, chain: Chain) -> int:
+    """The last block that an agent has handled. Later ones may have made contracts of its orders, also of expired ones.
+
+    A new agent begins at the head, and remembers that before it posts an order. Raises `ChainWentBack` if the chain
+    lacks blocks that were handled, and more than it may replace.
+    """
     from mesh.chain import ChainWentBack
 
-    head = await chain.block_number()
+    (handled, _), head = await ledger.cursor(), await chain.block_number()
+    if handled is None:
+        await ledger.set_cursor(head)
+        return head
     if handled > head + chain.node.timing.reorg_depth:
         raise ChainWentBack(handled + 1, head)
+    return handled
 
 
 @asynccontextmanager

@@ -59,7 +59,7 @@ NEVER: Final = 2**63
 
 
 class ChainListener:
-    """Reads the chain for one agent. An agent that never ran begins at the head."""
+    """Reads the chain for one agent, from the position in its ledger on."""
 
     def __init__(self, parts: AgentComponents, trader: Trader, executor: Executor, *, on_phase: OnPhase) -> None:
         self._parts = parts
@@ -122,9 +122,7 @@ class ChainListener:
         """The first block to read, and the history of those before it."""
         depth = self._chain.node.timing.reorg_depth
         last, encoded = await self._ledger.cursor()
-        if last is None:
-            last = await self._chain.retrying(self._chain.block_number, outages=self._parts.outages)
-            await self._ledger.set_cursor(last)
+        assert last is not None, "the agent's components set it"
         history = History.decode(encoded) if encoded else History(depth)
         history.depth = depth  # the setting may have changed
         self._parts.chain_head.begin_after(last)

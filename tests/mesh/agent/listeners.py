@@ -98,6 +98,8 @@ async def opened(
     """The robot's listener, which does not run yet."""
     settings, account = place.settings("robot"), place.market.accounts["robot"]
     async with working(settings, account, chain or place.chains["robot"], drops=Drops()) as parts:
+        if (await ledger.cursor())[0] is None:
+            await ledger.set_cursor(parts.chain_head.head)
         yield kind(dataclasses.replace(parts, ledger=ledger))
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent import OrderClosed, OrderState
+from mesh.agent.listener import ChainListener
 from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, default_lifetime
 from mesh.chain import BlockHeader, InsufficientTokens
 from mesh.chain.answers import Count, Word
@@ -243,10 +244,13 @@ async def test_orders_are_valid_for_minutes(times: Any, blocks: float) -> None:
 
 
 async def test_an_order_that_became_a_contract_and_expired_while_its_program_was_away_is_not_forgotten(
-    place: Place,
+    place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with place.agent("person") as person:
-        order = await person.order(OBJECTIVE, cost=5, lifetime=4)
+    """Its program had not begun to read the chain."""
+    with monkeypatch.context() as patch:
+        patch.setattr(ChainListener, "run", lambda listener: asyncio.Event().wait())
+        async with place.agent("person") as person:
+            order = await person.order(OBJECTIVE, cost=5, lifetime=4)
     made = await created(place, order.message)
     await place.node.mine(5)
     async with place.agent("person") as person:
