@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.background import Background
+from mesh.content import ContentUnavailable
 from mesh.errors import AiraError, RemoteError
 from mesh.flood import FairQueue
 from mesh.recording import ABOUT, Played, RecordingAbout, open_objective
@@ -108,7 +109,7 @@ class Question:
         async with self._parts.channel.subscribe(Result) as results, Background() as tasks:
             tasks.start(self._receive(results), "answers")
             for _ in range(FETCHES):
-                tasks.start(self._fetch(answered), "fetch an answer")
+                tasks.start(self._fetch(results, answered), "fetch an answer")
             tasks.start(self._publish(terms), "ask")
             return await answered
 
@@ -127,17 +128,20 @@ class Question:
                 for dropped in self._arrived.put(result.signer, result):
                     self._parts.drops.count("answer-overflow", dropped.signer)
 
-    async def _fetch(self, answered: asyncio.Future[Answer]) -> None:
+    async def _fetch(self, results: Subscription[Result], answered: asyncio.Future[Answer]) -> None:
+        """Fetch one answer after another. One that nobody had is fetched once more when it is sent again."""
+        timeout = min(FETCH_TIMEOUT, self._parts.settings.fetch_timeout)
         while True:
             result = await self._arrived.get()
+            cid = result.message.result
             try:
-                path = await self._parts.exchange.fetch(
-                    result.message.result, size_limit=LARGEST, timeout=FETCH_TIMEOUT, sync=False
-                )
+                path = await self._parts.exchange.fetch(cid, size_limit=LARGEST, timeout=timeout, sync=False)
                 answer, demand = await asyncio.to_thread(read_answer, path, result)
             except AiraError as error:
+                if isinstance(error, ContentUnavailable):
+                    results.forget(result)
                 self._parts.drops.count("answer-unreadable", result.signer)
-                log.debug("%s of %s is no answer: %s", result.message.result, result.signer, error)
+                log.debug("%s of %s is no answer: %s", cid, result.signer, error)
                 continue
             if answer.values and demand in ("", *self._asked) and not answered.done():
                 answered.set_result(answer)

@@ -81,6 +81,16 @@ async def test_what_is_no_answer_is_passed_over_and_a_legacy_answer_is_taken(pla
     assert (answer.value, answer.result) == (String("0.5 1.0"), legacy)
 
 
+async def test_an_answer_that_nobody_had_is_fetched_when_it_is_sent_again(place: Place) -> None:
+    late = place.save(objective(("/measurements", "0.5 1.0")))
+    async with place.agent("robot") as robot, place.agent("person", fetch_timeout=0.1) as person:
+        asking, cid = asyncio.create_task(person.ask()), cid_of_bytes(late.read_bytes())
+        await answer_from(robot, person, cid, until=lambda: "answer-unreadable" in person.drops.totals())
+        await robot.add(late)
+        await answer_from(robot, person, cid, until=asking.done)
+        assert (await asking).result == cid
+
+
 async def test_only_the_named_agent_is_believed(place: Place) -> None:
     async with place.agent("robot") as robot, place.agent("provider") as other, place.agent("person") as person:
         cid = await other.add(place.save(objective(("/said", "by another"))))
