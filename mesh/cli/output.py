@@ -30,6 +30,7 @@ LARGEST_NUMBER: Final = 2**53
 SIZE_UNITS: Final = ("bytes", "KiB", "MiB", "GiB", "TiB")
 BAR_INTERVAL: Final = 0.1
 """Seconds between two updates of a progress bar."""
+SHOW_CURSOR: Final = "\x1b[?25h"
 PIPE_INTERVAL: Final = 0.5
 """Seconds between two checks whether stdout is still read."""
 
@@ -45,6 +46,8 @@ def run_sync(work: Callable[[], T]) -> T:
     except AiraError as error:
         fail(error)
     except KeyboardInterrupt:
+        if sys.stderr.isatty():  # a bar that is interrupted while it begins or ends leaves the cursor hidden
+            click.echo(SHOW_CURSOR, file=sys.stderr, nl=False)
         sys.exit(INTERRUPTED)
     finally:
         for number, handler in before.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import re
@@ -136,3 +137,22 @@ def test_ctrl_c_restores_the_cursor_and_leaves_no_file(large: Path) -> None:
     assert terminal.end() == INTERRUPTED
     assert terminal.shown.rindex(CURSOR_SHOWN) > terminal.shown.rindex(CURSOR_HIDDEN)
     assert os.listdir(large.parent) == [large.name]
+
+
+class InterruptedTerminal(io.StringIO):
+    """A terminal at which Ctrl-C is pressed when the cursor has just been hidden."""
+
+    def isatty(self) -> bool:
+        return True
+
+    def flush(self) -> None:
+        if self.getvalue().count(CURSOR_HIDDEN) == 1 and CURSOR_SHOWN not in self.getvalue():
+            raise KeyboardInterrupt
+
+
+def test_ctrl_c_while_a_bar_is_drawn_first_restores_the_cursor(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := InterruptedTerminal())
+    with pytest.raises(SystemExit) as ended:
+        main(["objective", "check", str(folder / "it.mcap")])
+    assert ended.value.code == INTERRUPTED
+    assert terminal.getvalue().endswith(CURSOR_SHOWN)
