@@ -1,7 +1,7 @@
 # Three images, each with only the parts of the project that it needs:
 #
 #   edge    a device on a serial line: no chain client, no HTTP server except for metrics
-#   server  router, provider, agent, person, operator, bridge (the default)
+#   server  router, provider, agent, person, operator, bridge, page (the default)
 #   chain   a server with anvil, and the script that makes the site of the demonstration
 #
 # The base needs Python 3.11 or later with its venv module (Debian: python3, python3-venv, ca-certificates).
@@ -63,7 +63,7 @@ COPY --from=server-environment /opt/aira /opt/aira
 FROM with-server AS chain
 USER root
 RUN install -d -o aira -g aira -m 0700 /chain /site \
- && for one in authority router router-north router-south provider agent edge bridge person operator; do \
+ && for one in authority router router-north router-south provider agent edge bridge page person operator; do \
         install -d -o aira -g aira -m 0700 "/site/$one"; \
     done
 COPY --from=foundry /usr/local/bin/anvil /usr/local/bin/anvil

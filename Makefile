@@ -113,7 +113,7 @@ COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --gen
 lock: ## update the locked versions (needs uv)
 	@$(COMPILE) --extra dev --output-file $(LOCK)
 	@$(COMPILE) --constraint $(LOCK) --extra serial --extra metrics --output-file requirements/edge.txt
-	@$(COMPILE) --constraint $(LOCK) --extra chain --extra identity --extra ipfs --extra metrics \
+	@$(COMPILE) --constraint $(LOCK) --extra chain --extra identity --extra ipfs --extra metrics --extra web \
 		--output-file requirements/server.txt
 
 clean: ## remove what the targets above have made here; the peers' cache stays

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 from contextlib import AsyncExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -72,10 +71,9 @@ def _address(settings: Settings) -> str | None:
 
     if not settings.tls_certificate:
         return own_address(settings)
-    from mesh.identity.certificates import facts_of, read_certificate
+    from mesh.identity.certificates import holder_address
 
-    path = Path(settings.tls_certificate).expanduser()
-    return facts_of(read_certificate(path), path).holder.address
+    return holder_address(settings.tls_certificate)
 
 
 async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:

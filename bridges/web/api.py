@@ -263,7 +263,7 @@ class Api:
 
     async def logs(self, request: web.Request) -> web.Response:
         options = self._server.options
-        if (options.token or options.operator_token) and self._server.role_of(request) != "operator":
+        if options.has_login and self._server.role_of(request) != "operator":
             raise OperatorsOnly("only operators read logs", hint="log in as an operator")
         level = request.query.get("level", "info")
         if level not in LEVELS:

@@ -19,10 +19,11 @@ from mesh.cli.output import announce
 from mesh.extras import needs_extra
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
+from mesh.starting import open_when_ready, serve_on_each_chain, wait_for_files
+from mesh.telemetry.serving import Telemetry
 from schemas import parse_cid
 
 if TYPE_CHECKING:
-    from bridges.web.components import WebComponents
     from bridges.web.options import WebOptions
     from mesh.settings import Settings
 
@@ -51,6 +52,7 @@ FILE = click.Path(dir_okay=False, path_type=Path)
     "erc20_token",
     "keyfile",
     "keyfile_password_file",
+    "roster",
     "blocked_signers",
     "objective_size_limit",
     "content_limit",
@@ -61,9 +63,9 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 def command(settings: Settings, **options: Any) -> None:
     """Serve a page on which people order work, watch it, and judge it. Ctrl-C stops it.
 
-    People sign with the wallet of their browser. With --keyfile the page can also order for that account: then whoever
-    reaches the page can spend its money. It listens on this machine only; other addresses need --certificate, --key
-    and --token-file.
+    People sign with the wallet of their browser. With --keyfile the page can also order for that account: then all who
+    reach the page can spend its money. It listens on this machine only; other addresses need --certificate, --key,
+    and a login: --token-file, or --roster for members of the site who show their certificate.
 
     --model or --robot makes a page with one button, for one robot, which other sites may show in a frame (--embed).
     """
@@ -71,25 +73,31 @@ def command(settings: Settings, **options: Any) -> None:
 
 
 async def serve(settings: Settings, options: dict[str, Any]) -> None:
-    """Serve until cancelled."""
+    """Serve until cancelled, also when a development chain is started afresh."""
+    async with Telemetry(settings.metrics_listen) as telemetry:
+        await serve_on_each_chain(settings, partial(_serve, options, telemetry))
+
+
+async def _serve(options: dict[str, Any], telemetry: Telemetry, settings: Settings) -> None:
     with needs_extra("web", "aira web"):
         from bridges.web.components import opened
         from bridges.web.server import PageServer
-    from mesh.starting import open_when_ready, wait_for_files
 
-    chosen = await asyncio.to_thread(web_options, options)
+    await wait_for_files(settings)
+    chosen = await asyncio.to_thread(web_options, settings, options)
     chosen.check()
     async with AsyncExitStack() as stack:
-        await wait_for_files(settings)
-        components: WebComponents = await open_when_ready(stack, settings, partial(opened, settings), role="web")
+        make = partial(opened, settings)
+        components = await open_when_ready(stack, settings, make, role="page", on_wait=telemetry.starting)
         server = await stack.enter_async_context(PageServer(components, chosen))
+        stack.enter_context(telemetry.showing(measure=server.measure, health=server.health))
         account = f", orders for {components.agent.address}" if components.agent else ""
         words = f"page        {server.url}{account}"
         announce(log, "page-started", words, url=server.url, zenoh=components.network.id)
         await asyncio.Event().wait()
 
 
-def web_options(options: dict[str, Any]) -> WebOptions:
+def web_options(settings: Settings, options: dict[str, Any]) -> WebOptions:
     """The options as the server takes them. Raises `InputError`, `InvalidListenAddress`."""
     from bridges.web.options import WebOptions
     from mesh.telemetry.health import listen_address
@@ -103,6 +111,8 @@ def web_options(options: dict[str, Any]) -> WebOptions:
         operator_token=_token(options["operator_token_file"]),
         certificate=str(options["certificate"] or ""),
         key=str(options["key"] or ""),
+        roster=settings.roster,
+        ca=settings.tls_ca,
         embed=options["embed"],
         robot=robot_of(options),
         explorer=options["explorer"],

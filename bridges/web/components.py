@@ -67,7 +67,8 @@ async def opened(
             folder, limit = settings.state_directory / "content", settings.objective_expanded_limit
             store = await asyncio.to_thread(Store, folder, limit=limit, quota=settings.content_limit)
             stack.callback(store.close)
-            exchange = await enter(Exchange(network.session, store, drops=drops))
+            holder = await asyncio.to_thread(_holder, settings)
+            exchange = await enter(Exchange(network.session, store, address=holder, drops=drops))
         yield WebComponents(
             settings=settings,
             network=network,
@@ -81,3 +82,12 @@ async def opened(
             lighthouse=await opened_chain.names.address(settings.lighthouse_contract),
             token=await opened_chain.names.address(settings.erc20_token),
         )
+
+
+def _holder(settings: Settings) -> str:
+    """Whose space on the site's routers is the server's own: its certificate's holder; empty without a certificate."""
+    if not settings.tls_certificate:
+        return ""
+    from mesh.identity.certificates import holder_address
+
+    return holder_address(settings.tls_certificate)

@@ -20,12 +20,15 @@ class WebOptions:
     host: str = "127.0.0.1"
     port: int = 8585
     names: tuple[str, ...] = ()
-    """Names besides its own address by which browsers reach it (`HOST` or `HOST:PORT`)."""
+    """Names besides its own address by which browsers reach it: `HOST` at any port, or `HOST:PORT`."""
     token: str = field(default="", repr=False)
     """What people log in with; empty: no login."""
     operator_token: str = field(default="", repr=False)
     certificate: str = ""
     key: str = ""
+    roster: str = ""
+    """The site's roster: members who show a certificate of `ca` need no token, and its operators are operators."""
+    ca: str = ""
     embed: tuple[str, ...] = ()
     """Origins that may show the page in a frame."""
     robot: dict[str, Any] | None = None
@@ -36,13 +39,20 @@ class WebOptions:
 
     def check(self) -> None:
         """Raise `NotOpenToOthers` for a server that other machines can reach without TLS and login."""
-        if is_loopback(self.host):
-            return
-        if not (self.certificate and self.key and (self.token or self.operator_token)):
+        if self.roster and not (self.certificate and self.key and self.ca):
+            raise NotOpenToOthers(
+                "members of a roster log in by TLS", hint="with --roster give --certificate, --key and --tls-ca"
+            )
+        if not is_loopback(self.host) and not (self.certificate and self.key and self.has_login):
             raise NotOpenToOthers(
                 f"other machines can reach {self.host}: that needs TLS and a login",
-                hint="give --certificate, --key and --token-file, or listen on 127.0.0.1",
+                hint="give --certificate, --key and --token-file or --roster, or listen on 127.0.0.1",
             )
+
+    @property
+    def has_login(self) -> bool:
+        """Whether people, or operators only, can log in."""
+        return bool(self.token or self.operator_token or self.roster)
 
 
 def is_loopback(host: str) -> bool:

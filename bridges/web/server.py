@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
 import logging
 import re
-import secrets
-import ssl
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 import msgspec
 from aiohttp import web
 
-from bridges.web.answers import answer, body_of
+from bridges.web.answers import answer
 from bridges.web.api import Api
 from bridges.web.errors import (
     InvalidRequest,
@@ -29,15 +25,18 @@ from bridges.web.errors import (
 )
 from bridges.web.files import Files
 from bridges.web.jobs import Views
+from bridges.web.logins import Logins
 from bridges.web.market import Market
 from bridges.web.options import is_loopback
 from bridges.web.orders import OrderPublisher
 from bridges.web.stream import Stream
+from mesh.agent.status import WatcherStatus
 from mesh.background import Background
 from mesh.errors import AiraError
-from mesh.flood import BoundedDict, Rate, RateLimiter
+from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
 from mesh.role import Lifecycle
+from schemas.status import ALIVE
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -45,22 +44,18 @@ if TYPE_CHECKING:
 
     from bridges.web.components import WebComponents
     from bridges.web.options import WebOptions
+    from mesh.telemetry.metrics import MetricFamily
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 log = logging.getLogger(__name__)
 
 OWN_HEADER: Final = "X-Aira-Request"
-COOKIE: Final = "aira_session"
 REQUESTS: Final = Rate(per_second=50, burst=400)
 """Requests of one address."""
 REQUESTS_IN_TOTAL: Final = Rate(per_second=500, burst=2000)
-LOGINS: Final = Rate(per_second=0.2, burst=10)
-"""Attempts to log in, of one address."""
-SESSIONS: Final = 1024
 LONGEST_BODY: Final = 1 << 18
 """Bytes of a body that is no objective."""
-SESSION_SECONDS: Final = 12 * 3600.0
 AGENTS_INTERVAL: Final = 3.0
 """Seconds between two lists of agents on the stream."""
 VIEWERS: Final = ("https://app.foxglove.dev",)
@@ -84,11 +79,11 @@ class PageServer(Lifecycle):
         self.files = Files(components)
         self.views = Views(components, self.market, self.files)
         self.publisher = OrderPublisher(components, self.market)
+        self._status = WatcherStatus(components.network, components.channel, components.drops)
         self.url = ""
         self._hosts: frozenset[str] = frozenset()
+        self._logins = Logins(options)
         self._limiter = RateLimiter(per_sender=REQUESTS, total=REQUESTS_IN_TOTAL)
-        self._logins = RateLimiter(per_sender=LOGINS)
-        self._sessions: BoundedDict[str, tuple[str, float]] = BoundedDict(SESSIONS)
         self._chain_asked = float("-inf")
         self._has_chain = True
 
@@ -100,25 +95,33 @@ class PageServer(Lifecycle):
         tasks.start(self._show_agents(), "page: agents")
         tasks.start(self.components.drops.run(), "page: drops")
         app = web.Application(middlewares=[self._guarded], client_max_size=LONGEST_BODY)
-        app.add_routes([*Api(self).routes(), web.post("/api/v1/session", self._log_in)])
+        app.add_routes([*Api(self).routes(), web.post("/api/v1/session", self._logins.log_in)])
         app.router.add_get("/{path:.*}", self._static)
         app.on_shutdown.append(lambda _: self.stream.close())
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0)
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
-        site = web.TCPSite(runner, self.options.host, self.options.port, ssl_context=self._tls())
+        site = web.TCPSite(runner, self.options.host, self.options.port, ssl_context=self._logins.tls())
         await site.start()
         port = runner.addresses[0][1]
         host = f"[{self.options.host}]" if ":" in self.options.host else self.options.host
         self.url = f"{'https' if self.options.certificate else 'http'}://{host}:{port}"
-        own = {f"{host}:{port}", *(name if ":" in name else f"{name}:{port}" for name in self.options.names)}
+        own = {f"{host}:{port}"}
         if is_loopback(self.options.host):
             own |= {f"{name}:{port}" for name in ("localhost", "127.0.0.1", "[::1]")}
-        self._hosts = frozenset(own | set(self.options.names))
+        self._hosts = frozenset(own)
 
     def role_of(self, request: web.Request) -> str:
         """`operator` or `anybody`: what the session of a request may do."""
-        return self._session_of(request) or "anybody"
+        return self._logins.role_of(request) or "anybody"
+
+    async def measure(self) -> tuple[MetricFamily, ...]:
+        """Its metrics now."""
+        return await self._status.measure(())
+
+    def health(self) -> dict[str, str]:
+        """The state of its parts."""
+        return {**self._status.health(), "chain": ALIVE if self._has_chain else "waits for the node"}
 
     async def has_chain(self) -> bool:
         """Whether the node answers; asked once in three seconds."""
@@ -164,18 +167,23 @@ class PageServer(Lifecycle):
         if not self._limiter.allow(sender):
             self.components.drops.count("page-request", sender)
             raise TooManyRequests("too many requests", hint="wait a moment")
-        if request.host not in self._hosts:
+        if not self._is_own(request.host):
             raise WrongHost(f"this server is not {request.host[:80]!r}", hint="name it with --name")
         if not _is_viewer(request):
             self._check_site(request)
         is_api = request.path.startswith("/api/") or request.path == "/rpc"
-        if is_api and request.path not in OPEN_PATHS and self._needs_login and self._session_of(request) is None:
+        if (
+            is_api
+            and request.path not in OPEN_PATHS
+            and self._logins.is_needed
+            and self._logins.role_of(request) is None
+        ):
             raise LoginRequired("log in first", hint="the token is in the server's token file")
 
     def _check_site(self, request: web.Request) -> None:
         """Refuse pages of other sites."""
         origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc not in self._hosts:
+        if origin is not None and urlsplit(origin).netloc != request.host:
             raise WrongOrigin("pages of other sites may not use this server")
         is_api = request.path.startswith("/api/") or request.path == "/rpc"
         if is_api and request.headers.get("Sec-Fetch-Site") == "cross-site":
@@ -186,31 +194,9 @@ class PageServer(Lifecycle):
             if request.content_type not in ("application/json", "application/octet-stream"):
                 raise InvalidRequest("a body is application/json, or application/octet-stream for an objective")
 
-    @property
-    def _needs_login(self) -> bool:
-        return bool(self.options.token) or not is_loopback(self.options.host)
-
-    def _session_of(self, request: web.Request) -> str | None:
-        """The role of a request's session; None if it has none."""
-        role, until = self._sessions.get(request.cookies.get(COOKIE, ""), ("", 0.0))
-        return role if time.monotonic() < until else None
-
-    async def _log_in(self, request: web.Request) -> web.Response:
-        if not self._logins.allow(request.remote or ""):
-            raise TooManyRequests("too many attempts to log in", hint="wait a minute")
-        given = (await body_of(request, LoginRequest)).token.encode()
-        roles = (("operator", self.options.operator_token), ("anybody", self.options.token))
-        role = next((name for name, token in roles if token and hmac.compare_digest(token.encode(), given)), None)
-        if role is None:
-            raise LoginRequired("this is not the token")
-        session = secrets.token_urlsafe(32)
-        self._sessions[session] = role, time.monotonic() + SESSION_SECONDS
-        response = answer({"role": role})
-        secure = bool(self.options.certificate)
-        response.set_cookie(
-            COOKIE, session, max_age=int(SESSION_SECONDS), httponly=True, samesite="Strict", secure=secure
-        )
-        return response
+    def _is_own(self, host: str) -> bool:
+        """Whether a request for this host is meant for this server: a name without a port is one at any port."""
+        return host in self._hosts or not {host, host.rpartition(":")[0]}.isdisjoint(self.options.names)
 
     def _headers(self) -> dict[str, str]:
         frames = " ".join(self.options.embed) or "'none'"
@@ -239,6 +225,7 @@ class PageServer(Lifecycle):
         last: bytes = b""
         while True:
             await asyncio.sleep(AGENTS_INTERVAL)
+            await self.has_chain()
             if not self.stream.has_subscribers("agents"):
                 continue
             try:
@@ -249,19 +236,6 @@ class PageServer(Lifecycle):
             if (text := msgspec.json.encode(agents)) != last:
                 last = text
                 self.stream.publish("agents", "agents", agents)
-
-    def _tls(self) -> ssl.SSLContext | None:
-        if not self.options.certificate:
-            return None
-        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-        context.load_cert_chain(Path(self.options.certificate).expanduser(), Path(self.options.key).expanduser())
-        return context
-
-
-class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A token to log in with."""
-
-    token: str
 
 
 _VIEWER_HEADERS: Final = {

@@ -4,7 +4,8 @@
 # The same commands create your own site; see docs/sites.md.
 #
 #   /site/authority  the site's certificate and key; not shared with anyone
-#   /site/MEMBER     ca.pem, identity.pem, identity.key; roster.toml of routers; account.json and password of who signs
+#   /site/MEMBER     ca.pem, identity.pem, identity.key; roster.toml of routers; account.json and password of who signs;
+#                    browser.token of the page
 #   /chain           the development chain's keyfiles, which it writes when it has its contracts
 #
 # ROUTERS are the names of the routers, which are also their host names.
@@ -58,6 +59,8 @@ for router in $routers; do
 done
 member operator operator --address "$(some_address)"
 member bridge bridge --address "$(some_address)"
+member page person --role operator --host page --host localhost --host 127.0.0.1 --address "$(some_address)"
+od -An -tx1 -N16 /dev/urandom | tr -d ' \n' > "$work/page/browser.token"
 
 until [ -s "$keys/person.json" ]; do
     [ -n "${said:-}" ] || echo "  waiting for the chain, which has the accounts"
@@ -79,7 +82,7 @@ done
 for router in $routers; do
     cp "$work/roster.toml" "$work/$router/"
 done
-for one in authority $routers provider agent person edge bridge operator; do
+for one in authority $routers provider agent person edge bridge page operator; do
     hand_over "$one"
 done
 date -u +"made %Y-%m-%d %H:%M:%S UTC, certificates for 90 days" > "$made"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,6 +16,8 @@ from mesh.running import fail, report
 from mesh.settings import NetworkSettings, options_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.identity.certificates import CertificateFacts
     from mesh.identity.folders import SiteFolder
     from mesh.identity.roster import Member
@@ -154,10 +155,9 @@ def _own_address(settings: Settings) -> str:
     """The address in the settings' certificate."""
     if not settings.tls_certificate:
         raise IdentityMissing("no certificate is set", hint="give --tls-ca, --tls-certificate and --tls-key")
-    from mesh.identity.certificates import facts_of, read_certificate
+    from mesh.identity.certificates import holder_address
 
-    path = Path(settings.tls_certificate).expanduser()
-    return facts_of(read_certificate(path), path).holder.address
+    return holder_address(settings.tls_certificate)
 
 
 def _create_member(

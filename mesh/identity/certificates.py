@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.errors import InputError, InvalidAddress
@@ -26,7 +27,6 @@ with needs_extra("identity", "a certificate"):
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     Key = ec.EllipticCurvePrivateKey
 
@@ -130,6 +130,12 @@ def facts_of(certificate: x509.Certificate, path: Path) -> CertificateFacts:
         until=certificate.not_valid_after_utc,
         fingerprint=certificate.fingerprint(hashes.SHA256()).hex(),
     )
+
+
+def holder_address(file: str) -> str:
+    """The address (lower case) of the holder of a member's certificate in a PEM file. Raises `IdentityError`."""
+    path = Path(file).expanduser()
+    return facts_of(read_certificate(path), path).holder.address
 
 
 def certificate_bytes(certificate: x509.Certificate) -> bytes:

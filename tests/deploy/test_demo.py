@@ -1,19 +1,22 @@
 from __future__ import annotations
 
 import json
+import ssl
 from typing import TYPE_CHECKING
 
 import pytest
+from aiohttp import ClientSession, CookieJar, TCPConnector
 from eth_keyfile.keyfile import decode_keyfile_json
 
 from tests.support.deployment import ComposeDeployment, Images
+from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 pytestmark = pytest.mark.compose
 
-SERVICES = ("setup", "chain", "router", "provider", "agent", "person")
+SERVICES = ("setup", "chain", "router", "provider", "agent", "page", "person")
 
 
 @pytest.fixture(scope="module")
@@ -46,11 +49,31 @@ async def test_services_run_with_minimal_rights(demo: ComposeDeployment) -> None
         assert facts["EffectiveCaps"] in (None, []), service
         assert not facts["HostConfig"]["Privileged"], service
         assert "no-new-privileges" in " ".join(facts["HostConfig"]["SecurityOpt"]), service
-    for service in ("router", "provider", "agent", "chain"):
+    for service in ("router", "provider", "agent", "page", "chain"):
         assert demo.execute(service, "id", "-u") == "10001\n"
         assert demo.execute(service, "sh", "-c", "touch /usr/local/bin/mine 2>&1 || true").endswith(
             "Read-only file system\n"
         )
+
+
+async def test_the_page_shows_the_job_to_who_logs_in(demo: ComposeDeployment) -> None:
+    await demo.ready()
+    context = ssl.create_default_context(cadata=demo.execute("page", "cat", "/secrets/ca.pem"))
+    url = f"https://{demo.address('page')}:8585/api/v1"
+    headers = {"Host": "localhost:8585", "X-Aira-Request": "1"}
+    connector = TCPConnector(ssl=context)
+    async with ClientSession(connector=connector, headers=headers, cookie_jar=CookieJar(unsafe=True)) as browser:
+        async with browser.get(f"{url}/liabilities", server_hostname="localhost") as closed:
+            assert closed.status == 401
+        token = demo.execute("page", "cat", "/secrets/browser.token")
+        async with browser.post(f"{url}/session", json={"token": token}, server_hostname="localhost") as answer:
+            assert (await answer.json())["role"] == "anybody"
+
+        async def paid() -> bool:
+            async with browser.get(f"{url}/liabilities", server_hostname="localhost") as answer:
+                return [job["state"] for job in (await answer.json())["liabilities"]] == ["paid"]
+
+        await until_found(paid, what="the job on the page")
 
 
 async def test_no_key_and_no_password_is_in_an_environment_a_command_line_or_a_log(demo: ComposeDeployment) -> None:

@@ -109,13 +109,20 @@ def test_a_service_gets_only_its_own_secrets_and_read_only() -> None:
             if "secrets" in mount and name != "setup":
                 assert mount.endswith("-secrets}:/secrets:ro"), f"{name}: {mount}"
                 assert seen.setdefault(mount, name) == name
-    assert len(seen) == 7
+    assert len(seen) == 8
 
 
 def test_no_port_is_open_to_other_machines_by_default() -> None:
     for name, service in services().items():
         for port in service.get("ports", []):
             assert re.fullmatch(r"\$\{MESH_\w+_PORT:-127\.0\.0\.1::\d+\}", port), f"{name}: {port}"
+
+
+def test_the_page_is_served_by_tls_to_those_who_log_in() -> None:
+    words = services()["page"]["command"]
+    for option in ("--certificate", "--key", "--token-file"):
+        (value,) = [word.partition("=")[2] for word in words if word.startswith(f"{option}=")]
+        assert value.startswith("/secrets/"), option
 
 
 def test_no_volume_name_is_a_prefix_of_another() -> None:
