@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from mesh.network import Reading
     from mesh.recording import Objective, Played, Recorder, RecordingAbout, open_objective, pack
+    from mesh.ros import RosTypes, UnknownRosType
     from mesh.running import fail, run_to_end
     from mesh.settings import Settings
     from mesh.work.ledger import WrongPhase
@@ -77,6 +78,7 @@ _NAMES: Final = {
     ),
     "mesh.network": "Reading",
     "mesh.recording": "Objective Played Recorder RecordingAbout open_objective pack",
+    "mesh.ros": "RosTypes UnknownRosType",
     "mesh.running": "fail run_to_end",
     "mesh.settings": "Settings",
     "mesh.work.job": "Job JobFailed",
@@ -156,9 +158,11 @@ __all__ = [
     "RecordingAbout",
     "RemoteError",
     "Result",
+    "RosTypes",
     "Settings",
     "String",
     "Unanswered",
+    "UnknownRosType",
     "ValueSchema",
     "Verified",
     "WrongPhase",

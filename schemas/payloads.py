@@ -98,7 +98,7 @@ class String(Struct, frozen=True):
 
 EMPTY: Final = Empty.type
 STRING: Final = String.type
-JSON: Final = PayloadType("json", "", "jsonschema", b'{"type":"object"}')
+JSON: Final = PayloadType("json", "", "jsonschema", b'{"type":"object","properties":{}}')
 RAW: Final = PayloadType("application/octet-stream")
 
 _NUMERIC: Final = {

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 ROOT: Final = Path(__file__).parents[1]
 PACKAGES: Final = ("schemas", "mesh", "bridges")
-SHARED: Final[dict[str, str]] = {}
+SHARED: Final = {"Log": "the name that Ethereum gives an entry of a receipt, and Foxglove a line of a log"}
 """Class names that are defined in several modules on purpose, each with the reason."""
 LEVELS: Final = frozenset({"info", "warning", "error", "exception", "critical"})
 KEBAB: Final = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")

@@ -13,9 +13,9 @@ from mesh.errors import InputError
 from mesh.log_context import log_event
 from mesh.network import ReadingSubscription, sending
 from mesh.network.readings import LARGEST_READING
+from mesh.recording import encode_described
 from schemas import Result, parse_address
 from schemas.agent_keys import ReadingKey
-from schemas.payloads import encode_value
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -105,7 +105,7 @@ class ReadingAgent(TradingAgent):
 
 def _encoded(topic: str, value: object) -> tuple[bytes, PayloadType]:
     """The payload of a reading and its type. Raises `InvalidPayload`, `ReadingTooLarge`."""
-    payload, kind = encode_value(value)
+    payload, kind = encode_described(value)
     if len(payload) > LARGEST_READING:
         raise ReadingTooLarge(topic, len(payload))
     return payload, kind

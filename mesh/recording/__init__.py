@@ -9,7 +9,7 @@ from mesh.recording.errors import (
     RecordingTooLarge,
     Unrecordable,
 )
-from mesh.recording.json_schemas import JsonSchemas, is_described, json_type
+from mesh.recording.json_schemas import JsonSchemas, encode_described, json_type
 from mesh.recording.limits import GENEROUS, Limits
 from mesh.recording.objective import (
     ChannelMessage,

@@ -8,7 +8,8 @@ from typing import Any, Final
 
 import msgspec
 
-from schemas.payloads import JSON, PayloadType
+from mesh import foxglove
+from schemas.payloads import JSON, PayloadType, encode_value
 
 LONGEST: Final = 64 << 10
 """Bytes of a message from which a schema is inferred."""
@@ -18,6 +19,7 @@ CHANGES: Final = 32
 """How often the schema of a topic changes; messages that don't fit the last one get none."""
 DEPTH: Final = 8
 PROPERTIES: Final = 256
+_KINDS: Final = {int: "integer", str: "string"}
 _DECODER: Final = msgspec.json.Decoder()
 
 
@@ -32,17 +34,18 @@ def json_type(kind: type[Any]) -> PayloadType:
         (root,), definitions = msgspec.json.schema_components((kind,), ref_template="#/$defs/{name}")
     except TypeError:
         return JSON
-    schema = definitions.get(root.get("$ref", "").rpartition("/")[2], root)
-    if schema.get("type") != "object":
+    schema = _viewable(root, definitions)
+    if schema is None or schema["type"] != "object":
         return JSON
-    alone = _encoded(schema)
-    data = _encoded({**schema, "$defs": definitions}) if b'"$ref"' in alone else alone
-    return PayloadType("json", getattr(kind, "schema_name", kind.__name__), "jsonschema", data)
+    return PayloadType("json", getattr(kind, "schema_name", kind.__name__), "jsonschema", _encoded(schema))
 
 
-def is_described(kind: type[Any]) -> bool:
-    """Whether `kind` is a class with named fields: a msgspec Struct or a dataclass."""
-    return issubclass(kind, msgspec.Struct) or is_dataclass(kind)
+def encode_described(value: object) -> tuple[bytes, PayloadType]:
+    """As `encode_value`, with the name and schema of a Struct or dataclass in the type. Raises `InvalidPayload`."""
+    payload, kind = encode_value(value)
+    declared: Any = type(value)
+    is_described = issubclass(declared, msgspec.Struct) or is_dataclass(declared)
+    return payload, json_type(declared) if kind == JSON and is_described else kind
 
 
 class JsonSchemas:
@@ -59,6 +62,8 @@ class JsonSchemas:
         """The type of a message with a schema that fits; the same type if it has one already, or none is found."""
         if type.encoding != "json" or (type.schema_data and type.schema_data != JSON.schema_data):
             return type
+        if type.schema_name in foxglove.KINDS:
+            return json_type(foxglove.KINDS[type.schema_name])
         key = (topic, type.schema_name)
         if len(payload) > LONGEST or (key not in self._known and len(self._known) >= TOPICS):
             return type
@@ -94,7 +99,8 @@ class _TopicSchema:
         return True
 
     def _type(self) -> PayloadType:
-        return PayloadType("json", self._name, "jsonschema", _encoded(self._schema))
+        schema = _viewable(self._schema, {}) or self._schema
+        return PayloadType("json", self._name, "jsonschema", _encoded(schema))
 
 
 def _schema_of(value: Any, depth: int = DEPTH) -> dict[str, Any]:
@@ -135,6 +141,36 @@ def _merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
             items = [schema["items"] for schema in (one, other) if "items" in schema]
             return {"type": "array", "items": reduce(_merged, items)}
     return {}
+
+
+def _viewable(schema: Any, definitions: dict[str, Any], inside: tuple[str, ...] = ()) -> dict[str, Any] | None:
+    """A schema in the form that viewers read: no references, one type for each property. None if it has no such form.
+
+    Viewers refuse a topic whose schema has another form, so a property without that form is left out: all values fit.
+    """
+    match schema:
+        case {"$ref": str(reference)}:
+            name = reference.rpartition("/")[2]
+            return None if name in inside else _viewable(definitions[name], definitions, (*inside, name))
+        case {"enum": [*values]}:
+            kinds = {_KINDS.get(type(value), "") for value in values}
+            return {**schema, "type": kinds.pop()} if kinds in ({"integer"}, {"string"}) else None
+        case {"type": "object"}:
+            members = (
+                (name, _viewable(one, definitions, inside)) for name, one in schema.get("properties", {}).items()
+            )
+            found = {name: member for name, member in members if member is not None}
+            kept = {name: schema[name] for name in ("title", "description", "required") if name in schema}
+            return {**kept, "type": "object", "properties": found}
+        case {"type": "array", "prefixItems": [first, *others]} if all(one == first for one in others):
+            return _viewable({"type": "array", "items": first}, definitions, inside)
+        case {"type": "array", "items": dict(items)}:
+            item = _viewable(items, definitions, inside)
+            is_simple = item is not None and item["type"] != "array" and "contentEncoding" not in item
+            return {**schema, "items": item} if is_simple else None
+        case {"type": "number" | "integer" | "string" | "boolean"}:
+            return dict(schema)
+    return None
 
 
 def _encoded(schema: dict[str, Any]) -> bytes:

@@ -18,6 +18,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from mesh.recording.errors import Unrecordable
+from schemas.payloads import JSON
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -32,7 +33,6 @@ CHUNK_SIZE: Final = 128 << 10
 MAX_CHANNELS: Final = 0xFFFF
 MAX_TIME: Final = (1 << 64) - 1
 
-_JSON_SCHEMA: Final = b'{"type":"object"}'
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELDS: Final = _MESSAGE.size - 9
 _INDEX: Final = struct.Struct("<BQHI")
@@ -179,7 +179,7 @@ class McapWriter:
         """The number of a type's schema; 0, which means none, for bytes of no known type."""
         key = (type.schema_name, type.schema_encoding, type.schema_data)
         if type.encoding == "json" and not type.schema_data:
-            key = (type.schema_name, "jsonschema", _JSON_SCHEMA)
+            key = (type.schema_name, JSON.schema_encoding, JSON.schema_data)
         elif not any(key):
             return 0
         known = self._known_schemas.get(key)

@@ -24,7 +24,7 @@ import msgspec
 
 from mesh.content.files import atomic_file
 from mesh.errors import InputError, InvalidKey
-from mesh.recording.json_schemas import JsonSchemas
+from mesh.recording.json_schemas import JsonSchemas, encode_described
 from mesh.recording.limits import Limits
 from mesh.recording.mcap_writer import MAX_TIME, McapWriter
 from mesh.recording.objective import Played, open_source
@@ -129,8 +129,8 @@ def pack_values(
     time_ns: int = 0,
     metadata: Mapping[str, Mapping[str, str]] | None = None,
 ) -> PackSummary:
-    """Write values on topics to an MCAP file, in their order, all at one time. Raises also as `encode_value` does."""
-    encoded = ((topic_chunks(topic), encode_value(value)) for topic, value in values)
+    """Write values on topics to an MCAP file, in order, all at one time. Raises also as `encode_described` does."""
+    encoded = ((topic_chunks(topic), encode_described(value)) for topic, value in values)
     messages = (Played(topic, payload, time_ns, time_ns, 0, kind) for topic, (payload, kind) in encoded)
     return pack(messages, target, metadata=metadata)
 

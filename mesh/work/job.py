@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.errors import AiraError, ClosedError
 from mesh.network import sending
-from mesh.recording import is_described, json_type
+from mesh.recording import encode_described
 from mesh.work.listening import JobMessages
 from schemas.agent_keys import LiabilityTopicKey, topic_chunks
-from schemas.payloads import JSON, PayloadType, encode_value, payload_type
+from schemas.payloads import PayloadType, payload_type
 
 if TYPE_CHECKING:
     import zenoh
@@ -53,11 +53,8 @@ class Job:
         a dict or Struct, which become JSON), and `ClosedError` before the job runs and after it has ended.
         """
         self._check_running()
-        payload, kind = encode_value(message)
+        payload, kind = encode_described(message)
         key = str(LiabilityTopicKey(self._agent, self.liability.address, topic))
-        declared: Any = type(message)
-        if kind == JSON and is_described(declared):
-            kind = json_type(declared)
         if payload_type(kind.zenoh_encoding) != kind:  # only its name travels
             self._types[topic, kind.zenoh_encoding] = kind
         self._put(key, payload, kind)

@@ -54,7 +54,7 @@ async def test_a_handler_and_an_iterator_hear_what_an_agent_publishes(place: Pla
     assert {(reading.agent, reading.topic, reading.result) for reading in seen} == {
         (place.address("robot"), "/battery", "")
     }
-    assert (pose.topic, pose.value) == ("/pose", {"x": 1.5})
+    assert (pose.topic, pose.value, pose.type.schema_name) == ("/pose", {"x": 1.5}, "Pose")
 
 
 async def test_what_cannot_be_a_reading_is_refused_at_once(place: Place) -> None:

@@ -87,10 +87,10 @@ def test_every_channel_has_schema_times_and_role(tmp_path: Path) -> None:
     assert described[::2] == [
         ("ros1", "std_msgs/Empty", "ros1msg", b""),
         ("ros1", "std_msgs/String", "ros1msg", b"string data\n"),
-        ("json", "", "jsonschema", b'{"type":"object"}'),
+        ("json", "", "jsonschema", JSON.schema_data),
         ("application/octet-stream", "", "", b""),
         ("ros1", "my/Type", "", b""),
-        ("json", "Led", "jsonschema", b'{"type":"object"}'),
+        ("json", "Led", "jsonschema", JSON.schema_data),
     ]
     assert [channel.metadata["role"] for _, channel, _ in found] == ["objective", "device"] * 6
     assert all(message.log_time == message.publish_time > T0 for _, _, message in found)

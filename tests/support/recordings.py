@@ -1,0 +1,51 @@
+"""Reading recordings as other programs do: with the decoders of the `mcap` packages."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from mcap.decoder import DecoderFactory
+from mcap.reader import make_reader
+from mcap_ros1.decoder import DecoderFactory as Ros1Decoders
+from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from mcap.records import Schema
+
+
+class JsonDecoders(DecoderFactory):
+    """Decodes JSON, and refuses schemas that viewers refuse."""
+
+    def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
+        if message_encoding != "json":
+            return None
+        assert schema is not None
+        check_viewable(json.loads(schema.data))
+        return json.loads
+
+
+def decoded(path: Path) -> list[tuple[str, Any]]:
+    """Each message of an MCAP file: its topic, and the message. Raises if there is no decoder for one."""
+    with path.open("rb") as stream:
+        reader = make_reader(
+            stream, validate_crcs=True, decoder_factories=[JsonDecoders(), Ros1Decoders(), Ros2Decoders()]
+        )
+        return [(one.channel.topic, one.decoded_message) for one in reader.iter_decoded_messages()]
+
+
+def check_viewable(schema: dict[str, Any]) -> None:
+    """Fail if a JSON Schema is none that Foxglove and Lichtblick read: each part has one type; lists hold no lists."""
+    assert schema["type"] == "object"
+    for part in schema["properties"].values():
+        if part["type"] == "array":
+            part = part["items"]
+            assert part["type"] != "array"
+            assert "contentEncoding" not in part
+        if part["type"] == "object":
+            check_viewable(part)
+        else:
+            assert part["type"] in ("boolean", "string", "number", "integer")
