@@ -89,5 +89,5 @@ async def test_jobs_from_before_and_after_an_outage_of_the_node_are_done(
             assert (await late.outcome()).success
             assert done == ["early", "late"]
             assert await person.parts.chain.tokens.balance(site.address("robot")) == before + 2 * (COST - FEE)
-            assert has_event(provider, "chain-recovered")
+            await until(lambda: has_event(provider, "chain-recovered"), what="the provider's recovery", seconds=TIMEOUT)
             assert not has_traceback(provider)
