@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from itertools import count
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from tests.bridges.ipfs.legacy import LegacyClient
 from tests.support.ipfs import JsIpfs, Kubo, LibraryNode
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator, Callable, Iterator
 
 KINDS: dict[str, type[JsIpfs | Kubo]] = {"js-ipfs": JsIpfs, "kubo": Kubo}
 _topics = count(1)
@@ -40,12 +41,23 @@ def kind(request: pytest.FixtureRequest) -> type[JsIpfs | Kubo]:
 
 
 @pytest.fixture(scope="session")
-def shared_swarm(kind: type[JsIpfs | Kubo]) -> Iterator[Swarm]:
-    """Two daemons, which no test stops."""
+def swarms() -> Iterator[Callable[[type[JsIpfs | Kubo]], Swarm]]:
+    """Starts two daemons of a kind, once: they outlive the tests of the other kind, and no test stops them."""
     with ExitStack() as stack:
-        with ThreadPoolExecutor(2) as starting:
-            a, b = starting.map(lambda daemon: stack.enter_context(daemon), (kind(), kind()))
-        yield Swarm(a, b)
+
+        @cache
+        def swarm_of(kind: type[JsIpfs | Kubo]) -> Swarm:
+            with ThreadPoolExecutor(2) as starting:
+                a, b = starting.map(lambda daemon: stack.enter_context(daemon), (kind(), kind()))
+            return Swarm(a, b)
+
+        yield swarm_of
+
+
+@pytest.fixture
+def shared_swarm(kind: type[JsIpfs | Kubo], swarms: Callable[[type[JsIpfs | Kubo]], Swarm]) -> Swarm:
+    """Two daemons, which no test stops."""
+    return swarms(kind)
 
 
 @pytest.fixture
