@@ -179,6 +179,8 @@ class ContentBridge:
         )
 
     async def _fetch(self, cid: str) -> Path:
+        if (held := await asyncio.to_thread(self._store.checked, cid)) is not None:
+            return held
         path = await self._sources.fetch(
             self._store,
             cid,

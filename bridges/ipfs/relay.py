@@ -186,7 +186,7 @@ class MessageRelay:
     def _record_arrival(self, fingerprint: bytes, side: Side, *, echo: bool) -> None:
         queue = self.queues[side]
         arrived = queue.arrived(fingerprint, now=self._clock())
-        if arrived:
+        if arrived and not echo:
             self.counts[side]["left"] += 1
         if not echo and queue.heard(fingerprint):
             self._journal.remove_waiting(fingerprint)

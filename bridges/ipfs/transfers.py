@@ -134,16 +134,13 @@ class ContentSources:
         block_timeout: float,
         found: Found = lambda cids: None,
     ) -> Path:
-        """Fetch a file into `store`, verifying each block; returns its path there.
+        """Fetch a file into `store`, which lacks it, verifying each block; returns its path there.
 
         `size_limit` is in bytes; `timeout` in seconds for the file, `block_timeout` for a block. `found` is called with
         the CIDs of its blocks as they are found. Blocks received are kept for the next attempt.
 
         Raises `ContentUnavailable`, `ContentTooLarge`, `ContentCorrupt`, `StoreFull`, `InvalidCid`.
         """
-        held = await asyncio.to_thread(store.checked, cid)
-        if held is not None:
-            return held
         with store.assemble(cid, size_limit=size_limit) as assembly:
             try:
                 async with asyncio.timeout(timeout):

@@ -191,7 +191,7 @@ class RelayValidator:
             return
         if (address := self._address()) is not None and order.lighthouse != address:
             raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
-        if order.deadline <= self.head():
+        if (head := self.head()) and order.deadline <= head:
             raise InvalidMessage("deadline", f"block {order.deadline} has passed")
 
 

@@ -283,7 +283,7 @@ class MessageValidator(Generic[M]):
             return True
         if isinstance(order, (Demand, Offer)) and order.sender is None and str(order.nonce).startswith(AMBIGUOUS_NONCE):
             raise InvalidMessage("nonce", "the contracts would take it for the sender of a generation-5 order")
-        if order.deadline <= self._head():
+        if (head := self._head()) and order.deadline <= head:
             raise InvalidMessage("deadline", f"block {order.deadline} has passed")
         if self._address is not None and order.lighthouse != self._address:
             raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")

@@ -102,6 +102,8 @@ async def test_a_file_on_ipfs_is_served_to_the_mesh_and_stored(
         assert path.read_bytes() == content
         await until(lambda: bridge.store.has(cid), what="the file in the bridge's store", seconds=SECONDS)
         await until(lambda: bridge.content.metrics().fetched == 1, seconds=SECONDS)
+        await bridge.content.fetch(cid)
+        assert bridge.content.metrics().fetched == 1, "it is held already"
 
 
 async def test_a_file_chunked_otherwise_is_verified_block_by_block(

@@ -96,6 +96,7 @@ def test_an_echo_before_the_daemons_answer_does_not_send_it_again(time: Time, jo
     assert relay.queues[Side.IPFS].next() is not None
     assert relay.receive(one, Side.IPFS, echo=True) is RelayOutcome.KNOWN
     assert send_all(relay, Side.IPFS) == []
+    assert relay.status(Side.IPFS, per_second=0).left == 0, "no other bridge sent it"
 
 
 @pytest.mark.parametrize("by_this_bridge", [True, False])

@@ -76,6 +76,7 @@ async def test_an_order_of_another_market_or_past_its_deadline_is_rejected() -> 
     assert await reason(validator, encode(demand(lighthouse="0x" + "11" * 20))) == "lighthouse"
     assert await reason(validator, encode(demand(deadline=100))) == "deadline"
     await validator.validate(encode(demand(deadline=101)))
+    await RelayValidator(MARKET).validate(encode(demand(deadline=0)))  # which block it is is not known
 
 
 async def test_an_order_is_relayed_once_its_validator_is_known_to_be_safe() -> None:
