@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     )
     from mesh.agent.answers import Answer, Unanswered
     from mesh.agent.own_model import ModelUnfit
+    from mesh.amounts import XRT
     from mesh.chain import InsufficientTokens, NodeUnreachable, NotALiability
     from mesh.content import ContentUnavailable
     from mesh.errors import (
@@ -71,6 +72,7 @@ _NAMES: Final = {
     "mesh.agent.own_model": "ModelUnfit",
     "mesh.agent.orders": "Order OrderState",
     "mesh.agent.progress": "Progress",
+    "mesh.amounts": "XRT",
     "mesh.chain": "InsufficientTokens NodeUnreachable NotALiability",
     "mesh.content": "ContentUnavailable",
     "mesh.errors": (
@@ -112,6 +114,7 @@ def _version() -> str:
 
 __all__ = [
     "STRING",
+    "XRT",
     "ZERO_ADDRESS",
     "Agent",
     "AiraError",

@@ -2,14 +2,14 @@
 
 import sys
 
-from mesh import Agent, Declined, Demand, Job, JobFailed, Verified, cid_of_file, run_to_end
+from mesh import XRT, Agent, Declined, Demand, Job, JobFailed, Verified, cid_of_file, run_to_end
 
 robot = Agent(cid_of_file(__file__))  # this program is the behaviour
 
 
 @robot.on_demand
 async def offer(demand: Verified[Demand]) -> None:
-    if demand.message.cost < 5 * 10**9:  # wn
+    if demand.message.cost < XRT.parse("5 XRT"):
         raise Declined("too-cheap", "a job costs 5 XRT")
     await robot.offer(demand)
 
@@ -32,9 +32,9 @@ def report() -> None:
 
 async def demand_two() -> None:
     async with Agent(robot.model) as client:
-        orders = [await client.order([("/lamp", True), ("/water", n)], cost=5 * 10**9) for n in (2.0, 99.0)]
-        for order in orders:
-            print((await (await order.contract()).outcome()).reason or "done", flush=True)
+        orders = [await client.order([("/lamp", True), ("/water", n)], cost="5 XRT") for n in (2.0, 99.0)]
+        print(*[(await (await order.contract()).outcome()).reason or "done" for order in orders], sep="\n")
 
 
-robot.run() if "robot" in sys.argv else run_to_end(demand_two)
+if __name__ == "__main__":
+    robot.run() if "robot" in sys.argv else run_to_end(demand_two)

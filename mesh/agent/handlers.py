@@ -150,6 +150,8 @@ class HandlerDecorators:
         try:
             reading_selector(agent, topic)
         except InvalidKey as error:
+            if error.text == agent:
+                raise RegistrationError(error.why, hint='write the address of an agent: agent="0x…"') from None
             raise InvalidTopic(error.text, error.why) from None
 
         def register(handler: G) -> G:

@@ -185,6 +185,11 @@ class Order:
     _traded: TradedOrder = field(repr=False, compare=False)
     _actions: OrderActions = field(repr=False, compare=False)
 
+    def __repr__(self) -> str:
+        terms = f"model={self.message.model}, objective={self.message.objective}, cost={self.message.cost}"
+        became = f", liability={self.liability}" if self.liability else ""
+        return f"Order({self.kind} {self.hash}, {self.state}, {terms}, deadline={self.deadline}{became})"
+
     @property
     def kind(self) -> str:
         """`demand` or `offer`."""

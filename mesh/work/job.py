@@ -45,6 +45,9 @@ class Job:
         self.playing: Played | None = None
         """The message that is being handled: its topic, times and type."""
 
+    def __repr__(self) -> str:
+        return f"Job({self.liability.address}, position={self.position}, topics={sorted(self.topics)})"
+
     def publish(self, topic: str, message: object) -> None:
         """Publish on a topic of the job, as a device does. The message becomes part of the recording.
 

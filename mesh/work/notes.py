@@ -6,6 +6,7 @@ A note is one line of text and the error's code, as in `the lamp is broken [job-
 from __future__ import annotations
 
 import re
+from traceback import format_exception_only
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.errors import AiraError
@@ -34,8 +35,9 @@ class Reason(NamedTuple):
 
 def note_of(error: Exception) -> str:
     """The note for an error that ended a job."""
-    code = error.code if isinstance(error, AiraError) else HANDLER_FAILED
-    return f"{str(error) or type(error).__name__} [{code}]"
+    if isinstance(error, AiraError):
+        return f"{str(error) or type(error).__name__} [{error.code}]"
+    return f"{''.join(format_exception_only(error)).strip()} [{HANDLER_FAILED}]"
 
 
 def read_reason(recording: Path) -> Reason:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import types
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Union, get_args, get_origin, get_type_hints
 
@@ -71,9 +72,12 @@ class MessageType:
             return value
         if self._converted is None or (isinstance(value, _NATIVE) and not isinstance(value, String)):
             raise InvalidPayload(_text(self.declared), f"it is {_described(value)}")
+        plain = value.data if isinstance(value, String) else value
         try:
-            return msgspec.convert(value.data if isinstance(value, String) else value, self._converted)
+            return msgspec.convert(plain, self._converted)
         except msgspec.ValidationError as error:
+            with suppress(msgspec.ValidationError):
+                return msgspec.convert(_whole(plain), self._converted)
             raise InvalidPayload(_text(self.declared), str(error)) from None
 
 
@@ -202,6 +206,18 @@ def _undecodable(info: msgspec.inspect.Type) -> Iterator[type]:
                 inner = one.type if isinstance(one, msgspec.inspect.Field) else one
                 if isinstance(inner, msgspec.inspect.Type):
                     pending.append(inner)
+
+
+def _whole(value: Any) -> Any:
+    """Data with each float that is an integer as an int: for JSON Schema, 5.0 is an integer."""
+    match value:
+        case float() if value.is_integer():
+            return int(value)
+        case list():
+            return [_whole(one) for one in value]
+        case dict():
+            return {name: _whole(one) for name, one in value.items()}
+    return value
 
 
 def _text(kind: Any) -> str:

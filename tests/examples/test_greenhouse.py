@@ -5,11 +5,13 @@ from __future__ import annotations
 import ast
 import asyncio
 import sys
+from pathlib import Path
 
 from mypy import api
 
 from tests.support.commands import AIRA, Serving, run
 from tests.support.lessons import EXAMPLES, as_role, market
+from tests.support.recordings import decoded, recordings_in
 from tests.support.waiting import until
 
 __all__ = ["market"]
@@ -40,3 +42,5 @@ def test_two_jobs_at_once_one_of_which_fails_and_the_readings_beside_them(market
         watched = watch.log()
     assert done.stdout.splitlines() == ["done", "the tank has 10 litres"], done.stderr
     assert watched.count(" pays 5 XRT, model ") == 2
+    played = [decoded(path) for path in recordings_in(Path(market["AIRA_DATA_DIR"]))]
+    assert {said.data for messages in played for topic, said in messages if topic == "/lit"} == {True}

@@ -13,6 +13,7 @@ import pytest
 from tests.support.boards import board, edge
 from tests.support.commands import AIRA, Serving
 from tests.support.ports import free_port
+from tests.support.recordings import decoded, recordings_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,7 +26,10 @@ PROTOCOLS = ("frames", "rosserial")
 
 @pytest.fixture
 def market(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """Router, chain and provider; returns the environment variables of the other processes, without the keyfile."""
+    """Router, chain and provider; returns the environment variables of the other processes, without the keyfile.
+
+    At the end, other programs must be able to read all that was recorded.
+    """
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
     up = ("up", "--data-dir", tmp_path, "--listen", endpoint, "--port", str(port))
     with Serving(*AIRA, *up, says="provider    0x"):
@@ -35,6 +39,8 @@ def market(tmp_path: Path) -> Iterator[dict[str, str]]:
             "AIRA_DATA_DIR": str(tmp_path),
             "AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "development" / "password"),
         }
+    for path in recordings_in(tmp_path):
+        decoded(path)
 
 
 def as_role(role: str, market: dict[str, str]) -> dict[str, str]:

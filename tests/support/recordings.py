@@ -10,8 +10,10 @@ from mcap.reader import make_reader
 from mcap_ros1.decoder import DecoderFactory as Ros1Decoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 
+from mesh.recording.mcap_writer import MAGIC
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from mcap.records import Schema
@@ -35,6 +37,16 @@ def decoded(path: Path) -> list[tuple[str, Any]]:
             stream, validate_crcs=True, decoder_factories=[JsonDecoders(), Ros1Decoders(), Ros2Decoders()]
         )
         return [(one.channel.topic, one.decoded_message) for one in reader.iter_decoded_messages()]
+
+
+def recordings_in(folder: Path) -> Iterator[Path]:
+    """The complete MCAP files in a folder: stored ones, and copies."""
+    for path in folder.rglob("*"):
+        if path.is_file() and path.stat().st_size > len(MAGIC):
+            with path.open("rb") as stream:
+                start, _ = stream.read(len(MAGIC)), stream.seek(-len(MAGIC), 2)
+                if start == stream.read() == MAGIC:
+                    yield path
 
 
 def check_viewable(schema: dict[str, Any]) -> None:

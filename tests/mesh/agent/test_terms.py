@@ -9,6 +9,7 @@ import pytest
 
 from mesh.agent.contract import Contract, Outcome
 from mesh.agent.errors import NotAnObjective
+from mesh.agent.orders import Order, OrderState
 from mesh.amounts import InvalidAmount
 from schemas import Empty, cid_of_file, message_hash
 from tests.mesh.work.samples import liability
@@ -87,3 +88,12 @@ def test_hashes_print_as_hexadecimal_digits() -> None:
 
 def test_an_outcome_prints_what_there_is_to_say() -> None:
     assert repr(Outcome(success=True, result="Qm")) == "Outcome(success=True, result='Qm')"
+
+
+def test_an_order_prints_its_state_and_terms_in_one_short_line() -> None:
+    said = demand()
+    facts: dict[str, Any] = {"message": said, "hash": "ab" * 32, "posted": 0.0, "_traded": None, "_actions": None}
+    shown = repr(Order(state=OrderState.OPEN, liability="", **facts))
+    assert shown.startswith(f"Order(demand {'ab' * 32}, open, model={said.model}, ")
+    shown = repr(Order(state=OrderState.MATCHED, liability="0x12", **facts))
+    assert shown.endswith(f"cost={said.cost}, deadline={said.deadline}, liability=0x12)")

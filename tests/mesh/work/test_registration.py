@@ -8,6 +8,7 @@ import threading
 from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
@@ -31,6 +32,11 @@ CURRENT: ContextVar[str] = ContextVar("current")
 
 class Move(msgspec.Struct):
     metres: float
+
+
+class Steps(msgspec.Struct):
+    count: int
+    speed: float
 
 
 @dataclass
@@ -69,6 +75,9 @@ async def taken(annotation: Any, value: object) -> Any:
         (float, 1.5, 1.5),
         (float, 2, 2.0),
         (int, 2, 2),
+        (int, 5.0, 5),
+        (list[int], [1.0, 2.0], [1, 2]),
+        (Steps, {"count": 3.0, "speed": 2.0}, Steps(3, 2.0)),
         (bool, True, True),
         (str, "blue", "blue"),
         (str, String("blue"), "blue"),
@@ -99,6 +108,8 @@ async def test_a_message_has_the_type_that_the_handler_declares(annotation: Any,
         (Turn, {"degrees": 361}),
         (float, "fast"),
         (int, True),
+        (int, 5.5),
+        (int, inf),
         (str, 5),
         (bytes, "blue"),
         (Empty, "blue"),
@@ -250,6 +261,7 @@ MISTAKES: dict[str, tuple[Callable[[], object], type[RegistrationError], str]] =
     "result": (lambda: agent().on_result(nothing), InvalidHandler, "invalid-handler"),  # type: ignore[type-var]
     "liability": (lambda: agent().on_liability(only_job), InvalidHandler, "invalid-handler"),  # type: ignore[type-var]
     "reading": (lambda: agent().on_reading("battery"), InvalidTopic, "invalid-topic"),
+    "reading's agent": (lambda: agent().on_reading("/a", agent="0x1"), RegistrationError, "registration-error"),
     "on reading": (lambda: agent().on_reading("/a")(nothing), InvalidHandler, "invalid-handler"),  # type: ignore[type-var]
     "every": (lambda: agent().every(1.0)(only_job), InvalidHandler, "invalid-handler"),  # type: ignore[type-var]
     "every 0": (lambda: agent().every(0), InvalidPeriod, "invalid-period"),
