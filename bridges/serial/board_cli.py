@@ -42,10 +42,8 @@ def run(firmware: Path, port: Path | None, reset_on_open: bool, monitor: bool) -
     from bridges.serial.boards import SimulatedBoard
 
     try:
-        with SimulatedBoard(firmware, port=port, resets=reset_on_open, watch=_show) as board:
+        with SimulatedBoard(firmware, port=port, resets=reset_on_open, monitor=monitor, watch=_show) as board:
             click.echo(f"{HELP}\nconnect it with: aira edge {board.port} --agent ADDRESS")
-            if monitor:
-                board.send("monitor on")
             for line in sys.stdin:
                 if line.strip() == "quit":
                     return

@@ -126,9 +126,10 @@ class SimulatedBoard:
     """A board with the firmware `elf`: `with SimulatedBoard(elf) as board`, then open `board.port`.
 
     `port` is a path of one's own choice, or one in a new folder; it stays the same when the cable is pulled and plugged
-    in again. With `resets`, opening the port resets the board, as it does a real Uno. `watch` is called with each line
-    of the simulator's output. Entering raises `InvalidFirmware`, `PortBusy` or `InvalidPort` if the path is in use,
-    `ConfigurationError` if the simulator can't be compiled, and `BoardFailed`.
+    in again. With `resets`, opening the port resets the board, as it does a real Uno; with `monitor`, the output has
+    what the board sends. `watch` is called with each line of the simulator's output. Entering raises `InvalidFirmware`,
+    `PortBusy` or `InvalidPort` if the path is in use, `ConfigurationError` if the simulator can't be compiled, and
+    `BoardFailed`.
     """
 
     def __init__(
@@ -137,11 +138,12 @@ class SimulatedBoard:
         *,
         resets: bool = False,
         port: Path | None = None,
+        monitor: bool = False,
         watch: Callable[[str], object] | None = None,
     ) -> None:
         self._elf = elf
         self._chosen = port
-        self._resets = resets
+        self._options = [*(["reset"] if resets else []), *(["monitor"] if monitor else [])]
         self._watch = watch
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.port = Path()
@@ -164,7 +166,7 @@ class SimulatedBoard:
         else:
             self.port = self._chosen.absolute()
             check_free(self.port)
-        command = [str(program), str(self._elf), str(self.port), *(["reset"] if self._resets else [])]
+        command = [str(program), str(self._elf), str(self.port), *self._options]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
         )
@@ -257,7 +259,7 @@ class SimulatedBoard:
         return sum(line.startswith(word) for line in self.output)
 
     def send(self, line: str) -> None:
-        """Send the simulator a command line: see docs/devices.md. Raises `BoardFailed` when it has stopped."""
+        """Send the simulator a command line: those of `aira board run`. Raises `BoardFailed` when it has stopped."""
         process = self._running()
         assert process.stdin is not None
         try:

@@ -91,7 +91,7 @@ class CallFailed(AiraError, code="call-failed"):
     """A call to a device failed; `reason` is a short word for programs: a key of `CALL_ERRORS`, or `no-such-topic`."""
 
     def __init__(self, topic: str, reason: str, detail: str) -> None:
-        super().__init__(f"{topic}: {detail} ({reason})")
+        super().__init__(f"{topic}: {detail}" + (f" ({reason})" if reason != self.code else ""))
         self.topic = topic
         self.reason = reason
         self.detail = detail

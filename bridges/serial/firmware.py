@@ -100,10 +100,11 @@ def compiled_core(macros: Sequence[str]) -> Path:
 
 
 def sketch_files(sketch: Path) -> list[Path]:
-    """The `.ino` files of a sketch: first that with its name. Raises `InputError` if there is none."""
+    """The `.ino` files in the folder of a sketch: first that with its name. Raises `InputError` if there is none."""
     main = [path for suffix in SKETCHES if (path := sketch / f"{sketch.name}{suffix}").is_file()]
     if not main:
-        raise InputError(f"{sketch} is not a sketch: {sketch.name}.ino is missing")
+        hint = "the folder of a sketch and its file have the same name, as in lamp/lamp.ino"
+        raise InputError(f"{sketch} is not a sketch: {sketch.name}.ino is missing", hint=hint)
     others = sorted(path for path in sketch.iterdir() if path.suffix == main[0].suffix and path != main[0])
     return [main[0], *others]
 
@@ -157,7 +158,7 @@ def _run(*command: str | Path) -> str:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description="Compile Arduino sketches for an Uno.")
-    parser.add_argument("sketches", nargs="+", type=Path, metavar="SKETCH", help="a sketch's folder")
+    parser.add_argument("sketches", nargs="+", type=Path, metavar="SKETCH", help="a sketch's folder or its .ino file")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the ELF files")
     parser.add_argument(
         "-L", "--libraries", type=Path, action="append", default=[], help="a library, or a folder of libraries"
@@ -165,9 +166,10 @@ def main() -> None:
     parser.add_argument("-D", "--define", action="append", default=[], help="a macro, NAME or NAME=VALUE")
     given = parser.parse_args()
     try:
-        for sketch in given.sketches:
-            elf = given.output / f"{sketch.resolve().name}.elf"
-            compile_sketch(sketch.resolve(), elf, libraries=given.libraries, defines=given.define)
+        for path in map(Path.resolve, given.sketches):
+            sketch = path.parent if path.suffix in SKETCHES else path
+            elf = given.output / f"{sketch.name}.elf"
+            compile_sketch(sketch, elf, libraries=given.libraries, defines=given.define)
             flash, ram = size_of(elf)
             print(f"{elf}: {flash} bytes of flash, {ram} bytes of RAM")
     except AiraError as error:

@@ -1,8 +1,9 @@
 // An Arduino Uno without hardware: firmware in simavr, its serial line on a pseudo-terminal, controlled by lines of text.
 //
-//   board FIRMWARE.elf LINK [reset]
+//   board FIRMWARE.elf LINK [reset] [monitor]
 //
-// LINK is made to point to the terminal; with `reset` each opening of the terminal resets the board, as a real one does.
+// LINK is made to point to the terminal; with `reset` each opening of the terminal resets the board, as a real one does,
+// and with `monitor` what the board sends is shown from the start.
 // Lines on stdin: pin NUMBER high|low|free | adc CHANNEL MILLIVOLTS | send TEXT | monitor on|off | noise RATE SEED |
 //   unplug | plug | reset | quit
 // Says on stdout: port PATH | pin NUMBER LEVEL MICROSECONDS | pwm NUMBER VALUE TOP MICROSECONDS | serial TEXT | opened |
@@ -130,7 +131,7 @@ int main(int count, char **words) {
   static struct board board = {.terminal = -1};
   static elf_firmware_t firmware;
   const int parent = getppid();
-  if (count < 3) return fprintf(stderr, "usage: %s FIRMWARE.elf LINK [reset]\n", words[0]), 2;
+  if (count < 3) return fprintf(stderr, "usage: %s FIRMWARE.elf LINK [reset] [monitor]\n", words[0]), 2;
   prctl(PR_SET_PDEATHSIG, SIGTERM);
   signal(SIGTERM, stop);
   signal(SIGINT, stop);
@@ -139,7 +140,10 @@ int main(int count, char **words) {
   setvbuf(stdout, NULL, _IOLBF, 0);
   if (elf_read_firmware(words[1], &firmware)) return fprintf(stderr, "board: can't read %s\n", words[1]), 2;
   board.link = words[2];
-  board.resets = count > 3 && !strcmp(words[3], "reset");
+  for (int each = 3; each < count; ++each) {
+    board.resets |= !strcmp(words[each], "reset");
+    board.monitored |= !strcmp(words[each], "monitor");
+  }
   board.avr = avr_make_mcu_by_name("atmega328p");
   avr_init(board.avr);
   board.avr->frequency = HERTZ;

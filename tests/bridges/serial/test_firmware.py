@@ -26,7 +26,7 @@ from bridges.serial.frames_dialect import FramesDialect
 from bridges.serial.line import SerialPort
 from bridges.serial.rosserial_dialect import RosserialDialect
 from schemas.payloads import String
-from tests.support.boards import COUNTER, ECHO, ROSSERIAL_ECHO, board, firmware
+from tests.support.boards import COUNTER, DIMMER, ECHO, ROSSERIAL_ECHO, board, firmware
 from tests.support.lines import LineClient
 
 BAUD = 57_600
@@ -46,6 +46,12 @@ def test_an_echo_uses_little_of_an_uno() -> None:
     flash, ram = size_of(firmware(ECHO))
     assert flash <= FLASH
     assert ram <= RAM
+
+
+def test_text_that_a_sketch_prints_between_frames_does_no_harm() -> None:
+    with board(DIMMER, "CHATTY") as uno, frames(uno) as client:
+        assert client.call("/dim", b"64").status is CallStatus.DONE
+        assert client.dialect.counters.damaged > 0  # the text
 
 
 def test_a_thousand_calls_are_done_once_each_over_a_line_that_damages_one_byte_in_a_hundred() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -137,3 +139,11 @@ def test_a_library_that_is_missing_is_named_and_a_folder_without_libraries_too(t
     assert "-L" in raised.value.hint
     with pytest.raises(InputError, match="missing"):
         compile_sketch(sketch, tmp_path / "none.elf", libraries=[tmp_path / "missing"])
+
+
+def test_a_sketch_may_be_named_by_its_file(tmp_path: Path) -> None:
+    firmware(COUNTER)  # skips the test where the tools are missing
+    sketch = sketch_using(tmp_path, "Arduino.h", then="")
+    command = [sys.executable, "-m", "bridges.serial.firmware", str(sketch / "lamp.ino"), "-o", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"{tmp_path / 'out' / 'lamp.elf'}: ")

@@ -138,6 +138,12 @@ def test_a_link_that_a_killed_board_has_left_is_replaced(tmp_path: Path) -> None
         assert port.is_char_device()
 
 
+def test_the_monitor_misses_nothing_of_what_a_board_says_first() -> None:
+    with SimulatedBoard(firmware(TALKER), monitor=True) as uno:
+        uno.wait_until(lambda: any(line.startswith("serial") for line in uno.output), what="the greeting")
+        assert "serial hello\\t\\x01" in uno.output
+
+
 def test_the_command_line_shows_text_dimming_and_levels() -> None:
     with run_board(firmware(TALKER), "--monitor") as process:
         assert process.stdin is not None

@@ -346,12 +346,14 @@ class Link {
     return sum ^ expected;
   }
 
-  // Sends a frame with `size` bytes of payload; two bytes behind it are free for the check.
+  // Sends a frame with `size` bytes of payload; two bytes behind it are free for the check. The zero before it ends what
+  // the sketch has printed.
   void send(uint8_t *frame, uint8_t size) {
     const uint16_t sum = checksum(frame, size + 2, 0);
     frame[size + 2] = sum;
     frame[size + 3] = sum >> 8;
     const uint8_t *const end = frame + size + 4;
+    port_.write((uint8_t)0);
     for (const uint8_t *zero = frame;; frame = (uint8_t *)++zero) {
       while (zero < end && *zero) ++zero;
       port_.write((uint8_t)(zero - frame + 1));

@@ -1,4 +1,5 @@
 // A lamp with a dimmer on pin 9 and a button between pin 2 and ground: /dim takes 0 to 255, /button says how it is.
+// With CHATTY it prints text all the time, as somebody who looks for a mistake may do.
 #include <AiraFrames.h>
 
 const uint8_t LAMP = 9, BUTTON = 2;
@@ -25,6 +26,9 @@ void setup() {
 }
 
 void loop() {
+#ifdef CHATTY
+  Serial.print(F("here "));
+#endif
   mesh.poll();
   const bool now = digitalRead(BUTTON) == LOW;
   if (now == pressed) return;
