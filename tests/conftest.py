@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 import pytest
@@ -21,12 +22,20 @@ ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """One EVM and one router by default; every implementation in CI."""
+    """One EVM and one router by default, and one value of each parameter that is marked `sample`; all of them in CI."""
     if IN_CI:
         return
-    kept = [item for item in items if not _is_alternative(item)]
-    config.hook.pytest_deselected(items=[item for item in items if _is_alternative(item)])
-    items[:] = kept
+    groups: dict[tuple[object, ...], list[pytest.Item]] = {}
+    for item in items:
+        if not _is_alternative(item):
+            groups.setdefault(_without_samples(item), []).append(item)
+    sampled_before: Counter[object] = Counter()
+    kept = set[pytest.Item]()
+    for (path, *_), group in groups.items():
+        kept.add(group[sampled_before[path] % len(group)])
+        sampled_before[path] += len(group) > 1
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = [item for item in items if item in kept]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -65,6 +74,16 @@ def js_ipfs() -> Iterator[JsIpfs]:
     """A js-ipfs daemon that all tests of a run share: it takes seconds to start, so tests use topics of their own."""
     with JsIpfs() as running:
         yield running
+
+
+def _without_samples(item: pytest.Item) -> tuple[object, ...]:
+    """File, name and parameters of a test, without those parameters of which one value is enough."""
+    sampled = {name for mark in item.iter_markers("sample") for name in mark.args}
+    call = getattr(item, "callspec", None)
+    if call is None or not sampled:
+        return item.path, item.nodeid
+    rest = sorted((name, id(value)) for name, value in call.params.items() if name not in sampled)
+    return item.path, item.nodeid.partition("[")[0], *rest
 
 
 def _is_alternative(item: pytest.Item) -> bool:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tests.contracts.books import Terms
     from tests.contracts.evm import Answer
 
-HISTORIES: Final = int(os.environ.get("AIRA_MONEY_HISTORIES", "30"))
+HISTORIES: Final = int(os.environ.get("AIRA_MONEY_HISTORIES", "12"))
 AT_A_TIME: Final = 250
 """Histories in one test: few enough to stay far below the time limit of a test."""
 

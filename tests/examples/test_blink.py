@@ -72,6 +72,7 @@ def test_the_readme_commands_reproduce_the_objectives(
     assert cid_of_file(made) in readme
 
 
+@pytest.mark.sample("protocol")
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_demand_makes_the_lamp_blink_and_is_paid(protocol: str, market: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "result.mcap"
@@ -97,6 +98,7 @@ def test_a_ros_bag_makes_the_lamp_blink_as_well(market: dict[str, str], tmp_path
     assert [text for text, _ in said_on(out, "/led")] == ["blue on", "blue off"] * 3
 
 
+@pytest.mark.sample("protocol")
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_the_argument_chooses_the_lamp(protocol: str, market: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "result.mcap"

@@ -78,6 +78,7 @@ def test_an_invalid_address_of_a_node_is_an_error(tmp_path: Path) -> None:
     assert (caught.value.code, caught.value.endpoint) == ("invalid-endpoint", "nowhere")
 
 
+@pytest.mark.sample("generation")
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_names_are_those_of_the_generation(served: ServedChain, tmp_path: Path, generation: int) -> None:
     async with chain_of(settings(served, tmp_path, generation=generation), None) as chain:

@@ -86,6 +86,7 @@ async def until_settled(agent: Agent) -> None:
     await until_found(is_settled, what="an empty outbox", seconds=30)
 
 
+@pytest.mark.sample("generation")
 @GENERATIONS
 async def test_orders_that_two_agents_signed_become_a_contract(place: Place, generation: int) -> None:
     options: dict[str, Any] = {"open_services": True, "generation": generation}
@@ -138,6 +139,7 @@ async def test_a_result_without_a_contract_is_published_once(place: Place, opene
     assert await waiting(opened.agent) == []
 
 
+@pytest.mark.sample("generation")
 @GENERATIONS
 async def test_a_signed_order_is_published_unchanged(place: Place, opened: Asker, ear: Agent, generation: int) -> None:
     demand = demand_of(place, ear, generation=generation)

@@ -177,6 +177,7 @@ async def test_a_withdrawn_order_may_become_a_contract_all_the_same(place: Place
         assert await waiting(person) == ["withdrawal"]
 
 
+@pytest.mark.sample("generation")
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_an_order_withdrawn_on_the_chain_is_of_no_use_to_any_provider(place: Place, generation: int) -> None:
     async with place.agent("person", generation=generation) as person:

@@ -62,6 +62,7 @@ def _going(robot: Agent) -> Agent:
     return robot
 
 
+@pytest.mark.sample("seed")
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("nodes", "rate"), [(1, 0.03), (2, 0.1)])
 async def test_jobs_are_done_and_paid_once(
@@ -70,6 +71,7 @@ async def test_jobs_are_done_and_paid_once(
     await _do_jobs(founded, anvil, router, tmp_path, nodes=nodes, seed=seed, rate=rate)
 
 
+@pytest.mark.sample("seed")
 @pytest.mark.parametrize("seed", range(3))
 async def test_jobs_survive_a_node_that_at_times_lacks_the_contracts(
     founded: Founded, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, seed: int

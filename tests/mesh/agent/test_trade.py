@@ -28,6 +28,7 @@ async def allowance(place: Place, role: str) -> int:
     return await chain.tokens.allowance(place.address(role), chain.factory)
 
 
+@pytest.mark.sample("generation")
 @GENERATIONS
 async def test_a_demand_becomes_a_contract_with_its_terms(place: Place, generation: int) -> None:
     async with place.provider(), working(place.agent("robot")), place.agent("person", generation=generation) as person:
@@ -40,6 +41,7 @@ async def test_a_demand_becomes_a_contract_with_its_terms(place: Place, generati
         assert await waiting(person) == []
 
 
+@pytest.mark.sample("generation")
 @GENERATIONS
 async def test_each_of_several_concurrent_demands_becomes_a_contract(place: Place, generation: int) -> None:
     """Generation 5 counts the orders of an account: one that is overtaken is signed again, on both sides."""

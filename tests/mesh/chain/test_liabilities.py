@@ -100,6 +100,7 @@ async def test_only_liabilities_can_be_cancelled_and_watched(market: DeployedMar
             await chain.liabilities.refund_state(unused)
 
 
+@pytest.mark.sample("generation")
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_liabilities_of_the_originals_can_not_be_cancelled(market: DeployedMarket, generation: int) -> None:
     liability = await _made(market)
@@ -218,6 +219,7 @@ async def _matching_offer(market: DeployedMarket, generation: int, **fields: Any
     return market.offer(**await _counted(market, market.promisor, generation, 0), **fields)
 
 
+@pytest.mark.sample("generation")
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_a_withdrawn_order_makes_no_contract(market: DeployedMarket, generation: int) -> None:
     demand = await _order(market, generation, cost=XRT)
@@ -233,6 +235,7 @@ async def test_a_withdrawn_order_makes_no_contract(market: DeployedMarket, gener
             await chain.liabilities.create("airalab", demand, offer)
 
 
+@pytest.mark.sample("generation")
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_an_order_that_is_a_contract_is_not_withdrawn(market: DeployedMarket, generation: int) -> None:
     demand = await _order(market, generation)
@@ -254,6 +257,7 @@ async def test_only_the_next_order_of_the_own_account_is_withdrawn(market: Deplo
             await chain.liabilities.withdraw(demand)
 
 
+@pytest.mark.sample("generation")
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_the_originals_withdraw_no_order(market: DeployedMarket, generation: int) -> None:
     demand = await _order(market, generation)

@@ -59,6 +59,7 @@ async def _everything(chain: Chain) -> None:
     assert await node.block_hash(0)
 
 
+@pytest.mark.sample("nodes")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("nodes", [1, 2])
 async def test_each_method_is_asked_again_after_a_spoiled_answer(
@@ -96,6 +97,7 @@ async def test_a_node_that_says_it_has_no_latest_block_is_asked_again(anvil: Anv
         assert proxy.spoiled.total()
 
 
+@pytest.mark.sample("kind")
 @pytest.mark.parametrize("method", ANSWERS)
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_that_spoils_every_answer_to_a_method_is_unreachable(

@@ -161,6 +161,7 @@ def test_setting_aside_killed_at_any_step_leaves_a_consistent_store(tmp_path: Pa
     assert killed_at_each_step(tmp_path, "store.check()", check=check_set_aside) > 10
 
 
+@pytest.mark.sample("seed")
 @pytest.mark.parametrize("seed", range(3))
 def test_acknowledged_puts_survive_kills_at_any_moment(tmp_path: Path, seed: int) -> None:
     chance = random.Random(seed)

@@ -76,6 +76,7 @@ def failure_of(program: tuple[str, ...], variables: dict[str, str]) -> Failure:
     return Failure(done.returncode, error["code"], error["text"], lines[1].strip())
 
 
+@pytest.mark.sample("program")
 @ALL
 def test_a_wrong_password(site: Site, program: tuple[str, ...]) -> None:
     variables = site.variables("person")
@@ -88,6 +89,7 @@ def test_a_wrong_password(site: Site, program: tuple[str, ...]) -> None:
     assert "guessed" not in failure.text + failure.hint
 
 
+@pytest.mark.sample("program")
 @ALL
 def test_a_node_that_does_not_answer(site: Site, program: tuple[str, ...]) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
@@ -97,6 +99,7 @@ def test_a_node_that_does_not_answer(site: Site, program: tuple[str, ...]) -> No
     assert "web3_http_provider" in failure.hint
 
 
+@pytest.mark.sample("program")
 @ALL
 def test_a_chain_without_the_contracts(site: Site, bare: Anvil, program: tuple[str, ...]) -> None:
     failure = failure_of(program, site.variables("person", web3_http_provider=bare.url))
@@ -105,6 +108,7 @@ def test_a_chain_without_the_contracts(site: Site, bare: Anvil, program: tuple[s
     assert "web3_http_provider" in failure.hint
 
 
+@pytest.mark.sample("program")
 @ALL
 def test_an_unknown_lighthouse(site: Site, program: tuple[str, ...]) -> None:
     name = "nowhere.lighthouse.3.robonomics.eth"
