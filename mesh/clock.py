@@ -7,7 +7,7 @@ from typing import Final, Protocol
 
 
 class Clock(Protocol):
-    """The time of day, which may be set forth and back, and the monotonic clock, which only counts."""
+    """The time of day, which can be set, and the monotonic clock, which only moves forward."""
 
     def time(self) -> float:
         """The time of day: seconds since 1970."""

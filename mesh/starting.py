@@ -130,7 +130,7 @@ async def serve_on_each_chain(
             if gone is None or here is None or (gone.is_final and here == served):
                 raise
             fields = log_event("chain-gone", code=gone.code)
-            log.warning("the chain was started afresh (%s); serving on the one that is there now", gone, extra=fields)
+            log.warning("the chain was started afresh (%s); serving the new one", gone, extra=fields)
             served, settings = here, replace(settings, connect_timeout=-1.0)
 
 

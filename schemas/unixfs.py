@@ -175,7 +175,7 @@ def _parent(children: list[_Child]) -> tuple[UnixfsBlock, _Child]:
 
 
 def _make_room(levels: list[list[_Child]]) -> Iterator[UnixfsBlock]:
-    """Close the nodes that are full, from the lowest level up, because one more leaf is to come."""
+    """Close the nodes that are full, from the lowest level up, to make room for one more leaf."""
     height = 0
     while len(levels[height]) == MAX_LINKS:
         yield _close_node(levels, height)
@@ -183,7 +183,7 @@ def _make_room(levels: list[list[_Child]]) -> Iterator[UnixfsBlock]:
 
 
 def _close_tree(levels: list[list[_Child]]) -> Iterator[UnixfsBlock]:
-    """Close all open nodes, because no more leaf is to come; the last block is the root."""
+    """Close all open nodes, after the last leaf; the last block is the root."""
     height = 0
     while height + 1 < len(levels) or len(levels[height]) > 1:
         yield _close_node(levels, height)

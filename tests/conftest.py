@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from tests.support.ci import IN_CI
 from tests.support.ipfs import JsIpfs
 from tests.support.nodes import Anvil
 from tests.support.routers import EmbeddedRouter, Zenohd
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-IN_CI: Final = os.environ.get("CI") == "true"
 ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
 """Parameters that name a second implementation of what another parameter of the same test names already."""
 

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 AUTO: Final = "auto"
 DETECTED: Final = ("frames", "rosserial")
-"""The protocols that are searched for; other installed ones may not bear the questions of these."""
+"""The protocols that are tried; boards with other protocols may be disturbed by their questions."""
 BAUDS: Final = (57_600, 115_200, 9_600, 38_400, 19_200, 230_400, 250_000, 500_000, 1_000_000)
 """The baud rates of boards, the usual ones first."""
 FIRST_TRIAL: Final = 3.0

@@ -47,7 +47,7 @@ class PortName:
         self._usb = USB.fullmatch(text)
         if self._usb is None and not text.startswith("/"):
             raise InputError(
-                f"{text!r} names no serial port", hint="give a path, /dev/ttyACM0, or a USB id, usb:2341:0043"
+                f"{text!r} is not a serial port", hint="give a path, /dev/ttyACM0, or a USB id, usb:2341:0043"
             )
 
     def __str__(self) -> str:

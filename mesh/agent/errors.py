@@ -29,7 +29,7 @@ class Declined(AiraError, code="declined"):
 
     def __init__(self, reason: str, detail: str = "") -> None:
         if not is_word(reason):
-            raise InputError(f"{reason!r} is no word for programs", hint="use lower-case letters, digits and hyphens")
+            raise InputError(f"{reason!r} is not a valid code", hint="use lower-case letters, digits and hyphens")
         super().__init__(f"declined ({reason}): {detail}" if detail else f"declined ({reason})")
         self.reason = reason
         self.detail = detail[:LONGEST_DETAIL]

@@ -36,7 +36,7 @@ PeriodicHandler = Callable[[], object]
 
 
 class InvalidPeriod(RegistrationError, code="invalid-period"):
-    """A handler is to be called every so many seconds, but that is no such number."""
+    """The interval of a periodic handler is not a positive number of seconds."""
 
     def __init__(self, seconds: object) -> None:
         super().__init__(f"{seconds!r} is not a number of seconds above 0", hint="write @agent.every(5.0)")
@@ -110,7 +110,7 @@ class HandlerDecorators:
         `Empty`, `String`, list, dict, or a union of these. An objective with other messages is refused before it is
         played. Without a type, `message` is what was decoded: `Empty`, `String`, a number, JSON data, or bytes.
 
-        Messages are handled one after the other. When the last handler has returned, the job finishes with success;
+        Messages are handled one at a time. When the last handler has returned, the job finishes with success;
         an exception (best `JobFailed("why")`) ends it without, and the promisee is refunded.
         """
         check_topic(topic)
@@ -145,7 +145,7 @@ class HandlerDecorators:
     def on_reading(self, topic: str, *, agent: str = "*") -> Callable[[G], G]:
         """Handle what agents, or one (address), publish on `topic` outside of jobs: `async def handler(reading)`.
 
-        A `Reading` has the `agent`, the `topic` and the `value`. They are handled one after the other.
+        A `Reading` has the `agent`, the `topic` and the `value`. They are handled one at a time.
         """
         try:
             reading_selector(agent, topic)
@@ -188,7 +188,7 @@ async def call(
 ) -> AiraError | None:
     """Call a handler that belongs to no job. If it fails, that is logged (an `AiraError` if `logged` says so).
 
-    The agent goes on. Returns the `AiraError`.
+    The agent continues. Returns the `AiraError`.
     """
     name = name_of(handler)
     try:
@@ -201,18 +201,18 @@ async def call(
         task = asyncio.current_task()
         if task is not None and task.cancelling():
             raise
-        message = "handler %s was cancelled by what it waited for; the agent goes on"
+        message = "handler %s was cancelled by what it waited for; the agent continues"
         log.error(message, name, extra=log_event("handler-cancelled", handler=name))
     except Exception as error:
         facts = log_event("handler-crashed", handler=name, error=type(error).__name__)
-        log.exception("handler %s failed; the agent goes on", name, extra=facts)
+        log.exception("handler %s failed; the agent continues", name, extra=facts)
     return None
 
 
 async def dispatch(
     subscription: Subscription[Any] | ReadingSubscription, handlers: Sequence[Handler], *, concurrency: int
 ) -> None:
-    """Call all handlers with each message, one after the other; up to `concurrency` messages at once."""
+    """Call all handlers with each message, one at a time; up to `concurrency` messages at once."""
     slots = asyncio.Semaphore(concurrency)
 
     async def handle(message: Any) -> None:

@@ -79,12 +79,12 @@ def nothing(progress: Progress) -> None:
 
 
 def report(on_progress: OnProgress, progress: Progress) -> None:
-    """Call a user's function, whose errors are logged: they must not end what goes on."""
+    """Call a user's function and log its errors, which must not end the wait."""
     try:
         on_progress(progress)
     except Exception as error:
         facts = log_event("progress-not-reported", kind=progress.kind, error=type(error).__name__)
-        log.exception("on_progress failed; the agent goes on", extra=facts)
+        log.exception("on_progress failed; the agent continues", extra=facts)
 
 
 @asynccontextmanager
@@ -138,7 +138,7 @@ async def followed_job(parts: AgentComponents, liability: Liability, on_progress
 
 
 class FollowedJob:
-    """What an agent says of a job: `read` its samples, `report_all` of them in the order in which a job goes on."""
+    """What an agent reports about a job: `read` its samples, then `report_all` in the order of the phases."""
 
     def __init__(self, agent: str, on_progress: OnProgress) -> None:
         self._agent = agent

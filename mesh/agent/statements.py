@@ -55,7 +55,7 @@ async def received_rejections(
         order, signer, reason = rejection.order, rejection.provider, rejection.reason
         if signer not in lighthouse.stakes:
             facts = log_event("rejection-ignored", signer=signer, reason=reason)
-            log.warning("%s is no provider, but rejects: %s", signer, reason, extra=facts)
+            log.warning("%s is not a provider, but rejects: %s", signer, reason, extra=facts)
         elif reason == Refusal.FULL:
             facts = log_event("order-deferred", order=order, provider=signer, reason=reason)
             log.warning("provider %s has no room for the order %s now", signer, order, extra=facts)

@@ -1,7 +1,7 @@
 """What an Ethereum node answers: the type of each answer, and its limits.
 
 Nothing that a node says is used before it has its type: `decode_answer` raises `SpoiledAnswer` for a null, a missing
-field or a value of another type, and then the request is made again, to the next node if there are several.
+field or a value of another type, and then the request is sent again, to the next node if there are several.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ class Chain:
         lighthouses: Iterable[str] = (),
         outages: OutageLog | None = None,
     ) -> AsyncGenerator[BlockEvents, None]:
-        """Blocks with their events from the block `cursor` on, for ever, and reorganisations: `mesh.chain.following`.
+        """Blocks with their events from the block `cursor` on, and reorganisations, without end: see `following`.
 
         Transfers and approvals are those of `token` (an address; XRT by default), all or those that concern one of
         `parties` (addresses); a lighthouse's turns are read for the addresses in `lighthouses`. Outages of the node are

@@ -273,7 +273,7 @@ class TransactionDamaged(ConfigurationError, code="transaction-damaged"):
     """The file of a sent transaction is damaged."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(f"{path} holds no sent transaction", hint="it is damaged; move it away")
+        super().__init__(f"{path} does not contain a sent transaction", hint="it is damaged; move it away")
         self.path = path
 
 

@@ -26,7 +26,7 @@ Hashes are compared with the chain's to notice a reorganisation; the events are 
 history that it is given. Save it with the cursor and pass it again after a restart: blocks that were replaced in the
 meantime are then reverted first. Without one, only a reorganisation that happens while following is noticed.
 
-**When the node fails**, the failure is logged once (`OutageLog`) and reading goes on from the cursor as soon as the
+**When the node fails**, the failure is logged once (`OutageLog`) and reading continues from the cursor as soon as the
 node answers, with the backoff `Timing.outage_retry`. What stops `follow` is a chain that can't be the one that was
 read: `ChainWentBack` (the cursor is past its end) and `ReorganisedTooDeep` (no block of the history is on it).
 """
@@ -144,7 +144,7 @@ class History:
 async def follow(
     node: Node, read: ReadRange, cursor: int, *, history: History | None = None, outages: OutageLog | None = None
 ) -> AsyncGenerator[BlockEvents, None]:
-    """The events from the block `cursor` on, as `read` finds them, for ever; see the module.
+    """The events from the block `cursor` on, as `read` finds them, without end; see the module.
 
     Raises `ChainWentBack` and `ReorganisedTooDeep`. Other failures of the node are retried and logged to `outages`.
     """

@@ -49,7 +49,7 @@ class Lighthouses:
         return [event for event in created if isinstance(event, NewLighthouse)]
 
     async def watch(self, from_block: int | None = None) -> AsyncGenerator[NewLighthouse, None]:
-        """Each lighthouse created from a block on (by default from the next), for ever and each once.
+        """Each lighthouse created from a block on (by default from the next), without end, each once.
 
         A lighthouse that a reorganisation reverts is not yielded again when it is created again. Outages of the node
         are survived, but without `from_block` one at the start raises `NodeUnreachable`.

@@ -115,7 +115,7 @@ class RangeReader:
                 self._span = (last - first + 1) // 2
                 continue
             if last < head.number:
-                # A head that the node only claims to have would be read towards for ever.
+                # If the node only claims to have that head, reading towards it would never end.
                 await self._node.block_hash(last)
             for block in blocks:
                 yield _with_hash_of(block, head)

@@ -82,7 +82,7 @@ def _importing_from(folder: Path) -> Iterator[None]:
 def _not_running(kind: type[Any], path: Path) -> Iterator[list[Any]]:
     """Let `agent.run()`, with which many programs end, do nothing, and let `async with agent` fail.
 
-    Yields the list of the agents that were to be started.
+    Yields the list of the agents that the program would have started.
     """
     run, enter = kind.run, kind.__aenter__
     started: list[Any] = []

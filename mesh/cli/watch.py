@@ -66,8 +66,8 @@ def command(
 
     Agents report the contracts; `aira liability watch` reads them from the chain.
 
-    --readings prints, of any model, the readings of agents, such as the state of a battery, and the content of results
-    without a contract, with which agents answer. --out also records them; their topics begin with the agent's address.
+    --readings also prints what agents publish outside of jobs, such as the state of a battery, and the content of their
+    answers (results without a contract), of any model. --out records them; their topics begin with the agent's address.
     """
     configure_logging(level="warning")
     run_until_stopped(

@@ -1,4 +1,4 @@
-"""The directory of a store: which files it holds, their pins and sizes, and what becomes of a finished file."""
+"""The directory of a store: which files it holds, their pins and sizes, and how a finished file gets into it."""
 
 from __future__ import annotations
 

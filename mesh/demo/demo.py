@@ -56,7 +56,7 @@ class Demo:
     `folder` is for its files while it runs; the caller removes it, once the event loop and its threads have ended.
     `objective` is a file (None: three blinks), `generation` that of the messages, `out` the folder where objective and
     recording are kept (None: nowhere). `timeout` is in seconds (see `TIMEOUT`). With `page`, a port, the page of the
-    market is served, and `run` goes on until it is cancelled.
+    market is served, and `run` continues until it is cancelled.
     """
 
     def __init__(

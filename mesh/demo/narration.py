@@ -81,7 +81,7 @@ class JsonNarrator:
 
 
 def _write(text: str) -> None:
-    """Write to stdout. After its reader has closed it (`aira demo | head`), the demo goes on without output."""
+    """Write to stdout. If its reader closes it (`aira demo | head`), the demo continues without output."""
     try:
         sys.stdout.write(text)
         sys.stdout.flush()

@@ -35,7 +35,7 @@ class InvalidChainState(ConfigurationError, code="invalid-chain-state"):
     """The file holds no chain of anvil."""
 
     def __init__(self, state: Path) -> None:
-        super().__init__(f"{state} holds no chain of anvil", hint="name another file, or remove it")
+        super().__init__(f"{state} does not contain a chain of anvil", hint="name another file, or remove it")
         self.state = state
 
 

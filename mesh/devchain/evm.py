@@ -1,7 +1,7 @@
 """A whole Ethereum node in this process: py-evm as eth-tester sets it up, behind JSON-RPC methods.
 
 A transaction is mined at once into a block of its own, so there is no pool, no reorganisation and no "pending" state
-apart from the latest. Calls and estimates run in the block that would come next, as that is where a transaction lands.
+apart from the latest. Calls and estimates run in the next block, where a transaction would land.
 
 eth-tester's own front end is not used: it looks through the whole chain for each receipt, gives reverts as printed
 Python bytes, and speaks no JSON-RPC.

@@ -80,7 +80,7 @@ class RejectionPublisher:
 
 
 def at_fault(match: Match, error: str, arguments: Sequence[Any]) -> tuple[Verified[Order], ...]:
-    """The orders that caused the contracts' `error` (name of a custom error) when the match was to be a liability.
+    """The orders that caused the contracts' `error` (name of a custom error) when a match was not created.
 
     Both orders, if the error and its arguments don't tell them apart.
     """

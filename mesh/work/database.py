@@ -1,4 +1,4 @@
-"""The SQLite file of a ledger. Calls write one after the other.
+"""The SQLite file of a ledger. Calls write one at a time.
 
 A write is synced to the disk, and with it all earlier ones, unless it says that it can wait for the next one: a power
 loss then takes it back, but never an earlier write without the later ones. What can be read from the chain again can

@@ -212,7 +212,7 @@ class Executor:
         self._ready.put_nowait(address)
 
     async def _serve(self) -> None:
-        """Do ready jobs one after the other. Without handlers, others start them."""
+        """Do ready jobs, one at a time. Without handlers, others start them."""
         while True:
             address = await self._ready.get()
             if self._handlers is not None:
@@ -239,7 +239,7 @@ class Executor:
         try:
             await self._on_phase(Phase.RUNNING, run.liability)
             await self._playbacks.play_and_save(run, None if self._handlers is None else self._handlers.handle)
-        except (LedgerUnusable, RecordingFailed):  # the job goes on when the disk is usable
+        except (LedgerUnusable, RecordingFailed):  # the job continues when the disk is usable
             raise
         except Exception as error:
             success, note = False, note_of(error)

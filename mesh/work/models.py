@@ -1,4 +1,4 @@
-"""Descriptions of models: from the store, or from whoever serves them on the mesh at this moment."""
+"""Descriptions of models: from the store, or from peers that serve them now."""
 
 from __future__ import annotations
 

@@ -63,7 +63,9 @@ class ObjectiveNotFetched(ContentError, code="objective-not-fetched"):
     (enough others wait for it) or `rate` (there were too many fetches)."""
 
     def __init__(self, cid: str, reason: Literal["missing", "shared", "rate"]) -> None:
-        super().__init__(f"objective {cid} is not fetched now ({reason})", hint="the demand's next copy is looked at")
+        super().__init__(
+            f"objective {cid} is not fetched now ({reason})", hint="it is tried again with the demand's next copy"
+        )
         self.cid = cid
         self.reason = reason
 
@@ -108,7 +110,7 @@ class Objectives:
         return await self._check(cid, path, self._handlers, self._model)
 
     async def require_fit(self, cid: str, model: ModelDescription) -> None:
-        """Raise `ObjectiveUnfit` if an objective does not fit a model that is to be ordered.
+        """Raise `ObjectiveUnfit` if an objective does not fit the model that a demand orders.
 
         One that is neither in the store nor served by others now is not checked.
         """

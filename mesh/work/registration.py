@@ -70,7 +70,7 @@ def user_frame() -> FrameType:
 async def call_handler(handler: Callable[..., object], *arguments: Any) -> None:
     """Call a handler, a sync one in a thread. Raises what it raises.
 
-    Cancelling stops an async handler; a sync one goes on in its thread, and nobody waits for it.
+    Cancelling stops an async handler; a sync one continues in its thread, and nothing waits for it.
     """
     if inspect.iscoroutinefunction(inspect.unwrap(handler)):
         outcome = handler(*arguments)

@@ -15,6 +15,7 @@ from tests.contracts.books import Terms
 from tests.contracts.market import Market
 from tests.contracts.stage import FOREVER, Stage, Work
 from tests.contracts.suite import REFUND_DELAY, XRT, Suite
+from tests.support.ci import IN_CI
 
 if TYPE_CHECKING:
     from tests.contracts.chains import Chain
@@ -183,7 +184,7 @@ class Conspiracy:
                 self.stage.evm.advance(min(arguments[0], left))
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60 if IN_CI else 15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(generation=st.sampled_from((3, 5)), actions=st.lists(ACTION, max_size=20))
 def test_a_promisor_with_a_result_in_time_is_paid_whatever_the_others_do(
     generation: int, actions: list[tuple[Any, ...]]

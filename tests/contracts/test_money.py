@@ -30,12 +30,13 @@ from schemas import ZERO_ADDRESS
 from tests.contracts.choices import AGREEMENT, ALLOWANCES, ANYBODY, MOSTLY, NEXT, PROVIDER, STAKES, stage
 from tests.contracts.stage import FOREVER, TIMEOUT, Work
 from tests.contracts.suite import REFUND_DELAY, XRT
+from tests.support.ci import IN_CI
 
 if TYPE_CHECKING:
     from tests.contracts.books import Terms
     from tests.contracts.evm import Answer
 
-HISTORIES: Final = int(os.environ.get("AIRA_MONEY_HISTORIES", "12"))
+HISTORIES: Final = int(os.environ.get("AIRA_MONEY_HISTORIES", "30" if IN_CI else "10"))
 AT_A_TIME: Final = 250
 """Histories in one test: few enough to stay far below the time limit of a test."""
 

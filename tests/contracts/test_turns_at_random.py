@@ -21,12 +21,13 @@ from schemas import ZERO_ADDRESS, checksum_address
 from tests.contracts.books import Terms
 from tests.contracts.stage import FOREVER, TIMEOUT, Stage
 from tests.contracts.suite import XRT
+from tests.support.ci import IN_CI
 
 if TYPE_CHECKING:
     from tests.contracts.evm import Answer
 
 PERSON: Final = st.integers(0, 4)
-HISTORIES: Final = int(os.environ.get("AIRA_TURN_HISTORIES", "30"))
+HISTORIES: Final = int(os.environ.get("AIRA_TURN_HISTORIES", "30" if IN_CI else "8"))
 
 
 @cache
