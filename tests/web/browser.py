@@ -16,7 +16,9 @@ from eth_account.messages import encode_defunct
 from selenium import webdriver
 from selenium.common.exceptions import NoSuchElementException, StaleElementReferenceException, WebDriverException
 from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 
 from tests.support.peers import require
 
@@ -107,11 +109,18 @@ class Wallet:
             return self._send(params[0])
         return self.rpc(method, *params)
 
-    def _send(self, call: dict[str, str]) -> Any:
+    def give(self, address: str, *, wei: int = 0, token: str = "", units: int = 0) -> None:
+        """Send an account ether, or units of a token."""
+        if token:
+            self._send({"to": token, "data": f"0xa9059cbb{int(address, 16):064x}{units:064x}"})
+        else:
+            self._send({"to": address, "data": "0x", "value": wei})
+
+    def _send(self, call: dict[str, Any]) -> Any:
         transaction = {
             "to": call["to"],
             "data": call["data"],
-            "value": 0,
+            "value": call.get("value", 0),
             "nonce": int(self.rpc("eth_getTransactionCount", self.address, "latest"), 16),
             "chainId": int(self.rpc("eth_chainId"), 16),
             "gas": 2_000_000,
@@ -136,14 +145,18 @@ class Browser:
         self.url, self.wallet = url, wallet
         self.resize(size)
         self.set_dark(dark)
-        if wallet is not None:
-            self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WALLET})
+        self.start_wallet()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exc_info: object) -> None:
         self.driver.quit()
+
+    def start_wallet(self) -> None:
+        """Have the wallet in each document that this tab opens from now on."""
+        if self.wallet is not None:
+            self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WALLET})
 
     def resize(self, size: tuple[int, int]) -> None:
         """Show the page as a screen of this size does."""
@@ -221,6 +234,36 @@ class Browser:
 
         self.until(pressed, f"the button {words!r}")
 
+    def tab_to(self, css: str) -> None:
+        """Move the focus there by the Tab key alone."""
+        self.find(css)
+        for _ in range(120):
+            if self.driver.execute_script("return document.activeElement?.matches(arguments[0])", css):
+                return
+            self.keys(Keys.TAB)
+        raise AssertionError(f"the Tab key does not come to {css}")
+
+    def keys(self, *keys: str) -> None:
+        """Press keys, as a person without a mouse does."""
+        ActionChains(self.driver).send_keys(*keys).perform()
+        self.serve_wallet()
+
+    def lie(self, path: str, change: str) -> None:
+        """From the next page on, pass each answer whose path matches `path` to `change`: code that alters `body`."""
+        script = f"""
+        const honest = window.fetch;
+        window.fetch = async (path, init) => {{
+          const answer = await honest(path, init);
+          if (!/{path}/.test(String(path))) return answer;
+          const isFile = /files\\/\\w+$/.test(String(path));
+          const body = isFile ? new Uint8Array(await answer.arrayBuffer()) : await answer.json();
+          {change};
+          const {{ headers, status }} = answer;
+          return new Response(isFile ? body : JSON.stringify(body), {{ headers, status }});
+        }};
+        """
+        self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
+
     def type(self, label: str, text: str) -> None:
         """Write a text into the field with this label."""
         path = f"//label[contains(normalize-space(.), {json.dumps(label)})]"
@@ -228,7 +271,7 @@ class Browser:
             lambda: next(one for one in self.driver.find_elements(By.XPATH, path) if one.is_displayed()), label
         )
         field = self.driver.find_element(By.ID, found.get_attribute("for"))
-        field.clear()
+        field.send_keys(Keys.CONTROL + "a")
         field.send_keys(text)
 
     def text(self) -> str:

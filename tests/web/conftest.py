@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 import pytest
 from eth_account import Account
 
+from schemas import cid_of_file
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.ports import free_port
 from tests.web.browser import Browser, Wallet
+from tests.web.steps import order
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,6 +32,7 @@ class Site:
 
     url: str
     model: str
+    hostile_model: str
     node: str
     person: bytes
     variables: dict[str, str]
@@ -55,6 +58,18 @@ class Site:
             yield f"http://127.0.0.1:{port}"
 
 
+def hostile_model(folder: Path) -> Path:
+    """A model whose texts are scripts."""
+    model = json.loads((HERE / "model.json").read_text())
+    script = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
+    model |= {"title": script, "description": script, "success": script}
+    (topic,) = model["objective"]
+    topic["title"] = topic["value"]["properties"]["direction"]["title"] = script
+    path = folder / "hostile.json"
+    path.write_text(json.dumps(model))
+    return path
+
+
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     folder, port = tmp_path_factory.mktemp("site"), free_port()
@@ -69,14 +84,26 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         up = ("up", "--data-dir", folder, "--listen", endpoint, "--port", str(port))
         stack.enter_context(Serving(*AIRA, *up, says="provider    0x"))
         model = json.loads(aira("model", "new", HERE / "model.json", "--out", folder / "model.json", "--json").stdout)
-        robot = (sys.executable, HERE / "robot.py", folder / "model.json", HOSTILE)
-        keyfile = variables | {"AIRA_KEYFILE": f"{folder}/development/robot.json"}
+        hostile = hostile_model(folder)
+        robot = (sys.executable, HERE / "robot.py", folder / "model.json", HOSTILE, hostile)
+        keyfile = variables | {"AIRA_KEYFILE": f"{folder}/development/robot.json", "AIRA_OPEN_SERVICES": "true"}
         stack.enter_context(Serving(*robot, says="robot 0x", variables=keyfile))
         password = (folder / "development" / "password").read_text().strip()
         key = Account.decrypt((folder / "development" / "person.json").read_text(), password)
-        site = Site("", model["cid"], node, bytes(key), variables, folder)
+        models = model["cid"], cid_of_file(hostile)
+        site = Site("", *models, node, bytes(key), variables, folder)
         url = stack.enter_context(site.page())
-        yield Site(url, model["cid"], node, bytes(key), variables, folder)
+        yield Site(url, *models, node, bytes(key), variables, folder)
+
+
+@pytest.fixture(scope="session")
+def paid_job(site: Site) -> str:
+    """The address of a job that is paid, with all checks passed."""
+    with Browser(site.url, site.wallet()) as browser:
+        address = order(browser, site)
+        browser.sees("the robot was paid")
+        browser.until(lambda: len(browser.all(".findings .badge.good")) >= 19, "all checks")
+        return address
 
 
 @pytest.fixture

@@ -54,7 +54,8 @@ async def drive(job: Job, order: dict[str, Any]) -> None:
 
 async def main() -> None:
     async with agent:
-        await agent.add(model)
+        for file in (model, *map(Path, sys.argv[3:])):
+            await agent.add(file)
         print(f"robot {agent.address}", flush=True)
         await asyncio.Event().wait()
 

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import sys
+import urllib.request
 from typing import TYPE_CHECKING
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
+from selenium.webdriver.common.keys import Keys
 
 from tests.support.commands import Serving
 from tests.support.ports import free_port
 from tests.web.browser import DESKTOP, PHONE, Browser
+from tests.web.steps import fill_in, order, review, sign
+
+UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,35 +23,11 @@ if TYPE_CHECKING:
     from tests.web.conftest import Site
 
 
-def fill_in(browser: Browser, site: Site, *, direction: str = "left") -> None:
-    """From the link to a model until the price is asked."""
-    browser.go(f"order/model/{site.model}")
-    browser.find("#make")
-    browser.driver.execute_script(
-        "const one = [...document.querySelectorAll('fieldset select')].at(-1); one.value = arguments[0];"
-        "one.dispatchEvent(new Event('change', { bubbles: true }))",
-        direction,
-    )
-    browser.click("#make")
-    browser.sees("Fits the model")
-
-
-def review(browser: Browser) -> str:
-    """From the price to the terms that are signed; gives the hash that is shown."""
-    browser.until(lambda: browser.all("#allow") or browser.all("#order:not([disabled])"), "a way to go on")
-    if browser.all("#allow"):
-        browser.click("#allow")
-    browser.click("#order:not([disabled])")
-    return browser.find("#hash").text
-
-
 def test_a_job_is_ordered_paid_and_checked_by_clicks(browser: Browser, site: Site) -> None:
     browser.go()
     browser.connect()
     fill_in(browser, site)
-    review(browser)
-    browser.click("#sign")
-    browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
+    sign(browser)
     job = browser.driver.current_url
     browser.driver.refresh()  # in the middle of the job
     browser.sees("the robot was paid")
@@ -60,6 +42,12 @@ def test_a_job_is_ordered_paid_and_checked_by_clicks(browser: Browser, site: Sit
     assert browser.log() == []
     assert browser.driver.current_url == job
     assert browser.violations() == []
+    # The recording, for other programs: a download, and a link that Foxglove opens.
+    recording = browser.find("a[download]").get_attribute("href") or ""
+    with urllib.request.urlopen(recording, timeout=30) as response:
+        assert response.read(5) == b"\x89MCAP"
+    foxglove = browser.find("a[href^='foxglove:']").get_attribute("href") or ""
+    assert parse_qs(urlsplit(foxglove).query) == {"ds": ["remote-file"], "ds.url": [recording]}
 
 
 def test_what_failed_is_paid_back(browser: Browser, site: Site) -> None:
@@ -130,52 +118,6 @@ def test_an_open_order_is_withdrawn(browser: Browser, site: Site) -> None:
     browser.sees("You withdrew this order")
 
 
-def test_a_server_that_lies_about_a_job_is_caught(browser: Browser, site: Site) -> None:
-    """The page's own requests pass a script that changes the price in the answer about the job."""
-    browser.go()
-    browser.connect()
-    fill_in(browser, site)
-    review(browser)
-    browser.click("#sign")
-    browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
-    browser.sees("the robot was paid")
-    lie = """
-    const honest = window.fetch;
-    window.fetch = async (path, init) => {
-      const answer = await honest(path, init);
-      if (!/liabilities\\/0x\\w{40}$/.test(String(path))) return answer;
-      const job = await answer.json();
-      job.liability.cost = "1";
-      return new Response(JSON.stringify(job), { headers: answer.headers });
-    };
-    """
-    browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": lie})
-    browser.driver.refresh()
-    browser.find("#lie")
-
-
-LIE = """
-const honest = window.fetch;
-window.fetch = async (path, init) => {
-  const answer = await honest(path, init);
-  if (init?.method !== "POST" || !/v1\\/orders$/.test(String(path))) return answer;
-  const posted = await answer.json();
-  posted.order.hash = "ab".repeat(32);
-  return new Response(JSON.stringify(posted), { headers: answer.headers });
-};
-"""
-
-
-def test_a_server_that_answers_with_another_order_is_caught(browser: Browser, site: Site) -> None:
-    browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": LIE})
-    browser.go()
-    browser.connect()
-    fill_in(browser, site)
-    review(browser)
-    browser.click("#sign")
-    browser.sees("about another order than the one shown")
-
-
 def test_a_page_outlives_its_server(site: Site) -> None:
     port = free_port()
     with Browser(f"http://127.0.0.1:{port}", site.wallet()) as browser:
@@ -207,6 +149,49 @@ def test_an_order_shows_in_the_market_of_another_tab(browser: Browser, site: Sit
         assert other.log() == []
 
 
+def test_two_tabs_of_a_person_show_the_same_job(browser: Browser, site: Site) -> None:
+    browser.go()
+    browser.connect()
+    first = browser.driver.current_window_handle
+    browser.driver.switch_to.new_window("tab")
+    second = browser.driver.current_window_handle
+    browser.start_wallet()
+    browser.go("jobs")
+    browser.find("#account")  # the wallet is known here, too
+    browser.driver.switch_to.window(first)
+    job = order(browser, site)
+    browser.driver.switch_to.window(second)
+    browser.click(f"[title='{job}'] a")
+    browser.sees("the robot was paid")
+    browser.driver.switch_to.window(first)
+    browser.sees("the robot was paid")
+
+
+def test_an_order_needs_no_mouse(browser: Browser, site: Site) -> None:
+    browser.go(f"order/model/{site.model}")
+    browser.find("#make")
+    browser.keys(Keys.TAB, Keys.ENTER)  # skip what all pages have
+    assert browser.driver.execute_script("return document.activeElement.id") == "main"
+    browser.tab_to("#connect")
+    browser.keys(Keys.ENTER)
+    browser.tab_to(".choice")
+    browser.keys(Keys.ENTER)
+    browser.find("#account")
+    browser.tab_to("#make")
+    browser.keys(Keys.ENTER)
+    browser.sees("Fits the model")
+    browser.until(lambda: browser.all("#allow") or browser.all("#order:not([disabled])"), "a way to go on")
+    if browser.all("#allow"):
+        browser.tab_to("#allow")
+        browser.keys(Keys.ENTER)
+    browser.find("#order:not([disabled])")
+    browser.tab_to("#order")
+    browser.keys(Keys.ENTER)
+    browser.tab_to("#sign")
+    browser.keys(Keys.ENTER)
+    browser.sees("the robot was paid")
+
+
 def test_the_local_account_orders_and_is_labelled(site: Site) -> None:
     with site.page(keyfile=True) as url, Browser(url) as browser:
         browser.go()
@@ -225,7 +210,7 @@ def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_pa
         (tmp_path / "index.html").write_text(f'<!doctype html><iframe src="{url}/" width="500" height="800"></iframe>')
         serve = (sys.executable, "-m", "http.server", "--bind", "127.0.0.1", "--directory", tmp_path)
         with (
-            Serving(*serve, origin.rpartition(":")[2], says="Serving HTTP", variables={"PYTHONUNBUFFERED": "1"}),
+            Serving(*serve, origin.rpartition(":")[2], says="Serving HTTP", variables=UNBUFFERED),
             Browser(origin, site.wallet()) as browser,
         ):
             browser.driver.get(origin)
@@ -233,23 +218,51 @@ def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_pa
             browser.sees("Drive a circle")
             browser.sees("2 XRT")
             browser.picture(pictures / "robot-frame.png")
+            browser.connect()
+            browser.click("#make")
+            sign(browser)
+            browser.sees("the robot was paid")
+        other = f"http://localhost:{origin.rpartition(':')[2]}"
+        with (
+            Serving(*serve, origin.rpartition(":")[2], says="Serving HTTP", variables=UNBUFFERED),
+            Browser(other) as browser,
+        ):
+            browser.driver.get(other)
+            browser.driver.switch_to.frame(0)
+            assert "Drive a circle" not in browser.text()
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-def test_each_page_is_accessible(site: Site, pictures: Path, size: tuple[int, int], dark: bool) -> None:
+def test_each_page_is_accessible(site: Site, paid_job: str, pictures: Path, size: tuple[int, int], dark: bool) -> None:
+    look = f"{'phone' if size == PHONE else 'desktop'}-{'dark' if dark else 'light'}.png"
     with Browser(site.url, site.wallet(), size=size, dark=dark) as browser:
         browser.go()
         browser.connect()
         assert browser.wallet
         routes = {name: name for name in ("order", "market", "jobs", "robots", "provider")}
-        routes |= {"account": f"account/{browser.wallet.address}", "form": f"order/model/{site.model}"}
+        routes |= {"account": f"account/{browser.wallet.address}", "job": f"job/{paid_job}"}
         for name, route in routes.items():
             browser.go(route)
             browser.until(lambda: not browser.all("[aria-busy=true]") and browser.all("h1"), name)
-            browser.picture(
-                pictures / f"{name}-{'phone' if size == PHONE else 'desktop'}-{'dark' if dark else 'light'}.png"
-            )
-            assert browser.violations() == [], name
-            wider = browser.driver.execute_script("return document.documentElement.scrollWidth - innerWidth")
-            assert wider <= 0, f"{name} is wider than the screen"
+            if name == "robots":
+                browser.press("Details")
+                browser.click("#log summary")
+                browser.until(lambda: not browser.all("[aria-busy=true]"), "the log")
+            if name == "job":
+                browser.until(lambda: len(browser.all(".findings .badge.good")) >= 18, "all checks")
+                browser.until(lambda: browser.all(".plot canvas"), "the plot")
+            check(browser, pictures / f"{name}-{look}")
+        fill_in(browser, site)
+        review(browser)
+        check(browser, pictures / f"review-{look}")
+        browser.press("Not now")
+        check(browser, pictures / f"form-{look}")
+
+
+def check(browser: Browser, picture: Path) -> None:
+    """No violations, nothing wider than the screen; and a screenshot for people to look at."""
+    browser.picture(picture)
+    assert browser.violations() == [], picture.stem
+    wider = browser.driver.execute_script("return document.documentElement.scrollWidth - innerWidth")
+    assert wider <= 0, f"{picture.stem} is wider than the screen"

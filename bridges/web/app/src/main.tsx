@@ -1,6 +1,6 @@
 import { render } from "preact";
 import { useEffect, useState } from "preact/hooks";
-import { post, ApiError } from "./api";
+import { ApiError } from "./api";
 import { AppProvider, useApp, useData, useLive, wordsOf } from "./app";
 import { plain } from "./format";
 import { postAgain } from "./ordering";
@@ -8,6 +8,7 @@ import { AccountControl, AccountPage } from "./pages/account";
 import { FollowPage } from "./pages/follow";
 import { JobPage } from "./pages/job";
 import { JobsPage } from "./pages/jobs";
+import { LoginForm } from "./pages/login";
 import { MarketPage } from "./pages/market";
 import { OrderPage } from "./pages/order";
 import { ProviderPage } from "./pages/provider";
@@ -17,7 +18,6 @@ import { RobotsPage } from "./pages/robots";
 import "./style.css";
 import { texts } from "./texts";
 import type { Market } from "./types";
-import { Action, Field } from "./ui";
 
 const TABS = ["order", "market", "jobs", "robots", "provider"] as const;
 
@@ -39,7 +39,9 @@ function Page() {
   const market = useData<Market>("market");
   const { data, error } = market;
   if (data) return <AppProvider market={data} reloadMarket={market.reload}><Shell /></AppProvider>;
-  if (error instanceof ApiError && error.code === "login-required") return <Login done={market.reload} />;
+  if (error instanceof ApiError && error.code === "login-required") {
+    return <main class="login"><h1>AIRA</h1><LoginForm label={texts.token} hint={texts.tokenHint} done={market.reload} /></main>;
+  }
   return <main>{error ? <Broken error={error} retry={market.reload} /> : <p class="quiet" aria-busy="true">{texts.loading}</p>}</main>;
 }
 
@@ -60,7 +62,7 @@ function Shell() {
   if (onOwnPage) return <main><RobotPage robot={market.robot!} /></main>;
   return (
     <>
-      <a class="skip" href="#main">{texts.skip}</a>
+      <a class="skip" href="#main" onClick={skip}>{texts.skip}</a>
       {inFrame ? null : <Header route={route} />}
       <main id="main" tabIndex={-1} class={`on-${route[0] ?? "order"}`}><Content route={route} /></main>
       <footer>
@@ -70,6 +72,12 @@ function Shell() {
       </footer>
     </>
   );
+}
+
+/** To the content without a change of the route, which is in the same part of the address. */
+function skip(event: Event): void {
+  event.preventDefault();
+  document.getElementById("main")!.focus();
 }
 
 function Header(props: { route: string[] }) {
@@ -131,25 +139,6 @@ function Connection() {
     <span id="connection" role="status" class={broken ? "broken" : ""}>
       <span class={`dot ${broken ? "bad" : "good"}`} aria-hidden="true" /> {broken || texts.live} · {texts.block(block)}
     </span>
-  );
-}
-
-function Login(props: { done: () => void }) {
-  const [token, setToken] = useState("");
-  const [error, setError] = useState("");
-  const logIn = async () => {
-    setError("");
-    await post("session", { token });
-    props.done();
-  };
-  return (
-    <main class="login">
-      <h1>AIRA</h1>
-      <Field label={texts.token} hint={texts.tokenHint} error={error}>
-        {(id, described) => <input id={id} aria-describedby={described} type="password" autocomplete="current-password" value={token} onInput={(event) => setToken(event.currentTarget.value)} />}
-      </Field>
-      <Action run={logIn} disabled={!token} onError={(problem) => setError(wordsOf(problem))}>{texts.logIn}</Action>
-    </main>
   );
 }
 

@@ -9,7 +9,7 @@ import type { Reader } from "./contracts";
 import { orderHash, resultHash, signerOf } from "./messages";
 import type { Demand, Offer } from "./messages";
 import { texts } from "./texts";
-import type { Finding, Job, Market, Order } from "./types";
+import type { Answer, Finding, Job, Market, Order } from "./types";
 import { ask } from "./wallet";
 
 const LARGEST = 64 * 1024 * 1024;
@@ -149,6 +149,14 @@ function checkFile(which: "objective" | "result"): Check {
     const found = await cidOf(await getBytes(cid, LARGEST));
     return { name: which, holds: found === cid, detail: found === cid ? texts.fileMatches(found) : texts.fileDiffers(found, cid) };
   };
+}
+
+/** Throws `ServerLies` unless an answer is signed by the account that the server names, for the account that asked. */
+export async function checkAnswer(answer: Answer, asker: Address): Promise<void> {
+  const signer = await signerOf(resultHash(answer), answer.signature).catch(() => null);
+  if (signer !== answer.signer || answer.liability !== asker) throw new ServerLies(texts.lieAnswer);
+  const found = await cidOf(await getBytes(answer.result, LARGEST));
+  if (found !== answer.result) throw new ServerLies(texts.fileDiffers(found, answer.result));
 }
 
 /** Throws `ServerLies` if the objective that the server stored is not the file that was sent. */

@@ -75,11 +75,31 @@ export interface Statement {
   at: number;
 }
 
+/** A Result without a contract: its liability is the account that asked. */
+export interface Answer {
+  liability: Address;
+  result: string;
+  success: boolean;
+  signature: string;
+  signer: Address;
+  at: number;
+}
+
 export interface PostedOrder {
   order: Order;
   state: "open" | "withdrawn" | "contract" | "expired";
   liability: Address | null;
   statements: Statement[];
+  answers: Answer[];
+}
+
+export interface LogEvent {
+  sequence: number;
+  time: string;
+  level: string;
+  event?: string;
+  message: string;
+  liability?: Address;
 }
 
 export interface AgentStatus {

@@ -3,10 +3,11 @@ import { useApp, useData, useTopic } from "../app";
 import { amount, duration } from "../format";
 import { withdraw } from "../ordering";
 import { texts } from "../texts";
-import { checkOrder } from "../trust";
-import type { PostedOrder } from "../types";
-import { Action, Facts, Name, Problem, Show } from "../ui";
+import { checkAnswer, checkOrder } from "../trust";
+import type { Answer, PostedOrder, Summary } from "../types";
+import { Action, Badge, Facts, Name, Problem, Show } from "../ui";
 import { StatementList } from "./account";
+import { Recording } from "./recording";
 
 /** An order from its publication to its contract; then the page of the job takes over. */
 export function FollowPage(props: { hash: string }) {
@@ -26,11 +27,12 @@ export function FollowPage(props: { hash: string }) {
     <>
       <h1>{texts.yourOrder}</h1>
       <Show of={posted}>
-        {({ order, state, statements }) => (
+        {({ order, state, statements, answers }) => (
           <>
             {lie ? <Problem error={lie} /> : null}
-            <Steps done={1} active={state === "open"} failed={state === "expired" || state === "withdrawn"} />
-            <p class="lead" aria-live="polite">{texts.orderStateLong[state]}</p>
+            {BigInt(order.cost) ? <Steps done={1} active={state === "open"} failed={state === "expired" || state === "withdrawn"} /> : null}
+            <p class="lead" aria-live="polite">{answers.length ? texts.answered : texts.orderStateLong[state]}</p>
+            {answers.map((answer) => <AnswerView key={answer.signature} order={order} answer={answer} />)}
             <StatementList statements={statements} />
             <OrderFacts order={order} />
             {state === "open" && account?.address === order.signer ? (
@@ -44,6 +46,25 @@ export function FollowPage(props: { hash: string }) {
         )}
       </Show>
     </>
+  );
+}
+
+/** An answer without a contract, checked by this browser. One to another question of this account is not shown. */
+function AnswerView({ order, answer }: { order: PostedOrder["order"]; answer: Answer }) {
+  const summary = useData<Summary>(`files/${answer.result}/summary`);
+  const [checked, setChecked] = useState<unknown>(null);
+  useEffect(() => void checkAnswer(answer, order.signer).then(() => setChecked(true), setChecked), [answer.signature]);
+  const question = summary.data?.metadata["aira-answer"]?.demand;
+  if (question && question !== order.hash) return null;
+  return (
+    <section class="panel">
+      <h2>{texts.answer}</h2>
+      {checked !== null && checked !== true ? <Problem error={checked} /> : null}
+      <p>
+        {checked === true ? <Badge kind="good">{texts.holds}</Badge> : null} {texts.answeredBy} <Name text={answer.signer} href={`#/account/${answer.signer}`} />
+      </p>
+      <Recording cid={answer.result} />
+    </section>
   );
 }
 

@@ -1,5 +1,7 @@
 import { useEffect, useState } from "preact/hooks";
 import { useApp, useData, useTopic, wordsOf } from "../app";
+import { post } from "../api";
+import { isCid } from "../cid";
 import { calls } from "../contracts";
 import { amount, clock, duration, short } from "../format";
 import { texts } from "../texts";
@@ -9,6 +11,7 @@ import { Action, Badge, Facts, Money, Name, Show, Strange } from "../ui";
 import { JobState } from "./account";
 import { Steps } from "./follow";
 import { Recording } from "./recording";
+import { Operate } from "./robots";
 
 /** A job by its contract's address: terms, parties, files, timeline, and the checks. */
 export function JobPage(props: { address: string }) {
@@ -23,7 +26,10 @@ export function JobPage(props: { address: string }) {
   useTopic("chain", () => job.data && (!job.data.liability.isFinalized || unexplained) && job.reload());
   return (
     <>
-      <h1>{texts.job} <Name text={props.address} /></h1>
+      <div class="row between">
+        <h1>{texts.job} <Name text={props.address} /></h1>
+        <CopyLink />
+      </div>
       <Show of={job}>{(known) => <JobView job={known} playback={playback ?? known.playback} changed={job.reload} />}</Show>
     </>
   );
@@ -48,6 +54,7 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
       </p>
       {job.reason ? <p class="problem"><Strange text={job.reason.text || texts.reason[job.reason.code] || ""} /> <code>{job.reason.code}</code></p> : null}
       <Refund job={job} changed={props.changed} />
+      {ended ? <p><a class="button quietly" href={`#/order/model/${liability.model}`}>{texts.orderAgain}</a></p> : <Operate robot={liability.promisor} job={liability.address} />}
       <div class="columns">
         <section>
           <h2>{texts.terms}</h2>
@@ -81,6 +88,16 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
   );
 }
 
+/** The address of this page stays: it names the contract. */
+function CopyLink() {
+  const { notify } = useApp();
+  const copy = async () => {
+    await navigator.clipboard.writeText(location.href);
+    notify(texts.copied);
+  };
+  return <Action class="button small quietly" run={copy}>{texts.copyLink}</Action>;
+}
+
 function Timeline(props: { steps: Step[] }) {
   const { market } = useApp();
   return (
@@ -92,7 +109,7 @@ function Timeline(props: { steps: Step[] }) {
             {step.at !== null ? clock(step.at) : ""} {step.block !== null ? texts.block(step.block) : ""}{" "}
             {step.tx ? (market.explorer ? <a href={`${market.explorer}/tx/${step.tx}`} rel="noreferrer">{short(step.tx)}</a> : <Name text={step.tx} />) : null}
           </span>
-          {step.detail ? <Strange text={step.detail} /> : null}
+          {isCid(step.detail) ? <Name text={step.detail} href={`#/file/${step.detail}`} /> : <Strange text={step.detail} />}
         </li>
       ))}
     </ol>
@@ -105,9 +122,9 @@ function Refund(props: { job: Job; changed: () => void }) {
   if (liability.isFinalized || refundableFrom === null || account?.address !== liability.promisee) return null;
   const left = refundableFrom - block;
   if (left > 0) return <p class="hint">{texts.refundLater(amount(liability.cost, liability.token), refundableFrom, duration(left * market.blockTime))}</p>;
-  if (account.kind === "local") return <p class="callout">{texts.refundLocal(liability.address)}</p>;
   const refund = async () => {
-    await send(market.factory, calls.refund(liability.address));
+    if (account.kind === "local") await post("local/refunds", { liability: liability.address });
+    else await send(market.factory, calls.refund(liability.address));
     notify(texts.refunded);
     props.changed();
   };

@@ -17,7 +17,7 @@ interface Choice {
 /** Three ways to an objective: a form made from the model's description, a file, a CID. */
 export function ObjectiveChoice(props: Choice) {
   const described = props.model.description?.objective ?? [];
-  const ways = described.length ? (["form", "file", "cid"] as const) : (["file", "cid"] as const);
+  const ways = described.length ? (["form", "file", "cid"] as const) : (["file", "cid", "none"] as const);
   const [way, setWay] = useState<string>(ways[0]);
   const [error, setError] = useState("");
   const attempt = (find: () => Promise<Objective>) => async () => {
@@ -35,6 +35,7 @@ export function ObjectiveChoice(props: Choice) {
       {way === "form" ? <DescribedForm model={props.model} attempt={attempt} onError={onError} /> : null}
       {way === "file" ? <FileChoice model={props.model} attempt={attempt} onError={onError} /> : null}
       {way === "cid" ? <CidChoice model={props.model} attempt={attempt} onError={onError} /> : null}
+      {way === "none" ? <NoObjective model={props.model} attempt={attempt} onError={onError} /> : null}
       {error ? <p class="problem" role="alert">{error}</p> : null}
       {props.objective ? <Chosen objective={props.objective} described={props.model.described} /> : null}
     </>
@@ -95,6 +96,20 @@ function CidChoice({ model, attempt, onError }: Way) {
         {(id, described) => <input id={id} aria-describedby={described} class="wide" spellcheck={false} value={cid} onInput={(event) => setCid(event.currentTarget.value.trim())} />}
       </Field>
       <Action id="take-cid" disabled={!isCid(cid)} run={find} onError={onError}>{texts.take}</Action>
+    </>
+  );
+}
+
+/** For robots that need no objective, such as sensors: the market's rule is to name the model in its place. */
+function NoObjective({ model, attempt, onError }: Way) {
+  const take = attempt(async () => {
+    const summary = await get<Summary>(`files/${model.cid}/summary`);
+    return { cid: model.cid, size: summary.size, summary, preflight: { ok: true, reason: "", detail: "" } };
+  });
+  return (
+    <>
+      <p class="hint">{texts.noObjectiveHint}</p>
+      <Action id="no-objective" run={take} onError={onError}>{texts.noObjective}</Action>
     </>
   );
 }

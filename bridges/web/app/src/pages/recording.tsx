@@ -23,7 +23,7 @@ export function FilePage(props: { cid: string }) {
 /** A recording's topics: values plotted, images shown, text listed. */
 export function Recording(props: { cid: string }) {
   const summary = useData<Summary>(`files/${props.cid}/summary`);
-  const address = `${location.origin}/api/v1/files/${props.cid}`;
+  const address = `/api/v1/files/${props.cid}/recording.${summary.data?.format === "bag" ? "bag" : "mcap"}`;
   return (
     <>
       <Show of={summary}>
@@ -42,8 +42,8 @@ export function Recording(props: { cid: string }) {
         )}
       </Show>
       <p class="row">
-        <a class="button small quietly" href={`/api/v1/files/${props.cid}`} download={`${props.cid}.mcap`}>{texts.download}</a>
-        <a class="button small quietly" href={`foxglove://open?ds=remote-file&ds.url=${encodeURIComponent(address)}`}>{texts.foxglove}</a>
+        <a class="button small quietly" href={address} download={`${props.cid}.${address.split(".").pop()}`}>{texts.download}</a>
+        <a class="button small quietly" href={`foxglove://open?ds=remote-file&ds.url=${encodeURIComponent(location.origin + address)}`}>{texts.foxglove}</a>
       </p>
     </>
   );

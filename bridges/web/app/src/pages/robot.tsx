@@ -1,7 +1,7 @@
 import { useState } from "preact/hooks";
 import { zeroAddress } from "viem";
 import { useApp, useData } from "../app";
-import { amount, plain } from "../format";
+import { amount, parseAmount, plain } from "../format";
 import { texts } from "../texts";
 import type { Model, Objective, Robot } from "../types";
 import { Show, Strange } from "../ui";
@@ -17,7 +17,7 @@ export function RobotPage({ robot }: { robot: Robot }) {
   const description = model.data?.description;
   const cid = robot.objective ?? objective?.cid;
   const [number, unit] = (description?.price ?? "").split(" ");
-  const typical = unit === market.token.symbol ? BigInt(Math.round(Number(number) * 10 ** Math.min(market.token.decimals, 9))) * 10n ** BigInt(Math.max(0, market.token.decimals - 9)) : 0n;
+  const typical = unit === market.token.symbol ? parseAmount(number, market.token.decimals) ?? 0n : 0n;
   const cost = robot.cost !== null ? BigInt(robot.cost) : typical;
   const draft = cid ? { model: robot.model, objective: cid, cost, validator: zeroAddress, validatorFee: 0n, lifetime: market.defaultLifetime } : null;
   return (

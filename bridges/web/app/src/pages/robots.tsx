@@ -1,11 +1,13 @@
-import { useState } from "preact/hooks";
-import { post } from "../api";
+import { useEffect, useState } from "preact/hooks";
+import type { Address } from "viem";
+import { post, query } from "../api";
 import { useApp, useData, useTopic } from "../app";
-import { amount, duration, size } from "../format";
+import { amount, clock, duration, ether, size } from "../format";
 import { texts } from "../texts";
-import type { Agent, Liability } from "../types";
+import type { AccountState, Agent, Liability, LogEvent } from "../types";
 import { Action, Badge, Facts, Field, Money, Name, Show, Strange, Table } from "../ui";
 import { JobTable } from "./account";
+import { LoginForm } from "./login";
 
 /** Who is present, for owners and operators: health, jobs by phase, earnings, alerts, actions. */
 export function RobotsPage() {
@@ -68,7 +70,8 @@ function AgentDetails({ agent }: { agent: Agent }) {
   const { market } = useApp();
   const { status } = agent;
   const jobs = useData<{ liabilities: Liability[] }>(`liabilities?party=${agent.address}&limit=20`);
-  useTopic("chain", jobs.reload);
+  const account = useData<AccountState>(`accounts/${agent.address}`);
+  useTopic("chain", () => { jobs.reload(); account.reload(); });
   return (
     <section class="panel">
       <h2><Strange text={agent.role} most={40} /> <Name text={agent.address} /></h2>
@@ -91,6 +94,23 @@ function AgentDetails({ agent }: { agent: Agent }) {
             ]}
           />
         </div>
+        <div>
+          <h3>{texts.money}</h3>
+          <Show of={account}>
+            {({ record, spent, token, eth }) => (
+              <Facts
+                of={[
+                  [texts.earned, <Money units={record.earned} token={market.token} />],
+                  [texts.spent, <Money units={spent} token={market.token} />],
+                  [texts.balance, <Money units={token.balance} token={market.token} />],
+                  [texts.gas, ether(eth)],
+                  [texts.gasSpent, status?.market ? ether(status.market.spent) : ""],
+                  [texts.feesAndMinted, status?.market ? `${amount(status.market.fees, market.xrt)} + ${amount(status.market.minted, market.xrt)}` : ""],
+                ]}
+              />
+            )}
+          </Show>
+        </div>
       </div>
       {agent.offers.length ? (
         <>
@@ -109,24 +129,88 @@ function AgentDetails({ agent }: { agent: Agent }) {
       ) : null}
       <h3>{texts.jobs}</h3>
       <Show of={jobs}>{({ liabilities }) => <JobTable liabilities={liabilities} />}</Show>
-      {market.role === "operator" ? <Operate agent={agent} /> : <p class="hint">{texts.operatorsOnly}</p>}
+      <Log address={agent.address} />
+      {market.role === "operator" ? <OperateByAddress robot={agent.address} /> : <OperatorLogin />}
     </section>
   );
 }
 
-function Operate({ agent }: { agent: Agent }) {
-  const { notify } = useApp();
-  const [job, setJob] = useState("");
+const LEVELS = ["debug", "info", "warning", "error"];
+
+/** The latest events of a log, newest first; read again while they are shown. */
+function Log(props: { address: Address }) {
+  const [open, setOpen] = useState(false);
+  const [level, setLevel] = useState("info");
+  const log = useData<{ events: LogEvent[]; answered: boolean }>(open ? `agents/${props.address}/logs${query({ level, lines: 200 })}` : null);
+  useEffect(() => {
+    if (!open) return;
+    const timer = setInterval(log.reload, 3000);
+    return () => clearInterval(timer);
+  }, [open]);
+  return (
+    <details class="more" id="log" open={open} onToggle={(event) => setOpen(event.currentTarget.open)}>
+      <summary>{texts.log}</summary>
+      <Field label={texts.level}>
+        {(id) => (
+          <select id={id} value={level} onChange={(event) => setLevel(event.currentTarget.value)}>
+            {LEVELS.map((one) => <option key={one} value={one}>{one}</option>)}
+          </select>
+        )}
+      </Field>
+      <Show of={log}>
+        {({ events, answered }) => (
+          <Table label={texts.log} head={[texts.time, texts.level, texts.what, texts.message]} empty={answered ? texts.noEvents : texts.noLog}>
+            {[...events].reverse().map((event) => (
+              <tr key={`${event.time}${event.sequence}`}>
+                <td class="number">{clock(Date.parse(event.time) / 1000)}</td>
+                <td><Badge kind={event.level === "error" || event.level === "critical" ? "bad" : event.level === "warning" ? "warn" : "calm"}>{event.level}</Badge></td>
+                <td><code><Strange text={event.event ?? ""} most={60} /></code></td>
+                <td><Strange text={event.message} /> {event.liability ? <Name text={event.liability} href={`#/job/${event.liability}`} /> : null}</td>
+              </tr>
+            ))}
+          </Table>
+        )}
+      </Show>
+    </details>
+  );
+}
+
+/** Buttons that start, finish or restart a job; only for operators. */
+export function Operate(props: { robot: Address; job: string }) {
+  const { market, notify } = useApp();
+  if (market.role !== "operator") return null;
   const act = (action: string) => async () => {
-    await post(`agents/${agent.address}/${action}`, { liability: job });
-    notify(texts.sent(action));
+    const { success, msg } = await post<{ success?: boolean; msg?: string }>(`agents/${props.robot}/${action}`, { liability: props.job });
+    if (success === false) notify(texts.notDone(action, msg ?? ""), "bad");
+    else notify(texts.sent(action));
   };
+  return (
+    <p class="row operate">
+      {["start", "finish", "restart"].map((action) => (
+        <Action key={action} id={action} class="button small quietly" disabled={!props.job} run={act(action)}>{texts.action[action]}</Action>
+      ))}
+    </p>
+  );
+}
+
+function OperateByAddress(props: { robot: Address }) {
+  const [job, setJob] = useState("");
   return (
     <div class="row end">
       <Field label={texts.jobAddress}>
         {(id) => <input id={id} class="wide" spellcheck={false} value={job} onInput={(event) => setJob(event.currentTarget.value.trim())} />}
       </Field>
-      {["start", "finish", "restart"].map((action) => <Action key={action} class="button small" disabled={!job} run={act(action)}>{texts.action[action]}</Action>)}
+      <Operate robot={props.robot} job={job} />
     </div>
+  );
+}
+
+function OperatorLogin() {
+  const { reloadMarket } = useApp();
+  return (
+    <details class="more">
+      <summary>{texts.operatorsOnly}</summary>
+      <LoginForm label={texts.operatorToken} done={reloadMarket} />
+    </details>
   );
 }

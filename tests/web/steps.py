@@ -1,0 +1,49 @@
+"""Steps of people on the page, which several tests take."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tests.web.browser import Browser
+    from tests.web.conftest import Site
+
+
+def fill_in(browser: Browser, site: Site, *, direction: str = "left", seconds: float = 2) -> None:
+    """From the link to a model until the price is asked."""
+    browser.go(f"order/model/{site.model}")
+    browser.find("#make")
+    browser.driver.execute_script(
+        "const one = [...document.querySelectorAll('fieldset select')].at(-1); one.value = arguments[0];"
+        "one.dispatchEvent(new Event('change', { bubbles: true }))",
+        direction,
+    )
+    browser.type("Duration", str(seconds))
+    browser.click("#make")
+    browser.sees("Fits the model")
+
+
+def review(browser: Browser) -> str:
+    """From the price to the terms that are signed; gives the hash that is shown."""
+    browser.until(lambda: browser.all("#allow") or browser.all("#order:not([disabled])"), "a way to go on")
+    if browser.all("#allow"):
+        browser.click("#allow")
+    browser.click("#order:not([disabled])")
+    return browser.find("#hash").text
+
+
+def sign(browser: Browser) -> str:
+    """From the price to the job; gives its address."""
+    review(browser)
+    browser.click("#sign")
+    browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
+    return browser.driver.current_url.rpartition("/")[2]
+
+
+def order(browser: Browser, site: Site, *, direction: str = "left", seconds: float = 2) -> str:
+    """A whole order by clicks, with a wallet that is connected first; gives the job's address."""
+    if not browser.all("#account"):
+        browser.go()
+        browser.connect()
+    fill_in(browser, site, direction=direction, seconds=seconds)
+    return sign(browser)

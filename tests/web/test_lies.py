@@ -1,0 +1,99 @@
+"""Servers that lie, and strangers that send scripts: the page catches the ones, and shows the others as text.
+
+The page's own requests pass a script that alters the answers, as a lying server would.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support.objectives import objective
+from tests.web.browser import Browser
+from tests.web.conftest import HOSTILE
+from tests.web.steps import fill_in, review
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.web.conftest import Site
+
+JOB = r"liabilities\/0x\w{40}$"
+OTHER = "QmS9JArPwa55ePgDnyg6TzX24mYTS1b1vLqWNebyVotKxQ"
+LIES = {
+    "price": (JOB, "body.liability.cost = '1'"),
+    "outcome": (JOB, "body.liability.isSuccess = false"),
+    "robot": (JOB, "body.liability.promisor = body.liability.promisee"),
+    "signature": (JOB, "body.resultMessage.signature = body.resultMessage.signature.replace(/^.{8}/, '12345678')"),
+    "result": (JOB, f"body.resultMessage.result = '{OTHER}'"),
+    "recording": (r"files\/\w+$", "body[body.length >> 1] ^= 1"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_lie_about_a_job_is_caught(site: Site, paid_job: str, lie: str) -> None:
+    with Browser(site.url, site.wallet()) as browser:
+        browser.go()
+        browser.connect()
+        browser.lie(*LIES[lie])
+        browser.go(f"job/{paid_job}")
+        browser.driver.refresh()
+        assert "Don't trust this server" in browser.find("#lie").text
+        assert browser.all(".findings .badge.bad")
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "said"),
+    [
+        (r"v1\/orders$", "if (body.order) body.order.hash = 'ab'.repeat(32)", "about another order than the one shown"),
+        (r"orders\/\w{64}$", "body.order.signer = '0x' + '12'.repeat(20)", "a signature that is not its maker's"),
+        (r"orders\/\w{64}$", "body.order.cost = '1'", "about another order than the one shown"),
+    ],
+    ids=["hash", "signer", "terms"],
+)
+def test_a_lie_about_an_order_is_caught(browser: Browser, site: Site, path: str, change: str, said: str) -> None:
+    browser.lie(path, change)
+    browser.go()
+    browser.connect()
+    fill_in(browser, site, seconds=20)
+    review(browser)
+    # No contract takes the order from the page before it is looked at.
+    browser.lie(r"orders\/\w{64}$", "body.liability = null; body.state = 'open'")
+    browser.click("#sign")
+    browser.sees(said)
+
+
+def test_a_server_that_stores_another_file_is_caught(browser: Browser, site: Site, tmp_path: Path) -> None:
+    (tmp_path / "drive.mcap").write_bytes(objective(("/drive", "{}")))
+    browser.lie(r"v1\/objectives\?", f"body.cid = '{OTHER}'")
+    browser.go(f"order/model/{site.model}")
+    browser.click("#way-file")
+    browser.find("input[type=file]").send_keys(str(tmp_path / "drive.mcap"))
+    browser.click("#upload")
+    browser.sees("stored another file than the one you sent")
+    assert not browser.all("#order")
+
+
+def test_scripts_in_names_and_recordings_are_text(browser: Browser, site: Site, tmp_path: Path) -> None:
+    """In a model's texts, in an objective's topics and messages, and in the name of a file."""
+    browser.go(f"order/model/{site.hostile_model}")
+    browser.sees("<script>")
+    browser.find("#make")
+    browser.click("#make")
+    browser.sees("Fits the model")
+    name = tmp_path / "<img src=x onerror=document.title=1>.mcap"
+    name.write_bytes(objective((f"/{HOSTILE.replace('/', '')}", HOSTILE)))
+    browser.click("#way-file")
+    browser.find("input[type=file]").send_keys(str(name))
+    browser.click("#upload")
+    browser.sees("Does not fit the model")
+    browser.go(f"file/{browser.find('.chosen-objective .name').get_attribute('title')}")
+    browser.click(".topic summary")
+    browser.until(lambda: "<script>" in browser.find(".topic table").text, "the message")
+    assert browser.driver.title not in ("1", "hacked")
+    assert not browser.all("#page script")
+    assert not browser.all("#page img[src=x]")
+    assert "\u202e" not in browser.text()
+    assert browser.log() == []
+    assert browser.violations() == []

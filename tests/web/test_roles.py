@@ -1,0 +1,142 @@
+"""Operators, owners and providers: what each sees and may do, and what strangers may not."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import urllib.request
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from tests.web.browser import Browser
+from tests.web.steps import fill_in, order, sign
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from tests.web.conftest import Site
+
+PEOPLE, OPERATORS = "a token of people 123", "a token of operators 456"
+FORBIDDEN = """
+const [robot, liability, done] = arguments;
+fetch(`/api/v1/agents/${robot}/finish`, {
+  method: "POST",
+  headers: { "Content-Type": "application/json", "X-Aira-Request": "1" },
+  body: JSON.stringify({ liability }),
+}).then(async (answer) => done([answer.status, (await answer.json()).error.code]));
+"""
+
+
+@contextmanager
+def guarded(site: Site, folder: Path) -> Iterator[str]:
+    """A page where people and operators log in."""
+    (folder / "people").write_text(PEOPLE)
+    (folder / "operators").write_text(OPERATORS)
+    with site.page("--token-file", str(folder / "people"), "--operator-token-file", str(folder / "operators")) as url:
+        yield url
+
+
+def log_in(browser: Browser, token: str) -> None:
+    browser.go()
+    browser.type("Token", token)
+    browser.press("Log in")
+    browser.sees("What should be done?")
+
+
+def facts(site: Site, path: str) -> Any:
+    """What the page's server answers."""
+    with urllib.request.urlopen(f"{site.url}/api/v1/{path}", timeout=30) as response:
+        return json.load(response)
+
+
+def test_operators_finish_a_job_and_strangers_may_not(site: Site, tmp_path: Path) -> None:
+    with guarded(site, tmp_path) as url, Browser(url, site.wallet()) as person, Browser(url) as operator:
+        person.go()
+        person.type("Token", "not the token at all")
+        person.press("Log in")
+        person.sees("this is not the token")
+        assert person.violations() == []
+        log_in(person, PEOPLE)
+        log_in(operator, OPERATORS)
+        person.connect()
+        fill_in(person, site, seconds=120)
+        job = sign(person)
+        person.sees("Robot ready")
+        robot = facts(site, f"liabilities/{job}")["liability"]["promisor"]
+        assert not person.all("#finish")
+        assert person.driver.execute_async_script(FORBIDDEN, robot, job) == [403, "operators-only"]
+        operator.go(f"job/{job}")
+        operator.click("#finish")
+        operator.sees("Done: finish")
+        person.sees("the robot was paid")
+
+
+def test_an_owner_sees_health_money_jobs_and_logs(browser: Browser, site: Site) -> None:
+    address = order(browser, site)
+    browser.sees("the robot was paid")
+    browser.go("robots")
+    robot = facts(site, f"liabilities/{address}")["liability"]["promisor"]
+    row = f"//tr[.//*[@title='{robot}']]"
+    browser.until(lambda: "done" in browser.driver.find_element("xpath", row).text, "the robot's record")
+    browser.driver.find_element("xpath", f"{row}//button[contains(., 'Details')]").click()
+    browser.until(lambda: "Earned" in browser.find(".panel").text, "what the robot earned")
+    browser.until(lambda: browser.all(f".panel [title='{address}']"), "the job")
+    provider = facts(site, "lighthouse")["providers"][0]["address"]
+    browser.driver.find_element("xpath", f"//tr[.//*[@title='{provider}']]//button[contains(., 'Details')]").click()
+    browser.click("#log summary")
+    browser.until(lambda: "contract-created" in browser.find("#log").text, "an event of the provider's log")
+    assert browser.violations() == []
+
+
+def test_without_ether_for_gas_the_page_says_what_to_do(site: Site) -> None:
+    wallet, rich = site.poor_wallet(), site.wallet()
+    rich.give(wallet.address, token=facts(site, "market")["token"]["address"], units=10**10)
+    with Browser(site.url, wallet) as browser:
+        browser.go()
+        browser.connect()
+        fill_in(browser, site)
+        browser.sees("which costs gas, and this account has 0 ETH")
+        rich.give(wallet.address, wei=10**17)
+        browser.press("Check again")
+        browser.click("#allow")
+        browser.sees("The market may take")
+        browser.find("#order:not([disabled])")
+
+
+def test_an_allowance_that_the_wallet_refuses_can_be_given_later(site: Site) -> None:
+    wallet, rich = site.poor_wallet(), site.wallet()
+    rich.give(wallet.address, token=facts(site, "market")["token"]["address"], units=10**10)
+    rich.give(wallet.address, wei=10**17)
+    wallet.rejects.add("eth_sendTransaction")
+    with Browser(site.url, wallet) as browser:
+        browser.go()
+        browser.connect()
+        fill_in(browser, site)
+        browser.click("#allow")
+        browser.sees("You said no in the wallet")
+        wallet.rejects.clear()
+        browser.click("#allow")
+        browser.click("#order:not([disabled])")
+        browser.find("#hash")
+
+
+def test_a_provider_creates_a_lighthouse_stakes_and_withdraws(browser: Browser, site: Site) -> None:
+    browser.go()
+    browser.connect()
+    browser.go("provider")
+    browser.sees("Your stake")
+    browser.press("Create a lighthouse")
+    name = f"tower{secrets.token_hex(3)}"
+    browser.type("Name", name)
+    browser.driver.find_elements("xpath", "//button[normalize-space(.)='Create a lighthouse']")[-1].click()
+    browser.sees(f"The lighthouse {name} is created")
+    assert browser.wallet
+    browser.type("XRT", "2")
+    browser.click("#stake")
+    browser.sees("The stake is in the lighthouse")
+    own = f"//tr[.//*[@title='{browser.wallet.address}']]"
+    browser.until(lambda: "2 XRT" in browser.driver.find_element("xpath", own).text, "the stake in the list")
+    browser.click("#unstake")
+    browser.sees("The stake is back in your account")
+    browser.until(lambda: not browser.driver.find_elements("xpath", own), "the end of the stake")
