@@ -36,8 +36,9 @@ def sign(browser: Browser) -> str:
     """From the price to the job; gives its address."""
     review(browser)
     browser.click("#sign")
-    browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
-    return browser.driver.current_url.rpartition("/")[2]
+    # The part of the address that a frame has, too.
+    route = browser.until(lambda: browser.driver.execute_script("return location.hash.match(/^#.job.(.*)/)"), "the job")
+    return str(route[1])
 
 
 def order(browser: Browser, site: Site, *, direction: str = "left", seconds: float = 2) -> str:

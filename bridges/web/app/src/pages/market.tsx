@@ -73,6 +73,7 @@ export function MarketPage() {
       <p class="inline counts">
         {Object.entries(counts).map(([kind, count]) => <Badge key={kind} kind={kind === "lost" ? "warn" : "calm"}>{texts.eventName[kind] ?? kind} {count.toLocaleString()}</Badge>)}
       </p>
+      <p class="hint">{texts.ordersPerSecond}</p>
       <Rate perSecond={perSecond.current} />
       <div class="scroll" tabIndex={0} role="region" aria-label={texts.marketTitle}>
         <table class="ticker">

@@ -35,11 +35,22 @@ export function ObjectiveChoice(props: Choice) {
       {way === "form" ? <DescribedForm model={props.model} attempt={attempt} onError={onError} /> : null}
       {way === "file" ? <FileChoice model={props.model} attempt={attempt} onError={onError} /> : null}
       {way === "cid" ? <CidChoice model={props.model} attempt={attempt} onError={onError} /> : null}
-      {way === "none" ? <NoObjective model={props.model} attempt={attempt} onError={onError} /> : null}
+      {way === "none" ? (
+        <>
+          <p class="hint">{texts.noObjectiveHint}</p>
+          <button type="button" id="no-objective" class="button" onClick={() => props.choose(noObjective(props.model.cid))}>{texts.noObjective}</button>
+        </>
+      ) : null}
       {error ? <p class="problem" role="alert">{error}</p> : null}
-      {props.objective ? <Chosen objective={props.objective} described={props.model.described} /> : null}
+      {props.objective?.cid === props.model.cid ? <p class="chosen-objective">{texts.withoutObjective}</p> : props.objective ? <Chosen objective={props.objective} described={props.model.described} /> : null}
     </>
   );
+}
+
+/** Robots that need no objective, such as sensors, are ordered by naming the model in its place. Nobody need have its file. */
+function noObjective(model: string): Objective {
+  const summary = { cid: model, format: "", size: 0, messages: 0, startNs: "0", durationNs: "0", topics: [], metadata: {}, attachments: [] };
+  return { cid: model, size: 0, summary, preflight: { ok: true, reason: "", detail: "" } };
 }
 
 interface Way {
@@ -100,20 +111,6 @@ function CidChoice({ model, attempt, onError }: Way) {
   );
 }
 
-/** For robots that need no objective, such as sensors: the market's rule is to name the model in its place. */
-function NoObjective({ model, attempt, onError }: Way) {
-  const take = attempt(async () => {
-    const summary = await get<Summary>(`files/${model.cid}/summary`);
-    return { cid: model.cid, size: summary.size, summary, preflight: { ok: true, reason: "", detail: "" } };
-  });
-  return (
-    <>
-      <p class="hint">{texts.noObjectiveHint}</p>
-      <Action id="no-objective" run={take} onError={onError}>{texts.noObjective}</Action>
-    </>
-  );
-}
-
 interface Line {
   topic: ModelTopic;
   value: unknown;
@@ -154,7 +151,7 @@ function DescribedForm({ model, attempt, onError }: Way) {
         {topics.map((topic) => (
           <button key={topic.topic} type="button" class="button small quietly" disabled={lines.length >= most || lines.filter((one) => one.topic === topic).length >= (topic.maxMessages ?? most)}
             onClick={() => setLines((known) => [...known, line(topic, (known.at(-1)?.at ?? -1) + 1)])}>
-            + <Strange text={topic.title || topic.topic} most={60} />
+            {texts.addAnother} <Strange text={topic.title || topic.topic} most={60} />
           </button>
         ))}
       </p>

@@ -75,7 +75,7 @@ function AgentDetails({ agent }: { agent: Agent }) {
   return (
     <section class="panel">
       <h2><Strange text={agent.role} most={40} /> <Name text={agent.address} /></h2>
-      <div class="columns">
+      <div class="columns three">
         <div>
           <h3>{texts.parts}</h3>
           <Facts of={Object.entries(status?.parts ?? {}).map(([part, state]) => [part, <Badge kind={state === "alive" ? "good" : state === "off" ? "calm" : "warn"}><Strange text={state} /></Badge>])} />
