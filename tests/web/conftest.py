@@ -81,7 +81,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         "AIRA_KEYFILE_PASSWORD_FILE": str(folder / "development" / "password"),
     }
     with ExitStack() as stack:
-        up = ("up", "--data-dir", folder, "--listen", endpoint, "--port", str(port))
+        up = ("up", "--no-web", "--data-dir", folder, "--listen", endpoint, "--port", str(port))
         stack.enter_context(Serving(*AIRA, *up, says="provider    0x"))
         model = json.loads(aira("model", "new", HERE / "model.json", "--out", folder / "model.json", "--json").stdout)
         hostile = hostile_model(folder)
