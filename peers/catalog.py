@@ -169,6 +169,13 @@ _ALL = (
         search=_named_by("AIRA_KUBO"),
         absent="in no registry: name one with AIRA_KUBO=/path/to/ipfs",
     ),
+    Peer(
+        name="mcap",
+        purpose="MCAP's own command line, whose doctor checks recordings",
+        recipe=None,
+        search=_named_by("AIRA_MCAP"),
+        absent="in no registry: name one with AIRA_MCAP=/path/to/mcap",
+    ),
     Peer(name="systemd-analyze", purpose="checks systemd units", recipe=UNITS, search=_command("systemd-analyze")),
     Peer(name="avr-gcc", purpose="compiles firmware", recipe=BOARDS, search=_command("avr-gcc")),
     Peer(

@@ -156,8 +156,8 @@ class TradingAgent(Lifecycle):
         `validator_fee` is `"0.1 XRT"`, or wn. The factory gets the allowance that they need. A restarted agent sends
         the order again.
 
-        Raises `NotAnObjective`, `InvalidAmount`, `InsufficientTokens`, and `ObjectiveUnfit` if the model's description
-        is available and excludes the objective.
+        Raises `NotAnObjective`, `InvalidAmount`, `InsufficientTokens`, and `ObjectiveUnfit` if a file is not playable,
+        or if the model's description is available and excludes the objective.
         """
         writer = self.runtime.trader.writer
         cid = await self._cid_of(objective)
@@ -214,13 +214,14 @@ class TradingAgent(Lifecycle):
         return await asyncio.to_thread(self.parts.store.put_file, Path(path))
 
     async def _cid_of(self, objective: str | Path | Messages) -> str:
-        """The CID of an objective, once the agent's store has it. Raises `NotAnObjective`."""
+        """The CID of an objective, once the agent's store has it. Raises `NotAnObjective`, and `ObjectiveUnfit`."""
         if not isinstance(objective, str | Path):
             return await asyncio.to_thread(put_values, self.parts.store, objective)
         if isinstance(objective, str) and is_cid(objective):
             return objective
         if not await asyncio.to_thread(Path(objective).is_file):
             raise NotAnObjective(str(objective))
+        await self.runtime.objectives.require_playable(Path(objective))
         return await self.add(objective)
 
     async def fetch(self, cid: str) -> Path:

@@ -26,7 +26,7 @@ RETIRED: Final = {
 }
 """Options of the legacy stack that have no meaning here, and why. They are logged and ignored."""
 
-NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO", "AIRA_PEERS_CACHE"})
+NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO", "AIRA_MCAP", "AIRA_PEERS_CACHE"})
 """`AIRA_*` variables that belong to the command line or to the tests, not to the settings."""
 
 

@@ -109,6 +109,10 @@ class Objectives:
                 path = await self._fetch(cid, patience)
         return await self._check(cid, path, self._handlers, self._model)
 
+    async def require_playable(self, path: Path) -> None:
+        """Raise `ObjectiveUnfit` for a file that no robot can play."""
+        await self._check(str(path), path, None, None)
+
     async def require_fit(self, cid: str, model: ModelDescription) -> None:
         """Raise `ObjectiveUnfit` if an objective does not fit the model that a demand orders.
 

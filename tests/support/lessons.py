@@ -13,7 +13,7 @@ import pytest
 from tests.support.boards import board, edge
 from tests.support.commands import AIRA, Serving
 from tests.support.ports import free_port
-from tests.support.recordings import decoded, recordings_in
+from tests.support.recordings import check_recording, recordings_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,7 +40,7 @@ def market(tmp_path: Path) -> Iterator[dict[str, str]]:
             "AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "development" / "password"),
         }
     for path in recordings_in(tmp_path):
-        decoded(path)
+        check_recording(path)
 
 
 def as_role(role: str, market: dict[str, str]) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from typing import TYPE_CHECKING, Any
 
 from mcap.decoder import DecoderFactory
@@ -11,6 +12,7 @@ from mcap_ros1.decoder import DecoderFactory as Ros1Decoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 
 from mesh.recording.mcap_writer import MAGIC
+from peers.catalog import PEERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -37,6 +39,14 @@ def decoded(path: Path) -> list[tuple[str, Any]]:
             stream, validate_crcs=True, decoder_factories=[JsonDecoders(), Ros1Decoders(), Ros2Decoders()]
         )
         return [(one.channel.topic, one.decoded_message) for one in reader.iter_decoded_messages()]
+
+
+def check_recording(path: Path) -> None:
+    """Fail unless other programs read an MCAP file without complaint; `mcap doctor` is one of them if it is here."""
+    decoded(path)
+    if (mcap := PEERS["mcap"].search()) is not None:
+        done = subprocess.run([mcap, "doctor", path], capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, ""), f"{path}: {done.stderr}"
 
 
 def recordings_in(folder: Path) -> Iterator[Path]:

@@ -11,6 +11,7 @@ from mesh.agent.contract import Contract, Outcome
 from mesh.agent.errors import NotAnObjective
 from mesh.agent.orders import Order, OrderState
 from mesh.amounts import InvalidAmount
+from mesh.work.objectives import ObjectiveUnfit
 from schemas import Empty, cid_of_file, message_hash
 from tests.mesh.work.samples import liability
 from tests.support.objectives import objective
@@ -57,6 +58,14 @@ async def test_what_is_neither_cid_nor_file_is_refused(place: Place, tmp_path: P
             with pytest.raises(NotAnObjective) as caught:
                 await person.order(missing)
             assert caught.value.text == str(missing)
+
+
+async def test_a_file_that_no_robot_can_play_is_refused(place: Place, tmp_path: Path) -> None:
+    (tmp_path / "robot.py").write_text("import this")
+    async with place.agent("person") as person:
+        with pytest.raises(ObjectiveUnfit) as caught:
+            await person.order(str(tmp_path / "robot.py"))
+        assert caught.value.reason == "not-a-recording"
 
 
 async def test_a_contract_prints_its_address_state_cost_and_parties() -> None:
