@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from schemas.loading import on_demand
+from mesh.shadowing import require_own
+
+require_own("schemas")  # before it is imported
+
+from schemas.loading import on_demand  # noqa: E402
 
 if TYPE_CHECKING:
     from mesh.agent import (

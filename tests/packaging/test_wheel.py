@@ -124,3 +124,30 @@ def test_an_agent_with_a_keyfile_names_the_extra(base: Path, tmp_path: Path) -> 
     first, second = done.stderr.splitlines()
     assert first.endswith("[package-missing]")
     assert second.strip() == "pip install 'aira-mesh[chain]'"
+
+
+@pytest.mark.parametrize("words", [["--version"], ["cid", "it"]])
+def test_python_m_mesh_works_beside_folders_of_the_same_names(base: Path, tmp_path: Path, words: list[str]) -> None:
+    (tmp_path / "it").write_text("a lamp")
+    for name, file in (("schemas", "__init__.py"), ("bridges", "__init__.py"), ("mesh", "notes.txt")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / file).touch()
+    done = in_base(base, "-m", "mesh", *words, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_program_beside_another_schemas_is_told_which_folder_hides_ours(base: Path, tmp_path: Path) -> None:
+    (tmp_path / "schemas").mkdir()
+    (tmp_path / "schemas" / "__init__.py").touch()
+    done = in_base(base, "-c", "import mesh", folder=tmp_path)
+    assert done.stderr.splitlines()[-1].startswith("ImportError: ")
+    assert str(tmp_path / "schemas") in done.stderr.splitlines()[-1]
+
+
+def test_another_package_mesh_is_named_by_python(base: Path, tmp_path: Path) -> None:
+    (tmp_path / "mesh").mkdir()
+    (tmp_path / "mesh" / "__init__.py").touch()
+    done = in_base(base, "-m", "mesh", "--version", folder=tmp_path)
+    assert done.returncode == 1
+    assert "mesh.__main__" in done.stderr
+    assert in_base(base, "-P", "-m", "mesh", "--version", folder=tmp_path).returncode == 0
