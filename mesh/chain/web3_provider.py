@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from aiohttp import ClientError, ClientResponseError
+from aiohttp.http import HttpProcessingError
 from web3.exceptions import Web3Exception
 from web3.providers.async_base import AsyncBaseProvider
 
@@ -262,6 +263,8 @@ def _shown(chain: int | RpcFailure) -> str:
 
 def _reason(error: Exception) -> str:
     match error:
+        case ClientResponseError(__cause__=HttpProcessingError()):
+            return "the answer is not HTTP"
         case ClientResponseError():
             return f"HTTP {error.status} {error.message}"
         case TimeoutError():

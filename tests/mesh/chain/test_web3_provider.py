@@ -117,6 +117,22 @@ async def test_a_server_that_says_nothing_is_given_up_after_one_attempt(scheme: 
     assert len(attempts) == 1
 
 
+async def test_a_server_that_speaks_no_http_is_given_up_at_once_in_one_line() -> None:
+    attempts: list[bytes] = []
+
+    async def greet(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        attempts.append(await reader.readline())
+        writer.write(b"SSH-2.0-server\r\n")
+        writer.close()
+
+    server = await asyncio.start_server(greet, "127.0.0.1")
+    async with server:
+        with unreachable("the answer is not HTTP"):
+            async with Node(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}"):
+                pass
+    assert len(attempts) == 1
+
+
 async def test_a_json_rpc_error_with_an_http_status_is_reported() -> None:
     async def rude(request: web.Request) -> web.Response:
         error = {"code": -32005, "message": "limit exceeded"}
