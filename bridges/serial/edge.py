@@ -1,12 +1,11 @@
-"""The edge agent: a board's topics as keys of its agent, and what is put or queried there brought to the board.
+"""The edge agent: serves a board's topics as keys of its agent.
 
-Outside a job a topic is `aira/agent/{address}/device/{device}/{topic}`; what belongs to a job uses the liability's
-topics and becomes part of the recording. A put is a command without a reply; a query is a call, whose reply reports how
-it ended. While the board answers, its liveliness token is on the device's topic `/present`.
+Outside a job a topic is `aira/agent/{address}/device/{device}/{topic}`; messages of a job use the liability's topics
+and are recorded. A put is a command without a reply; a query is a call, whose reply reports how it ended. While the
+board answers, its liveliness token is on the device's topic `/present`.
 
-If several devices of an agent have a topic of the same name, a call reaches the one that its parameter `device` names,
-and a command in a job reaches all of them: rename the topics of one to avoid that. An edge agent marks everything that
-it puts, so that no other one takes it for a command.
+If several devices of an agent share a topic's name, a call reaches the one that its parameter `device` names, a command
+in a job all of them. Edge agents mark what they put, so that others don't take it for a command.
 """
 
 from __future__ import annotations
@@ -39,13 +38,7 @@ from bridges.serial.metrics import EdgeCounters
 from mesh.errors import InvalidKey
 from mesh.log_context import liability_context, log_event
 from mesh.network import sending
-from schemas.agent_keys import (
-    DeviceTopicKey,
-    EventKey,
-    LiabilityTopicKey,
-    parse_agent_key,
-    topic_chunks,
-)
+from schemas.agent_keys import DeviceTopicKey, EventKey, LiabilityTopicKey, parse_agent_key, topic_chunks
 from schemas.payloads import EMPTY, STRING, String, payload_type
 from schemas.selectors import event_selector, topic_selector
 
@@ -75,9 +68,7 @@ class JobTracker:
 
     def begin(self, liability: str) -> None:
         """Make this job the current one: a command named it."""
-        if liability in self._open:
-            self._open.remove(liability)
-        self._open.insert(0, liability)
+        self._open = [liability, *(other for other in self._open if other != liability)]
 
     def handle_event(self, key: str) -> None:
         """Update the jobs by an event of the agent, given its key."""
@@ -86,20 +77,18 @@ class JobTracker:
         except InvalidKey as error:
             log.info("%s", error, extra=log_event("key-ignored", key=key))
             return
-        if not isinstance(event, EventKey):
-            return
-        if event.event == "ready" and event.liability not in self._open:
-            self._open.append(event.liability)
-        elif event.event in ("complete", "finalized") and event.liability in self._open:
-            self._open.remove(event.liability)
+        match event:
+            case EventKey(event="ready", liability=job) if job not in self._open:
+                self._open.append(job)
+            case EventKey(event="complete" | "finalized", liability=job) if job in self._open:
+                self._open.remove(job)
 
 
 class Edge:
     """A board in the mesh, on an open session, as the device `name` of the agent with the address `agent`.
 
     A command waits at most `patience` seconds for a board that is absent or busy; `rename` maps the board's topics to
-    their names in the mesh. `run` blocks its thread until `stop` is called from another one; it needs no event loop.
-    Raises `InvalidKey` for a device whose name or agent is invalid.
+    their names in the mesh. `run` blocks its thread and needs no event loop. Raises `InvalidKey` for an invalid name.
     """
 
     def __init__(
@@ -131,7 +120,9 @@ class Edge:
     def run(self) -> None:
         """Serve until `stop`."""
         subscriber: Any = self._session.declare_subscriber(event_selector(self._agent), self._on_job_event)
-        about: Any = self._session.declare_queryable(self._key(ABOUT), self._on_about_query)
+        about: Any = self._session.declare_queryable(
+            self._key(ABOUT), lambda query: self._line.call_soon(partial(self._reply_about, query))
+        )
         try:
             self._line.run()
         finally:
@@ -170,10 +161,8 @@ class Edge:
         self._commandable = {self._name_of[topic]: topic for topic in reversed(accepting)}
         for topic in accepting:
             if self._commandable[name := self._name_of[topic]] != topic:
-                shadowed = log_event("topic-shadowed", topic=topic.name, name=name)
-                log.warning(
-                    "%s is the name of another topic of the board; nothing reaches %s", name, topic.name, extra=shadowed
-                )
+                facts = {"topic": topic.name, "name": name}
+                log.warning("%(name)s is another topic's name, too", facts, extra=log_event("topic-shadowed", **facts))
         for name in self._declared.keys() - self._commandable.keys():
             for declared in self._declared.pop(name):
                 declared.undeclare()
@@ -184,9 +173,8 @@ class Edge:
             self._token = self._session.liveliness().declare_token(self._key(PRESENT))
         topics = ", ".join(self._name_of.values()) or "no topics"
         ready = log_event("board-ready", name=info.name, version=info.version, topics=topics)
-        log.info(
-            "%s is present: %s", " ".join(filter(None, ("the board", info.name, info.version))), topics, extra=ready
-        )
+        title = " ".join(filter(None, ("the board", info.name, info.version)))
+        log.info("%s is present: %s", title, topics, extra=ready)
 
     def _valid_names(self, info: DeviceInfo) -> Iterator[tuple[BoardTopic, str]]:
         """The board's topics with their names in the mesh; those without a valid one are left out."""
@@ -222,9 +210,6 @@ class Edge:
 
     def _on_call(self, query: zenoh.Query) -> None:
         self._line.call_soon(partial(self._call, query))
-
-    def _on_about_query(self, query: zenoh.Query) -> None:
-        self._line.call_soon(partial(self._reply_about, query))
 
     def _command(self, key: str, payload: bytes, given: PayloadType) -> None:
         topic, job = self._topic_of(key)
@@ -271,10 +256,9 @@ class Edge:
             return
         if topic.flow is Flow.REQUESTS:
             self._request(topic, self._key(name), payload)
-            return
-        job = self._jobs.current
-        key = self._job_key(job, name) if job else self._key(name)
-        self._put(key, payload, topic.type, attachment=said_by(self._name))
+        else:
+            key = self._job_key(job, name) if (job := self._jobs.current) else self._key(name)
+            self._put(key, payload, topic.type, attachment=said_by(self._name))
 
     def _request(self, topic: BoardTopic, key: str, payload: bytes) -> None:
         """Query the mesh for the board, which gets each answer."""

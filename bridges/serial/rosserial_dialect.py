@@ -1,11 +1,10 @@
 """The host's side of rosserial version 2, for every sketch that speaks it.
 
-A board acknowledges nothing and buffers 64 bytes. But it announces its topics when it reads a request for them; so each
-command is followed by that request, and the next command is sent after the answer: until then the board may still run
-the callback of the last one. The answer proves no more: the board skips a damaged command silently.
+A board acknowledges nothing and buffers 64 bytes. But it announces its topics on request, so that request follows each
+command, and the next command is sent after the answer: until then the board may still run the last callback. The
+answer proves no more: the board skips a damaged command silently.
 
-If the cable is pulled during a command, nothing is asked when the board is back: one that was asked before and was not
-restarted speaks by itself within some seconds, so it is known that it reads on.
+After a cable was pulled during a command, the board is not asked: if it was not restarted, it speaks within seconds.
 """
 
 from __future__ import annotations

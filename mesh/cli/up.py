@@ -150,24 +150,21 @@ async def serve_market(
             serve_chain(settings, host="127.0.0.1", port=port, block_time=block_time, anvil=program, state=state)
         )
         chain = await stack.enter_async_context(served.market.chain(served.url, "provider"))
-        # Each generation has its own name for the lighthouse, and so its own keys.
-        markets = [Settings(generation=3).lighthouse_contract, Settings(generation=5).lighthouse_contract]
+        markets = [Settings(generation=generation).lighthouse_contract for generation in (3, 5)]
         folder = await state_folder(settings, chain, served.market.accounts["provider"].address)
-        providers = [
-            await stack.enter_async_context(
-                Provider(network.session, chain, name, withdrawals=folder / f"withdrawals-{name.lower()}.sqlite")
-            )
-            for name in markets
-        ]
+        providers = []
+        for name in markets:
+            provider = Provider(network.session, chain, name, withdrawals=folder / f"withdrawals-{name.lower()}.sqlite")
+            providers.append(await stack.enter_async_context(provider))
         process = ProviderProcess(network, chain, providers)
         stack.enter_context(telemetry.showing(measure=process.measure, health=process.health))
         where = await _page_line(stack, page, settings, served)
         tasks = await stack.enter_async_context(asyncio.TaskGroup())
-        for market, one in zip(markets, providers, strict=True):
-            tasks.create_task(one.run(), name=f"provider of {market}")
-        router, provider = ", ".join(settings.listen), providers[0].address
-        words = f"router      {router}\n{served.describe()}\n{where}provider    {provider}"
-        announce(log, "market-started", words, **served.facts(), provider=provider)
+        for name, provider in zip(markets, providers, strict=True):
+            tasks.create_task(provider.run(), name=f"provider of {name}")
+        router, address = ", ".join(settings.listen), providers[0].address
+        words = f"router      {router}\n{served.describe()}\n{where}provider    {address}"
+        announce(log, "market-started", words, **served.facts(), provider=address)
 
 
 async def _page_line(

@@ -53,10 +53,9 @@ class OutputNotWritable(ConfigurationError, code="output-not-writable"):
 class Demo:
     """The demo: router, chain, provider, robot and person.
 
-    `folder` is for its files while it runs; the caller removes it, once the event loop and its threads have ended.
-    `objective` is a file (None: three blinks), `generation` that of the messages, `out` the folder where objective and
-    recording are kept (None: nowhere). `timeout` is in seconds (see `TIMEOUT`). With `page`, a port, the page of the
-    market is served, and `run` continues until it is cancelled.
+    `folder` is for its files; the caller removes it once the event loop and its threads have ended. `objective` is a
+    file (None: three blinks), `generation` that of the messages, `out` the folder that keeps objective and recording
+    (None: nowhere). With `page`, a port, the market's page is served, and `run` continues until it is cancelled.
     """
 
     def __init__(
@@ -84,11 +83,7 @@ class Demo:
         self._person: Agent
 
     async def run(self) -> None:
-        """Run the whole demo, once.
-
-        Raises `InputError` for an objective that can't be played and `OutputNotWritable`, both before anything is
-        opened, and `DemoStalled`.
-        """
+        """Run the whole demo, once. Raises `InputError` and `OutputNotWritable` at the start, and `DemoStalled`."""
         started = time.monotonic()
         objective = await asyncio.to_thread(self._prepare)
         try:
@@ -236,15 +231,9 @@ class Demo:
                 event("robot", "running", "plays the objective and records its device", liability=address)
             case Phase.COMPLETE:
                 self._success = liability.is_success
-                done = "done" if liability.is_success else "not done"
-                event(
-                    "robot",
-                    "complete",
-                    f"signs the Result: {done}, recording\n{liability.result}",
-                    liability=address,
-                    result=liability.result,
-                    success=liability.is_success,
-                )
+                success, result = liability.is_success, liability.result
+                words = f"signs the Result: {'done' if success else 'not done'}, recording\n{result}"
+                event("robot", "complete", words, liability=address, result=result, success=success)
                 self._narrator.chapter("The contract pays" if liability.is_success else "The contract refunds")
             case Phase.FINALIZED:
                 event("contract", "finalized", "liability is finalized", liability=address)
@@ -252,10 +241,9 @@ class Demo:
 
     async def _do_job(self, objective: Objective, started: float) -> Contract:
         """Publish the demand, wait until the job is done and paid, and keep the recording."""
-        before, path = await self._balances(), objective.path
+        before, path, event = await self._balances(), objective.path, self._narrator.event
         self._narrator.chapter("A person wants work done")
         cid = await asyncio.to_thread(cid_of_file, path)
-        event = self._narrator.event
         event("person", "objective", f"holds the objective {path.name}\n{cid}", objective=cid, file=str(path))
         event("person", "asking", f"will pay {_xrt(COST)} for it, and publishes a Demand", model=MODEL, cost=COST)
         async with asyncio.timeout(self._timeout):
@@ -265,11 +253,10 @@ class Demo:
             await self._finalized.wait()
         recording, after = await contract.recording(), await self._balances()
         for role in ROLES:
-            balance = f"had {_xrt(before[role])}, has {_xrt(after[role])}"
-            event(role, "balance", balance, before=before[role], after=after[role])
+            had, has = before[role], after[role]
+            event(role, "balance", f"had {_xrt(had)}, has {_xrt(has)}", before=had, after=has)
         kept = await asyncio.to_thread(self._keep, recording, outcome.result, path, cid)
-        words = f"has the recording {kept}\n{outcome.result}"
-        event("person", "recording", words, result=outcome.result, path=kept)
+        event("person", "recording", f"has the recording {kept}\n{outcome.result}", result=outcome.result, path=kept)
         self._summarize(contract, outcome, cid, started)
         return contract
 
@@ -279,8 +266,7 @@ class Demo:
 
     def _keep(self, recording: Path, result: str, objective: Path, cid: str) -> str:
         """Copy recording and objective to the output folder, named by their CIDs; return where the recording is."""
-        out = self._out
-        if out is None:
+        if (out := self._out) is None:
             return f"{result}.mcap (keep it with --out DIR)"
         kept = out / f"{result}.mcap"
         for source, target in ((objective, out / f"{cid}{objective.suffix}"), (recording, kept)):
