@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from mesh.recording import GENEROUS, numbers_of, open_objective, value_of
+from mesh.recording import GENEROUS, numbers_of, open_objective
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -116,7 +116,7 @@ def _of_topic(recording: Objective, topic: str, first: int) -> Iterator[tuple[in
 
 
 def _facts(message: Played, number: int, start_ns: int, cid: str) -> dict[str, Any]:
-    value, is_cut = value_of(message), False
+    value, is_cut = message.value, False
     if isinstance(value, bytes):
         is_cut = len(value) > LONGEST_VALUE
         value = base64.b64encode(value[:LONGEST_VALUE]).decode()
@@ -143,7 +143,7 @@ def _how_shown(message: Played) -> str:
     """How the messages of a topic are shown: `values`, `image`, `text`, `bytes` or `none`."""
     if _image(message):
         return "image"
-    value = value_of(message)
+    value = message.value
     if value is None:
         return "none"
     if isinstance(value, bytes):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.cli.output import json_text, print_json, print_line, printable
-from mesh.recording import GENEROUS, open_objective, value_of
+from mesh.recording import GENEROUS, open_objective
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,12 +37,12 @@ def _facts(message: Played) -> dict[str, Any]:
         "type": message.type.zenoh_encoding,
         "role": message.role,
     }
-    value = value_of(message)
+    value = message.value
     return facts | ({"base64": value} if isinstance(value, bytes) else {"value": value})
 
 
 def _text(message: Played) -> str:
-    value = value_of(message)
+    value = message.value
     if isinstance(value, bytes):
         shown = value[:BYTES_SHOWN].hex(" ") + (" …" if len(value) > BYTES_SHOWN else "")
         return f"{printable(message.type.schema_name or message.type.encoding or 'bytes')}, {len(value)} bytes: {shown}"

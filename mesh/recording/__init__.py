@@ -35,4 +35,4 @@ from mesh.recording.recorder import Recorder, RecorderSettings, RecordingSummary
 from mesh.recording.recorders import Recorders
 from mesh.recording.recovery import RECOVERED, recover
 from mesh.recording.source import Attachment
-from mesh.recording.values import numbers_of, value_of
+from mesh.recording.values import numbers_of

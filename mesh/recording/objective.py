@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Struct
 
@@ -13,11 +14,11 @@ from mesh.recording.bag_source import open_bag
 from mesh.recording.errors import NotARecording, RecordingTooLarge
 from mesh.recording.limits import Limits
 from mesh.recording.mcap_source import open_mcap
-from schemas.payloads import PayloadType
+from schemas.errors import InvalidPayload
+from schemas.payloads import Empty, PayloadType, String, decode_value
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
 
     from mesh.content import Progress
     from mesh.recording.source import OnMessage, RecordingChannel, RecordingSource
@@ -46,6 +47,17 @@ class Played(Struct, frozen=True):
     sequence: int
     type: PayloadType
     role: str = ""
+
+    @property
+    def value(self) -> Any:
+        """A number, a text, a list, None for an empty message, JSON data; else bytes."""
+        try:
+            value = decode_value(self.payload, self.type)
+        except InvalidPayload:
+            return self.payload
+        if isinstance(value, String):
+            return value.data
+        return None if isinstance(value, Empty) else value
 
 
 class ChannelMessage(Struct, frozen=True):
@@ -98,14 +110,14 @@ class Objective:
             yield ChannelMessage(channel, _played(channels[channel], payload, log_time, publish_time, sequence))
 
 
-def open_objective(path: Path, limits: Limits = _DEFAULT, *, progress: Progress | None = None) -> Objective:
+def open_objective(path: str | Path, limits: Limits = _DEFAULT, *, progress: Progress | None = None) -> Objective:
     """Check the whole recording at `path`, an MCAP file or a ROS 1 bag, and open it.
 
     Reads the whole file: use a thread. The limits bound the memory, whatever the file states; schema texts are never
     parsed. `progress` is called with the bytes read, of all. Raises `NotARecording`, `RecordingTooLarge`,
     `CorruptRecording`.
     """
-    return Objective(open_source(path, limits, progress=progress))
+    return Objective(open_source(Path(path), limits, progress=progress))
 
 
 def open_source(

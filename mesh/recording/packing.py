@@ -18,6 +18,7 @@ import base64
 import binascii
 from dataclasses import dataclass
 from decimal import Decimal
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -35,7 +36,6 @@ from schemas.payloads import EMPTY, JSON, STRING, Empty, PayloadType, String, en
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
 
     from mesh.content import Progress
 
@@ -92,7 +92,7 @@ class PackSummary:
 
 
 def pack(
-    messages: Iterable[Played], target: Path, *, metadata: Mapping[str, Mapping[str, str]] | None = None
+    messages: Iterable[Played], target: str | Path, *, metadata: Mapping[str, Mapping[str, str]] | None = None
 ) -> PackSummary:
     """Write messages, in any order, and metadata records to an MCAP file. Equal messages give equal bytes.
 
@@ -102,7 +102,7 @@ def pack(
     first = last = 0
     topics: set[str] = set()
     schemas = JsonSchemas()
-    with atomic_file(target) as stream:
+    with atomic_file(Path(target)) as stream:
         writer = McapWriter(stream)
         for name, values in (metadata or {}).items():
             writer.add_metadata(name, values)

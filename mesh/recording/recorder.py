@@ -13,6 +13,7 @@ import threading
 from concurrent.futures import Future
 from contextvars import copy_context
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from mesh.clock import SYSTEM_CLOCK
@@ -23,8 +24,6 @@ from mesh.recording.mcap_writer import check_message
 from mesh.recording.partial import PartialFile, PendingMessage
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from mesh.clock import Clock
     from mesh.recording.partial import MessageRole, RecordingAbout
     from schemas.payloads import PayloadType
@@ -88,8 +87,14 @@ class Recorder:
     """
 
     def __init__(
-        self, path: Path, about: RecordingAbout, *, settings: RecorderSettings = _SETTINGS, clock: Clock = SYSTEM_CLOCK
+        self,
+        path: str | Path,
+        about: RecordingAbout,
+        *,
+        settings: RecorderSettings = _SETTINGS,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
+        path = Path(path)
         self.path: Final = path
         self._settings = settings
         self._clock = clock

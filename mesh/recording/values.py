@@ -1,11 +1,11 @@
-"""The values of recorded messages: to print them, and to plot their numbers."""
+"""The numbers in recorded messages, to plot them."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
 from schemas.errors import InvalidPayload
-from schemas.payloads import Empty, String, decode_value
+from schemas.payloads import String, decode_value
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -14,17 +14,6 @@ if TYPE_CHECKING:
 
 LONGEST_LIST: Final = 12
 """Members of a list whose numbers are read."""
-
-
-def value_of(message: Played) -> Any:
-    """A text, None for an empty message, JSON data, or the bytes of what has another type or is not of its type."""
-    try:
-        value = decode_value(message.payload, message.type)
-    except InvalidPayload:
-        return message.payload
-    if isinstance(value, String):
-        return value.data
-    return None if isinstance(value, Empty) else value
 
 
 def numbers_of(message: Played) -> Iterator[tuple[str, float]]:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from mesh.recording import Played, Recorder, RecordingAbout, json_type, open_objective, rates_of
-from schemas.payloads import JSON, RAW
+from mesh.recording import Played, Recorder, RecordingAbout, json_type, open_objective, pack, rates_of
+from schemas.payloads import JSON, RAW, encode_value, payload_type
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -81,3 +81,14 @@ def test_the_schema_is_in_the_recording(tmp_path: Path) -> None:
         recorder.record("/point", msgspec.json.encode(Point(1.0)), json_type(Point))
     (topic,) = open_objective(tmp_path / "it.mcap").topics
     assert topic.type == json_type(Point)
+
+
+def test_programs_name_files_by_text_and_read_values(tmp_path: Path) -> None:
+    made, copied = f"{tmp_path}/made.mcap", f"{tmp_path}/copied.mcap"
+    with Recorder(made, RecordingAbout()) as recorder:
+        for value in (1.5, "text", None, {"x": [1]}, b"bytes"):
+            recorder.record("/it", *encode_value(value))
+        recorder.record("/it", b"no number", payload_type("ros1;std_msgs/Float64"))
+    pack(open_objective(made).messages(), copied)
+    found = [message.value for message in open_objective(copied).messages()]
+    assert found == [1.5, "text", None, {"x": [1]}, b"bytes", b"no number"]
