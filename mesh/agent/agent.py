@@ -80,6 +80,10 @@ class Agent(HandlerDecorators, ReadingAgent):
         self.drops = Drops()
         """Counts what was dropped, of what strangers sent."""
 
+    def __repr__(self) -> str:
+        who = f", account={self.address}" if self._runtime is not None else ""
+        return f"Agent(model={self.model or '(any)'}{who})"
+
     def model_description(
         self, title: str, *, result: Mapping[str, Any] | None = None, **fields: Unpack[DescriptionFields]
     ) -> ModelDescription:

@@ -11,6 +11,7 @@ from mesh.agent.contract import Contract, Outcome
 from mesh.agent.errors import NotAnObjective
 from mesh.agent.orders import Order, OrderState
 from mesh.amounts import InvalidAmount
+from mesh.work.job import Job
 from mesh.work.objectives import ObjectiveUnfit
 from schemas import Empty, cid_of_file, message_hash
 from tests.mesh.work.samples import liability
@@ -106,3 +107,12 @@ def test_an_order_prints_its_state_and_terms_in_one_short_line() -> None:
     assert shown.startswith(f"Order(demand {'ab' * 32}, open, model={said.model}, ")
     shown = repr(Order(state=OrderState.MATCHED, liability="0x12", **facts))
     assert shown.endswith(f"cost={said.cost}, deadline={said.deadline}, liability=0x12)")
+
+
+async def test_an_agent_and_its_job_print_what_they_are_for(place: Place) -> None:
+    agent = place.agent("robot")
+    assert repr(agent) == f"Agent(model={agent.model})"
+    async with agent:
+        assert repr(agent) == f"Agent(model={agent.model}, account={agent.address})"
+    job = Job(None, place.address("robot"), liability(), position=2)  # type: ignore[arg-type]
+    assert repr(job) == f"Job({liability().address}, position=2, topics=[])"
