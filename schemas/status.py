@@ -79,6 +79,8 @@ class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_f
     """Seconds since it started."""
     work: Work | None = None
     market: MarketStatus | None = None
+    model: str = ""
+    """The model of an agent that has one, a CIDv0."""
     dropped: Mapping[str, int] = {}
     """What it dropped since it started because there was too much of it, by reason."""
     heaviest: Mapping[str, Mapping[str, int]] = {}

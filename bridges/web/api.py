@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -234,20 +235,21 @@ class Api:
     async def liabilities(self, request: web.Request) -> web.Response:
         query, limit = request.query, number_in(request, "limit", 50, most=LISTED)
         party = parse_address(query["party"]) if query.get("party") else ""
-        found = []
-        for job in reversed(self._market.contracts.jobs.values()):
-            record = job.liability
-            if party and party not in (record.promisee, record.promisor):
-                continue
-            if query.get("model") and query["model"] != record.model:
-                continue
-            if query.get("state") and (query["state"] == "finalized") != record.is_finalized:
-                continue
-            found.append(record)
-            if len(found) > limit:
-                break
+        jobs = [
+            job
+            for job in reversed(self._market.contracts.jobs.values())
+            if (not party or party in (job.liability.promisee, job.liability.promisor))
+            and query.get("model") in (None, "", job.liability.model)
+        ]
+        found = [
+            job.liability
+            for job in jobs
+            if query.get("phase") in (None, "", job.phase)
+            and (not query.get("state") or (query["state"] == "finalized") == job.liability.is_finalized)
+        ]
         listed = [liability_json(record, self._market.contracts.labels) for record in found[:limit]]
-        return answer({"liabilities": listed, "more": len(found) > limit})
+        phases = Counter(job.phase for job in jobs)
+        return answer({"liabilities": listed, "more": len(found) > limit, "phases": phases})
 
     async def job(self, request: web.Request) -> web.Response:
         return answer(await self._views.job(address_in(request)))

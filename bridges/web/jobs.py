@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from bridges.web.alerts import alerts_of
 from bridges.web.views import liability_json, result_json
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
 from mesh.evidence import Claim, Verdict, check_end, verify
 from mesh.watching import present, statuses
 from mesh.work.notes import read_reason
-from schemas import ZERO_ADDRESS, encode
-from schemas.status import ALIVE, OFF, BridgeStatus
+from schemas import ZERO_ADDRESS, encode, parse_cid
+from schemas.status import ALIVE, OFF, BridgeStatus, Status
 
 if TYPE_CHECKING:
     from bridges.web.components import WebComponents
@@ -199,13 +200,14 @@ class Views:
                 "address": peer.address,
                 "health": _health(status),
                 "status": None if status is None else msgspec.json.decode(status.encode()),
-                "models": sorted(models.get(peer.address, ())) if peer.role == "agent" else [],
+                "models": sorted(models.get(peer.address, set()) | _own_model(status)) if peer.role == "agent" else [],
                 "offers": [order.json() for order in offers.get(peer.address, ())][:LISTED],
                 "record": records.get(peer.address, AccountRecord()).json(),
             }
             for peer, status in found.items()
         ]
-        return {"agents": listed, "unlisted": max(0, len(peers) - AGENTS)}
+        alerts = alerts_of({peer.address: status for peer, status in found.items()}, market.head)
+        return {"agents": listed, "unlisted": max(0, len(peers) - AGENTS), "alerts": alerts}
 
     def _offers(self) -> dict[str, list[SeenOrder]]:
         """The open offers by signer."""
@@ -221,6 +223,15 @@ class Views:
         for job in self._contracts.jobs.values():
             found.setdefault(job.liability.promisor, set()).add(job.liability.model)
         return found
+
+
+def _own_model(status: RoleStatus | None) -> set[str]:
+    """The model that an agent says it has: it may wait for demands without an offer."""
+    with suppress(AiraError):
+        if isinstance(status, Status) and status.model:
+            parse_cid(status.model)
+            return {status.model}
+    return set()
 
 
 def _health(status: RoleStatus | None) -> str:

@@ -177,7 +177,8 @@ class Agent(HandlerDecorators, ReadingAgent):
         parts = await open_when_ready(stack, self.settings, make, role="agent", on_wait=self.telemetry.starting)
         models = Models(parts.store, parts.exchange)
         description = await own_description(parts, models, self._given_model, self._handlers.topics)
-        return await stack.enter_async_context(AgentRuntime(parts, self._handlers, models, description))
+        runtime = AgentRuntime(parts, self._handlers, models, description, model=self.model or "")
+        return await stack.enter_async_context(runtime)
 
     def _closed(self) -> None:
         self._network = self._channel = self._runtime = None

@@ -48,7 +48,13 @@ class AgentRuntime(Role):
     title = "agent"
 
     def __init__(
-        self, parts: AgentComponents, handlers: Handlers, models: Models, description: ModelDescription | None = None
+        self,
+        parts: AgentComponents,
+        handlers: Handlers,
+        models: Models,
+        description: ModelDescription | None = None,
+        *,
+        model: str = "",
     ) -> None:
         topics = handlers.topics or None
         self.parts = parts
@@ -69,7 +75,7 @@ class AgentRuntime(Role):
             on_phase=self._on_phase,
         )
         self.listener = ChainListener(parts, self.trader, self.executor, on_phase=self._on_phase)
-        self._status = AgentStatus(parts, self.executor, self.playbacks.recorders)
+        self._status = AgentStatus(parts, self.executor, self.playbacks.recorders, model=model)
         self._handlers = handlers
 
     async def _open(self, stack: AsyncExitStack) -> None:

@@ -46,10 +46,11 @@ class WatcherStatus:
 class AgentStatus:
     """The metrics, the health and the service `status` of an agent with an account. Nothing here asks the network."""
 
-    def __init__(self, parts: AgentComponents, executor: Executor, recorders: Recorders) -> None:
+    def __init__(self, parts: AgentComponents, executor: Executor, recorders: Recorders, *, model: str = "") -> None:
         self._parts = parts
         self._executor = executor
         self._recorders = recorders
+        self._model = model
         self._started = time.monotonic()
 
     async def status(self, _request: Nothing) -> Status:
@@ -67,6 +68,7 @@ class AgentStatus:
             chain_id=parts.chain.chain_id,
             xrt=parts.chain.xrt,
             uptime=round(time.monotonic() - self._started, 3),
+            model=self._model,
             dropped=parts.drops.totals(),
             heaviest=parts.drops.senders(),
             work=Work(

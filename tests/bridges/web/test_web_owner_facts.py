@@ -1,0 +1,80 @@
+"""What owners and operators see: models of robots that wait, jobs by phase, alerts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from bridges.web.alerts import ALERTS, LONGEST, alerts_of
+from mesh import Job, String  # noqa: TC001  handlers are read at run time
+from schemas.status import Status, StoreUse, Work
+from tests.support.market import MODEL, offering
+from tests.support.objectives import objective
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from tests.support.market import Place
+
+DATA = {"X-Aira-Request": "1", "Content-Type": "application/octet-stream"}
+ROBOT = "0x70997970C51812dc3A010C7d01b50e0d17dc79C8"
+
+
+async def test_a_robot_that_waits_for_demands_shows_its_model(place: Place, serve: Any) -> None:
+    async with place.agent("robot"), serve() as browser:
+        (robot,) = (await browser.get("agents"))["agents"]
+        assert (robot["offers"], robot["models"]) == ([], [MODEL])
+        assert robot["status"]["model"] == MODEL
+
+
+async def test_jobs_are_counted_by_phase(place: Place, serve: Any) -> None:
+    robot = offering(place.agent("robot"))
+
+    @robot.on("/blink")
+    async def blink(job: Job, message: String) -> None:
+        pass
+
+    async with place.provider(), robot, serve("person") as browser:
+        made = await browser.post("objectives", objective(("/blink", "on")), headers=DATA)
+        await browser.post("local/orders", {"model": MODEL, "objective": made["cid"], "cost": "7"}, status=202)
+        party = place.address("person")
+
+        async def newest() -> Any:
+            """The newest job, once it has ended."""
+            jobs = await browser.get("liabilities", party=party, phase="finalized", limit=1)
+            found = jobs["liabilities"]
+            return jobs if found and found[0]["objective"] == made["cid"] else None
+
+        await until_found(newest, what="the job's end")
+        jobs = await newest()
+        assert sum(jobs["phases"].values()) == jobs["phases"]["finalized"] >= 1
+        assert (await browser.get("liabilities", party=party, phase="running"))["liabilities"] == []
+
+
+def status(**facts: Any) -> Status:
+    about: dict[str, Any] = {
+        "role": "agent",
+        "address": ROBOT,
+        "version": "1",
+        "zenoh_id": "1",
+        "lighthouse": "l",
+        "chain_id": 1,
+    }
+    return Status(**(about | {"parts": {"channel": "alive", "executor": "off"}, "head": 1000} | facts))
+
+
+def test_what_does_not_work_is_an_alert() -> None:
+    full = Work(jobs={}, outbox=0, store=StoreUse(files=1, bytes=99, quota=100))
+    cases: dict[str, Any] = {
+        "silent": None,
+        "part-waits": status(parts={"listener": "waits for the node"}),
+        "behind": status(head=900),
+        "store-full": status(work=full),
+        "drops": status(heaviest={"rate": {"0x00": 40, "0x01": 2}}),
+    }
+    for code, found in cases.items():
+        (alert,) = alerts_of({ROBOT: found}, 1000)
+        assert (alert["agent"], alert["code"]) == (ROBOT, code)
+    assert alerts_of({ROBOT: status()}, 1000) == []
+    endless = {str(number): status(parts={"part": "x" * 10_000}) for number in range(2 * ALERTS)}
+    bounded = alerts_of(endless, 1000)
+    assert len(bounded) == ALERTS
+    assert max(len(alert["detail"]) for alert in bounded) == LONGEST
