@@ -10,9 +10,13 @@ if TYPE_CHECKING:
     from xdist.workermanage import WorkerController  # type: ignore[import-untyped]
 
 SECONDS: Final[dict[str, int]] = {
+    "tests/web/test_page.py": 150,
     "tests/examples/test_blink.py": 120,
     "tests/mesh/cli/test_serving.py": 100,
+    "tests/web/test_lessons.py": 90,
+    "tests/web/test_outages.py": 90,
     "tests/bridges/ipfs/test_resilience.py": 80,
+    "tests/web/test_lies.py": 75,
     "tests/mesh/operations/test_two_providers.py": 70,
     "tests/bridges/ipfs/test_channel.py": 55,
     "tests/contracts/test_money.py": 50,
@@ -20,6 +24,7 @@ SECONDS: Final[dict[str, int]] = {
     "tests/examples/test_greenhouse.py": 25,
     "tests/mesh/operations/test_unfit_at_the_start.py": 55,
     "tests/bridges/serial/test_firmware.py": 50,
+    "tests/web/test_roles.py": 50,
     "tests/mesh/cli/test_chain_up.py": 50,
     "tests/mesh/cli/test_status.py": 35,
     "tests/mesh/cli/test_verify.py": 35,

@@ -31,6 +31,7 @@ LIES = {
 }
 
 
+@pytest.mark.sample("lie")
 @pytest.mark.parametrize("lie", LIES)
 def test_a_lie_about_a_job_is_caught(site: Site, paid_job: str, lie: str) -> None:
     with Browser(site.url, site.wallet()) as browser:
@@ -43,6 +44,7 @@ def test_a_lie_about_a_job_is_caught(site: Site, paid_job: str, lie: str) -> Non
         assert browser.all(".findings .badge.bad")
 
 
+@pytest.mark.sample("path", "change", "said")
 @pytest.mark.parametrize(
     ("path", "change", "said"),
     [

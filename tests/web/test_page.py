@@ -232,6 +232,7 @@ def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_pa
             assert "Drive a circle" not in browser.text()
 
 
+@pytest.mark.sample("size", "dark")
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 def test_each_page_is_accessible(site: Site, paid_job: str, pictures: Path, size: tuple[int, int], dark: bool) -> None:
