@@ -31,8 +31,7 @@ REPEATED: Final = ("model", "objective", "token", "cost", "lighthouse", "validat
 """The fields that are the same when an order is posted again; its nonce and perhaps its deadline are new."""
 LIFETIME: Final = 600.0
 """Seconds for which an order is valid by default."""
-FEWEST_BLOCKS: Final = 50
-MOST_BLOCKS: Final = 20_000
+FEWEST_BLOCKS, MOST_BLOCKS = 50, 20_000
 """The bounds of the default lifetime, whatever block time was measured."""
 MEASURED_BLOCKS: Final = 100
 """The latest blocks, whose times give the block time."""
@@ -102,7 +101,7 @@ class TradedOrder:
         return OrderClosed(self.identity, self.state, liability=self.liability)
 
     def close(self, state: OrderState) -> None:
-        """It won't become a contract, as far as can be known: those who wait for that get an error."""
+        """It won't become a contract, as far as is known: those who wait for that get an error."""
         self.state = state
         fail_future(self.created, self.why_closed)
 
@@ -171,7 +170,7 @@ class OrderActions(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Order:
-    """An order of the agent's account, as it was when it was asked for: `agent.orders()`, `agent.order(…)`."""
+    """An order of the agent's account at one moment: `agent.orders()`, `agent.order(…)`."""
 
     message: Demand | Offer
     """The signed demand or offer."""
@@ -209,9 +208,9 @@ class Order:
     async def withdraw(self) -> Order:
         """Withdraw the order; returns it in its new state. `honoured_by` names the providers that obey.
 
-        A signed withdrawal is sent until the order's deadline, and the order no more. It may still become a contract:
-        by a provider that is creating it now, that the withdrawal does not reach, or that does not obey. Until the
-        deadline the allowance covers the order. Raises `OrderClosed` if it has become a contract.
+        A signed withdrawal is sent until the deadline, instead of the order. A provider that is creating its contract,
+        or does not know or obey the withdrawal, may still use it, so the allowance covers it until the deadline. Raises
+        `OrderClosed` if the order has become a contract.
         """
         return await self._actions.withdraw(self._traded)
 
@@ -226,10 +225,9 @@ class Order:
     async def contract(self, *, on_progress: OnProgress = nothing) -> Contract:
         """Wait until the order is a contract. Cancelling the wait changes nothing.
 
-        `on_progress` is called with what happens meanwhile: offers for a demand, agents' declines, providers'
-        rejections (both also from before), and the contract. A decline or a rejection is information: the order stays
-        valid, so another agent or provider, or the same one later, may use it. Raises `OrderClosed` if the order was
-        withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
+        `on_progress` is called with offers for a demand, agents' declines, providers' rejections (both also earlier
+        ones), and the contract. After a decline or a rejection the order stays valid. Raises `OrderClosed` if the order
+        was withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
         """
         return await self._actions.contract_of(self._traded, on_progress)
 
@@ -266,16 +264,13 @@ class TermsWriter:
         }
 
     def terms_of(self, order: Demand | Offer) -> Terms:
-        """The terms of `order`, for an order of this account in the same generation that answers it.
-
-        The deadline is a stranger's: it counts up to the setting `deadline_limit`.
-        """
+        """The terms of a stranger's order, for one that answers it; its deadline counts up to `deadline_limit`."""
         latest = self._chain_head.head + self._settings.deadline_limit
         return {**self._repeated(order), "deadline": min(order.deadline, latest)}
 
     def _repeated(self, order: Demand | Offer) -> Terms:
-        terms = {field: getattr(order, field) for field in (*REPEATED, "deadline")}
-        return {**terms, "sender": None if order.generation == 3 else self._signer.address}
+        sender = None if order.generation == 3 else self._signer.address
+        return {field: getattr(order, field) for field in (*REPEATED, "deadline")} | {"sender": sender}
 
     async def sign(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Demand | Offer:
         """An order with these terms and a fresh nonce, signed. Raises `UnsafeValidator`."""

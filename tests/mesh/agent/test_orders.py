@@ -196,8 +196,12 @@ async def test_orders_of_another_program_of_the_account_are_followed_too(place: 
     """Both use one ledger: what one posts and withdraws, the other one learns of."""
     async with place.agent("person") as person, place.agent("person") as other:
         order = await person.order(OBJECTIVE)
-        await place.node.mine(1)
-        await until(lambda: [one.hash for one in other.orders()] == [order.hash])
+
+        async def is_known() -> bool:
+            await place.node.mine(1)  # an agent looks at each block after the one at which it began to listen
+            return [one.hash for one in other.orders()] == [order.hash]
+
+        await until_found(is_known)
         await other.orders()[0].withdraw()
         contract = asyncio.create_task(order.contract())
         await place.node.mine(1)
