@@ -34,8 +34,7 @@ async def take_existing(
         await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
         demands, contract = await _equal(agent, objective, **terms)
     if others := len(agent.orders()) - len(demands):
-        also = f"{plural(others, 'other order')} of this account may become contracts"
-        click.echo(f"{also}, and are sent again; see `aira order list`", err=True)
+        click.echo(f"this account also has {plural(others, 'other open order')}; see `aira order list`", err=True)
     if not demands and contract is None:
         return None
     for order in demands:

@@ -262,7 +262,6 @@ def _what_it_means(fact: dict[str, Any]) -> str:
         return f"No provider can use it any more: transaction {fact['tx']}."
     until = f"it may still become a contract before block {fact['deadline']:,}; --on-chain excludes that"
     if fact["providers"] and fact["confirmedBy"] >= fact["providers"]:
-        return (
-            f"All {plural(fact['providers'], 'provider')} present confirmed it. If another one has the order, {until}."
-        )
+        who = plural(fact["providers"], "present provider")
+        return f"Confirmed by {who}, which is all. If another one has the order, {until}."
     return f"{fact['confirmedBy']} of {plural(fact['providers'], 'present provider')} confirmed it: {until}."

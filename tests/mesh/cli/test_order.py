@@ -137,7 +137,7 @@ async def test_a_rejection_is_told_with_what_it_means(site: Site, capsys: pytest
         await until(is_told)
     facts = {"kind": "rejected", "agent": provider.address, "code": "Unwanted", "detail": "not today"}
     assert facts in map(json.loads, "".join(said).splitlines())
-    assert "1 other order of this account" in "".join(notes)
+    assert "1 other open order;" in "".join(notes)
     assert not waiting.done()
     waiting.cancel()
     await asyncio.wait([waiting])
