@@ -137,7 +137,7 @@ def robot_of(options: dict[str, Any]) -> dict[str, Any] | None:
     if given.get("objective"):
         parse_cid(str(given["objective"]))
     cost = str(given.get("cost", "")) or None
-    if cost is not None and not cost.isdigit():
+    if cost is not None and not (cost.isascii() and cost.isdigit()):
         raise InvalidOptions("the cost is a whole number in the smallest unit of the token")
     return {
         "model": given["model"],

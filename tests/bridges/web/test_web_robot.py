@@ -1,0 +1,70 @@
+"""The page for one robot: from options or a TOML file, and shown in the frames of other sites."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from bridges.web.cli import robot_of
+from mesh.cli.errors import InvalidOptions
+from mesh.errors import InputError
+from tests.support.market import MODEL
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FULL = f'model = "{MODEL}"\nobjective = "{MODEL}"\ncost = 1500\ntitle = "The lamp"\ntext = "It blinks."\n'
+
+
+def options(robot: Path | None = None, **given: str) -> dict[str, Any]:
+    return {"robot": robot, "model": None, "objective": None, "cost": None} | given
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "robot.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_toml_file_describes_a_robots_page_and_options_change_it(tmp_path: Path) -> None:
+    told = {"model": MODEL, "objective": MODEL, "cost": "1500", "title": "The lamp", "text": "It blinks."}
+    assert robot_of(options(written(tmp_path, FULL))) == told
+    assert robot_of(options(written(tmp_path, FULL), cost="7")) == told | {"cost": "7"}
+    assert robot_of(options()) is None
+    alone = {"model": MODEL, "objective": None, "cost": None, "title": "", "text": ""}
+    assert robot_of(options(model=MODEL)) == alone
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "model = ",
+        'title = "no model"',
+        f'model = "{MODEL}"\ncolour = "red"',
+        f'model = "{MODEL}"\ncost = "1.5"',
+        f'model = "{MODEL}"\ncost = -1',
+        f'model = "{MODEL}"\ncost = "²"',
+        f'model = "{MODEL}"\nobjective = "nothing"',
+        'model = "../../etc"',
+    ],
+)
+def test_what_describes_no_page_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError):
+        robot_of(options(written(tmp_path, text)))
+
+
+def test_unknown_words_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidOptions, match="colour"):
+        robot_of(options(written(tmp_path, FULL + 'colour = "red"')))
+
+
+async def test_a_robots_page_is_shown_in_the_frames_of_the_sites_that_embed_it(serve: Any, tmp_path: Path) -> None:
+    robot = robot_of(options(written(tmp_path, FULL)))
+    sites = ("https://one.example", "https://two.example")
+    async with serve(robot=robot, embed=sites) as browser:
+        assert (await browser.get("market"))["robot"] == robot
+        async with browser.session.get(browser.server.url) as response:
+            policy = response.headers["Content-Security-Policy"]
+            assert policy.endswith("frame-ancestors https://one.example https://two.example")
+            assert "X-Frame-Options" not in response.headers
