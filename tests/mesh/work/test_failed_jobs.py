@@ -43,7 +43,7 @@ async def refusal(place: Place, robot: Agent, content: bytes | str, **terms: Any
     """Have a robot fail at an objective: its note in the ledger and in the recording. The money must come back."""
     async with place.at_work(robot) as person:
         before = await place.balance("robot"), await place.balance("person")
-        source = place.save(content) if isinstance(content, bytes) else content
+        source = await person.add(place.save(content)) if isinstance(content, bytes) else content
         contract = await person.demand(source, cost=COST, **terms)
         outcome = await contract.outcome()
         assert not outcome.success
