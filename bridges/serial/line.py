@@ -45,7 +45,7 @@ class PortName:
     def __init__(self, text: str) -> None:
         self.text = text
         self._usb = USB.fullmatch(text)
-        if self._usb is None and not text.startswith("/"):
+        if self._usb is None and "/" not in text:
             raise InputError(
                 f"{text!r} is not a serial port", hint="give a path, /dev/ttyACM0, or a USB id, usb:2341:0043"
             )

@@ -61,8 +61,7 @@ static void obey(struct board *board, char *line) {
   } else if (!strcmp(line, "plug")) {
     plug(board);
   } else if (!strcmp(line, "reset")) {
-    avr_reset(board->avr);
-    stop_sending(board);
+    restart(board);
   } else if (!strcmp(line, "quit")) {
     stopped = 1;
   } else if (*line) {

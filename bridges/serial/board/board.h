@@ -47,4 +47,5 @@ void stop_sending(struct board *board);
 // pins.c
 void watch_pins(struct board *board);
 void look_at_pins(struct board *board);
+void restart(struct board *board);
 bool hold_pin(struct board *board, unsigned pin, const char *level);

@@ -166,10 +166,7 @@ static void look_at_terminal(struct board *board) {
   if (open != board->open) {
     board->open = open;
     puts(open ? "opened" : "closed");
-    if (open && board->resets) {
-      avr_reset(board->avr);
-      stop_sending(board);
-    }
+    if (open && board->resets) restart(board);
     if (!open) flush_terminal(board);
   }
   struct termios2 settings;

@@ -19,6 +19,7 @@ static const struct timer {
     {0xB0, 0xB1, 0, {{11, 6, 0xB3}, {3, 4, 0xB4}}},
 };
 static const int8_t NONE = -1;
+static avr_ioport_external_t held[3];  // of the ports B, C and D, from outside
 
 static char port_of(unsigned pin) { return pin < 8 ? 'D' : pin < 14 ? 'B' : 'C'; }
 static unsigned bit_of(unsigned pin) { return pin < 8 ? pin : pin < 14 ? pin - 8 : pin - 14; }
@@ -107,7 +108,6 @@ void look_at_pins(struct board *board) {
 
 // Hold an input "high" or "low", or let it be "free"; false for another level, or no such pin.
 bool hold_pin(struct board *board, unsigned pin, const char *level) {
-  static avr_ioport_external_t held[3];
   const bool high = !strcmp(level, "high"), released = !strcmp(level, "free");
   if (pin >= PINS || !(high || released || !strcmp(level, "low"))) return false;
   const unsigned bit = bit_of(pin), mask = 1 << bit;
@@ -122,4 +122,22 @@ bool hold_pin(struct board *board, unsigned pin, const char *level) {
   const unsigned now = released ? state.port >> bit & 1 : high;  // a free one follows its pull-up
   avr_raise_irq(avr_io_getirq(board->avr, AVR_IOCTL_IOPORT_GETIRQ(port->name), bit), now);
   return true;
+}
+
+// Press the reset button. simavr then forgets the levels of inputs, but not that it has reported them: so they are
+// reported again.
+void restart(struct board *board) {
+  avr_ioport_state_t before[3];
+  for (int port = 0; port < 3; port++) avr_ioctl(board->avr, AVR_IOCTL_IOPORT_GETSTATE('B' + port), &before[port]);
+  avr_reset(board->avr);
+  stop_sending(board);
+  for (unsigned pin = 0; pin < PINS; pin++) {
+    const char name = port_of(pin);
+    const unsigned bit = bit_of(pin);
+    const avr_ioport_external_t *port = &held[name - 'B'];
+    avr_irq_t *irq = avr_io_getirq(board->avr, AVR_IOCTL_IOPORT_GETIRQ(name), bit);
+    if (before[name - 'B'].ddr >> bit & 1) avr_raise_irq(irq, 0);  // no output any more
+    irq->value = 0;
+    if (port->mask >> bit & 1) avr_raise_irq(irq, port->value >> bit & 1);
+  }
 }

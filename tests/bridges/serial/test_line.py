@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def test_a_port_is_found_by_its_path(tmp_path: Path) -> None:
+def test_a_port_is_found_by_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "tty"
     with pytest.raises(PortMissing):
         PortName(str(path)).find()
     path.touch()
     assert PortName(str(path)).find() == path
+    monkeypatch.chdir(tmp_path)
+    assert PortName("./tty").find().samefile(path)
 
 
 def test_a_usb_device_that_is_not_plugged_in_is_missing() -> None:

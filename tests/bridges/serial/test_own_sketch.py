@@ -1,18 +1,23 @@
-"""A hobbyist's own sketch, with an input and a PWM output, works for money."""
+"""A hobbyist's own sketch, with an input and a PWM output, works for money; docs/devices.md shows how."""
 
 from __future__ import annotations
 
 import asyncio
+import re
+import runpy
 from typing import TYPE_CHECKING, Any
 
 from bridges.serial.device import Device
+from bridges.serial.firmware import compile_sketch, size_of
 from mesh.recording import open_objective
 from schemas.payloads import decode_value
-from tests.support.boards import DIMMER, board, edge
+from tests.support.boards import DIMMER, LIBRARIES, ROOT, board, edge, firmware
 from tests.support.market import founded, offering, place
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.work.job import Job
     from tests.support.market import Place
 
@@ -57,3 +62,15 @@ async def test_a_lamp_is_dimmed_for_money_and_a_button_ends_the_job(place: Place
         values.setdefault(message.topic, []).append(decode_value(message.payload, message.type))
     assert values["/dim"][:2] == [64, 128]
     assert values["/button"] == [True]
+
+
+def test_the_sketch_and_the_robot_of_the_page_about_devices_are_complete(tmp_path: Path) -> None:
+    firmware(DIMMER)  # skips the test where the tools are missing
+    text = (ROOT / "docs" / "devices.md").read_text()
+    [sketch], [robot] = (re.findall(f"```{kind}\n(.*?)```", text, re.DOTALL) for kind in ("cpp", "python"))
+    for name, source in (("lamp/lamp.ino", sketch), ("robot.py", robot), ("model.md", "Dims a lamp")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(source)
+    flash, _ = size_of(compile_sketch(tmp_path / "lamp", tmp_path / "lamp.elf", libraries=[LIBRARIES]))
+    assert flash > 0
+    assert {"agent", "board", "brightness"} <= runpy.run_path(str(tmp_path / "robot.py")).keys()
