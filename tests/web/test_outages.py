@@ -92,6 +92,19 @@ def test_a_job_goes_on_when_router_and_node_come_back(fragile: Fragile) -> None:
         browser.sees("the robot was paid")
 
 
+def test_an_owner_is_alerted_when_a_robot_does_not_answer(fragile: Fragile) -> None:
+    with Browser(fragile.site.url) as browser:
+        browser.go("robots")
+        browser.sees("agent")
+        assert "No answer:" not in browser.text()
+        fragile.robot.pause()
+        try:
+            browser.sees("No answer:")
+        finally:
+            fragile.robot.resume()
+        browser.until(lambda: browser.all("td .dot.good") and "No answer:" not in browser.text(), "the robot's health")
+
+
 @pytest.mark.parametrize("account", ["wallet", "local"])
 def test_the_price_of_a_job_that_nobody_finishes_is_taken_back(fragile: Fragile, account: str) -> None:
     site = fragile.site

@@ -75,6 +75,10 @@ def test_operators_finish_a_job_and_strangers_may_not(site: Site, tmp_path: Path
 def test_an_owner_sees_health_money_jobs_and_logs(browser: Browser, site: Site) -> None:
     address = order(browser, site)
     browser.sees("the robot was paid")
+    browser.go("jobs")
+    browser.until(lambda: "ended (0)" not in browser.find("main select").text, "jobs that have ended")
+    browser.find("main select").send_keys("ended")
+    browser.until(lambda: browser.all(f"td [title='{address}']"), "the job among those")
     browser.go("robots")
     robot = facts(site, f"liabilities/{address}")["liability"]["promisor"]
     row = f"//tr[.//*[@title='{robot}']]"

@@ -131,6 +131,12 @@ export interface Agent {
   record: JobRecord;
 }
 
+export interface Agents {
+  agents: Agent[];
+  unlisted: number;
+  alerts: { agent: Address; code: string; detail: string }[];
+}
+
 export interface ValueSchema {
   type?: string;
   title?: string;

@@ -9,22 +9,21 @@ import { JobTable } from "./account";
 /** All jobs, or those of the account; newest first. */
 export function JobsPage() {
   const { account } = useApp();
-  const [state, setState] = useState("");
+  const [phase, setPhase] = useState("");
   const [mine, setMine] = useState(false);
   const [wanted, setWanted] = useState("");
   const party = mine ? account?.address : undefined;
-  const jobs = useData<{ liabilities: Liability[]; more: boolean }>(`liabilities${query({ state, party, limit: 100 })}`);
+  const jobs = useData<{ liabilities: Liability[]; more: boolean; phases: Record<string, number> }>(`liabilities${query({ phase, party, limit: 100 })}`);
   useTopic("chain", jobs.reload);
   return (
     <>
       <h1>{texts.jobs}</h1>
       <form class="row end" onSubmit={(event) => { event.preventDefault(); if (wanted) location.hash = `#/job/${wanted}`; }}>
-        <Field label={texts.state}>
+        <Field label={texts.phaseTitle}>
           {(id) => (
-            <select id={id} value={state} onChange={(event) => setState(event.currentTarget.value)}>
+            <select id={id} value={phase} onChange={(event) => setPhase(event.currentTarget.value)}>
               <option value="">{texts.all}</option>
-              <option value="open">{texts.jobState.open}</option>
-              <option value="finalized">{texts.ended}</option>
+              {Object.entries(texts.phase).map(([name, title]) => <option key={name} value={name}>{title} ({jobs.data?.phases[name] ?? 0})</option>)}
             </select>
           )}
         </Field>

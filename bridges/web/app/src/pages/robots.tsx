@@ -4,34 +4,33 @@ import { post, query } from "../api";
 import { useApp, useData, useTopic } from "../app";
 import { amount, clock, duration, ether, size } from "../format";
 import { texts } from "../texts";
-import type { AccountState, Agent, Liability, LogEvent } from "../types";
+import type { AccountState, Agent, Agents, Liability, LogEvent } from "../types";
 import { Action, Badge, Facts, Field, Money, Name, Show, Strange, Table } from "../ui";
 import { JobTable } from "./account";
 import { LoginForm } from "./login";
 
 /** Who is present, for owners and operators: health, jobs by phase, earnings, alerts, actions. */
 export function RobotsPage() {
-  const agents = useData<{ agents: Agent[]; unlisted: number }>("agents");
-  const [live, setLive] = useState<Agent[] | null>(null);
-  useTopic("agents", (event) => event.kind === "agents" ? setLive(event.data.agents) : agents.reload());
+  const agents = useData<Agents>("agents");
+  const [live, setLive] = useState<Agents | null>(null);
+  useTopic("agents", (event) => event.kind === "agents" ? setLive(event.data) : agents.reload());
   return (
     <>
       <h1>{texts.robotsTitle}</h1>
-      <Show of={agents}>{({ agents: known, unlisted }) => <AgentList agents={live ?? known} unlisted={unlisted} />}</Show>
+      <Show of={agents}>{(known) => <AgentList {...(live ?? known)} />}</Show>
     </>
   );
 }
 
-function AgentList(props: { agents: Agent[]; unlisted: number }) {
+function AgentList(props: Agents) {
   const { market } = useApp();
   const [open, setOpen] = useState("");
-  const alerts = props.agents.filter((agent) => agent.health !== "alive");
   const chosen = props.agents.find((agent) => agent.address + agent.role === open);
   return (
     <>
-      {alerts.map((agent) => (
-        <p class="callout warn" key={agent.address + agent.role}>
-          {texts.health[agent.health]}: <Strange text={agent.role} most={40} /> <Name text={agent.address} /> <Strange text={troubles(agent)} />
+      {props.alerts.map((alert) => (
+        <p class="callout warn" key={alert.agent + alert.code + alert.detail}>
+          <strong>{texts.alert[alert.code] ?? alert.code}</strong> <Name text={alert.agent} /> <Strange text={alert.detail} />
         </p>
       ))}
       <Table label={texts.robotsTitle} head={[texts.healthTitle, texts.role, texts.account, texts.jobs, texts.record, texts.earned, texts.uptime, ""]} numbers={[5, 6]} empty={texts.nobodyPresent}>
@@ -54,11 +53,6 @@ function AgentList(props: { agents: Agent[]; unlisted: number }) {
       {chosen ? <AgentDetails key={open} agent={chosen} /> : null}
     </>
   );
-}
-
-function troubles(agent: Agent): string {
-  const parts = Object.entries(agent.status?.parts ?? {}).filter(([, state]) => state !== "alive" && state !== "off");
-  return parts.map(([part, state]) => `${part}: ${state}`).join(", ");
 }
 
 function Phases(props: { jobs?: Record<string, number> }) {
