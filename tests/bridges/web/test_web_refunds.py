@@ -1,0 +1,70 @@
+"""Getting the money back: the local account's cost of a job that nobody finished."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from aiohttp import ClientSession
+
+from bridges.web.components import opened
+from bridges.web.options import WebOptions
+from bridges.web.server import PageServer
+from mesh.chain import DeploymentPlan
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.development import deploy_market
+from tests.bridges.web.conftest import Browser
+from tests.support.market import MODEL, Founded, Place, offering
+from tests.support.objectives import objective
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.support.routers import EmbeddedRouter
+
+COST, DELAY = 5_000, 30
+DATA = {"X-Aira-Request": "1", "Content-Type": "application/octet-stream"}
+
+
+async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(router: EmbeddedRouter, tmp_path: Path) -> None:
+    async with EmbeddedChain() as node:
+        plan = DeploymentPlan(refund_delay=DELAY, timeout_blocks=100)
+        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
+        async with (
+            Place(Founded(node, market), router.endpoint, tmp_path) as place,
+            place.provider(),
+            offering(place.agent("robot")),  # it has no handlers: its jobs wait for `start`
+            opened(
+                place.settings("person"), account=market.accounts["person"], chain=place.chains["person"]
+            ) as components,
+            PageServer(components, WebOptions(port=0, static=tmp_path)) as server,
+            ClientSession() as session,
+        ):
+            browser, before = Browser(session, server), await place.balance("person")
+            made = await browser.post("objectives", objective(("/blink", "on")), headers=DATA)
+            wanted = {"model": MODEL, "objective": made["cid"], "cost": str(COST)}
+            order = (await browser.post("local/orders", wanted, status=202))["order"]["hash"]
+
+            async def matched() -> Any:
+                return (await browser.get(f"orders/{order}"))["liability"]
+
+            await until_found(matched, what="a contract")
+            address = await matched()
+            assert await place.balance("person") == before - COST
+            early = await browser.post("local/refunds", {"liability": address}, status=502)
+            assert early["error"]["code"] == "not-refundable"
+            await node.mine(DELAY + 1)
+
+            async def refunded() -> bool:
+                async with session.post(
+                    f"{server.url}/api/v1/local/refunds", json={"liability": address}, headers={"X-Aira-Request": "1"}
+                ) as response:
+                    return response.status == 200
+
+            await until_found(refunded, what="the refund")
+            assert await place.balance("person") == before
+
+            async def ended() -> Any:
+                return (await browser.get(f"liabilities/{address}"))["timeline"][-1]["kind"] == "refunded"
+
+            await until_found(ended, what="the refund on the page")
