@@ -17,6 +17,7 @@ from mesh.extras import PackageMissing
 from mesh.page import free_page_port, page_server
 from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.ports import free_port
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,3 +68,25 @@ def test_what_the_page_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mesh.page.entry_points", lambda group: {})
     with pytest.raises(PackageMissing):
         page_server()
+
+
+def test_the_page_goes_on_when_its_market_is_started_afresh(tmp_path: Path) -> None:
+    endpoint, node, port = f"tcp/127.0.0.1:{free_port()}", free_port(), free_port()
+    up = ("up", "--no-web", "--engine", "embedded", "--listen", endpoint, "--port", str(node), "--data-dir", tmp_path)
+    of_market = ("--connect", endpoint, "--web3-http-provider", f"http://127.0.0.1:{node}")
+    web = ("web", "--listen", f"127.0.0.1:{port}", *of_market, "--data-dir", tmp_path / "page")
+    url = f"http://127.0.0.1:{port}/api/v1"
+
+    def is_connected() -> bool:
+        try:
+            return bool(answer(f"{url}/market")["connected"] == {"router": True, "chain": True})
+        except OSError:
+            return False  # it opens again
+
+    with Serving(*AIRA, *up, says="provider    0x") as market, Serving(*AIRA, *web, says="page  ") as page:
+        assert is_connected()
+        market.end(signal.SIGINT)
+        market.start()
+        page.wait_until_said("the chain was started afresh")
+        wait_until(is_connected, what="the page on the new chain", seconds=60)
+        assert page.is_running
