@@ -18,6 +18,7 @@ from mesh.work.objectives import ObjectiveUnfit
 from schemas import cid_of_file
 from tests.mesh.operations.site import MODEL, Site, settings_of
 from tests.support.commands import aira
+from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
 from tests.support.waiting import until
 
@@ -59,12 +60,15 @@ def output(capsys: pytest.CaptureFixture[str]) -> Output:
     return Output(capsys)
 
 
-async def test_an_objective_that_no_robot_takes_is_an_error_before_anything_is_sent(tmp_path: Path, site: Site) -> None:
+@pytest.mark.parametrize(("content", "reason"), [(b"no recording", "not-a-recording"), (objective(), "no-messages")])
+async def test_an_objective_that_no_robot_takes_is_an_error_before_anything_is_sent(
+    tmp_path: Path, site: Site, content: bytes, reason: str
+) -> None:
     path = tmp_path / "bad.mcap"
-    path.write_bytes(b"no recording")
+    path.write_bytes(content)
     with pytest.raises(ObjectiveUnfit) as caught:
         await demand(settings_of(site, "person"), objective=str(path), out=None, as_json=False, **TERMS)
-    assert (caught.value.reason, caught.value.cid) == ("not-a-recording", str(path))
+    assert (caught.value.reason, caught.value.cid) == (reason, str(path))
     async with site.agent("person") as person:
         assert person.orders() == []
 
