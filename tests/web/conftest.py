@@ -14,6 +14,7 @@ import pytest
 from eth_account import Account
 
 from schemas import cid_of_file
+from schemas.model import parse_description
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.ports import free_port
 from tests.web.browser import Browser, Wallet
@@ -66,7 +67,7 @@ def hostile_model(folder: Path) -> Path:
     (topic,) = model["objective"]
     topic["title"] = topic["value"]["properties"]["direction"]["title"] = script
     path = folder / "hostile.json"
-    path.write_text(json.dumps(model))
+    path.write_bytes(parse_description(json.dumps(model).encode()).encode())
     return path
 
 
