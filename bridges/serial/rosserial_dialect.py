@@ -44,6 +44,8 @@ ASK_INTERVAL: Final = 0.5
 """Seconds between two requests for the topics while a board starts."""
 SETTLE_TIME: Final = 0.1
 """Seconds without another announcement after which a board has announced all."""
+MISSING_TIME: Final = 0.5
+"""The same behind a command if answers are missing: their requests were lost, or the board is late."""
 ANNOUNCEMENT: Final = 300
 """Bytes for whose time on the line a board may be silent between two announcements, if that takes longer."""
 QUIET: Final = 3.0
@@ -85,7 +87,7 @@ class RosserialDialect(Dialect):
         baud: int,
         parameters: Mapping[str, object] | None = None,
         clock: Callable[[], float] = time.time,
-        settle_time: float = SETTLE_TIME,
+        settle_time: float = MISSING_TIME,
     ) -> None:
         super().__init__(baud=baud, parameters=parameters)
         self._clock = clock

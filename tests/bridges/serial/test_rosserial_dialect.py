@@ -32,7 +32,15 @@ from bridges.serial.rosserial import (
     RosserialMessage,
     encode_message,
 )
-from bridges.serial.rosserial_dialect import CUT_OFF, FORGETS, LOST, MAX_REQUESTS, SETTLE_TIME, RosserialDialect
+from bridges.serial.rosserial_dialect import (
+    CUT_OFF,
+    FIRST_DELAY,
+    FORGETS,
+    LOST,
+    MAX_REQUESTS,
+    SETTLE_TIME,
+    RosserialDialect,
+)
 from schemas.payloads import String
 
 STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
@@ -410,3 +418,16 @@ def test_a_board_that_is_busy_for_long_does_not_make_the_line_busy() -> None:
     for _ in range(100):
         bench.after(0.1)
         assert bench.dialect.next_tick > bench.now
+
+
+def test_a_late_answer_to_an_earlier_request_does_not_end_the_next_command() -> None:
+    bench = ready()
+    bench.command()
+    bench.after(FIRST_DELAY)  # so the board has two requests
+    bench.announce(*TOPICS)
+    later = bench.command("/hear", text("on"))
+    bench.after(0.3)
+    begun = [later.begun]
+    bench.announce(*TOPICS)
+    assert [*begun, later.begun] == [False, True]
+    assert later not in [event.command for event in bench.dialect.events() if isinstance(event, CommandFinished)]
