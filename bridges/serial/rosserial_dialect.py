@@ -76,10 +76,8 @@ class _ActiveCommand:
 
 
 class RosserialDialect(Dialect):
-    """rosserial. `parameters` are what a sketch may request, by name; `clock` gives the time that boards ask for;
-    `settle_time` is how long the next command waits, in seconds, if some answers to requests behind the last one are
-    missing: longer for a board that runs slower than its line.
-    """
+    """rosserial. `parameters` are what a sketch may request; `clock` gives the time that boards ask for. A command
+    waits `settle_time` s if answers to requests behind the last one are missing: longer for a slow board."""
 
     def __init__(
         self,

@@ -26,11 +26,7 @@ from mesh.cli.output import (
 from mesh.recording import Limits, preflight
 from mesh.work.models import description_in
 from schemas import cid_of_file
-from schemas.model import (
-    MAX_MODEL_SIZE,
-    ModelDescription,
-    description_schema,
-)
+from schemas.model import MAX_MODEL_SIZE, ModelDescription, description_schema, read_description
 from schemas.value_schema import ValueSchema
 
 if TYPE_CHECKING:
@@ -85,13 +81,16 @@ def check(settings: Settings, model: str, objective: str | None, as_json: bool) 
     """Check MODEL, a file or a CID; with OBJECTIVE, a file or a CID, check whether a robot of that model accepts it.
 
     The exit code is 1 if the objective does not fit, 2 if the description is not valid. The printed reason is a stable
-    code. A model without a description fits any objective that can be played.
+    code. A model without a description fits any objective that can be played; a file NAME.json must be a description.
     """
     path = local_file(settings, model)
     recording = None if objective is None else local_file(settings, objective)
 
     def work() -> bool:
         description = description_in(path)
+        if description is None and path.suffix == ".json":  # it was meant as one
+            with path.open("rb") as file:
+                description = read_description(file.read(MAX_MODEL_SIZE + 1))
         facts = {"cid": cid_of_file(path), "described": description is not None, "ok": True, "reason": "", "detail": ""}
         if recording is not None:
             limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)

@@ -56,7 +56,7 @@ def _of_program(path: Path) -> ModelDescription:
     if agent is None:
         raise ProgramUnusable(f"{path} has no agent and no description", hint=_HINT)
     text = (names.get("__doc__") or path.stem).strip()
-    title = re.split(r"[.:;\n]", text, maxsplit=1)[0].strip()[:80]
+    title = re.split(r"[.:;](?=\s|$)|\n", text, maxsplit=1)[0].strip()[:80]
     return agent.model_description(title, description=" ".join(text.split()) if text != title else "")
 
 

@@ -108,6 +108,13 @@ def test_check_refuses_a_description_that_is_not_canonical(described: Path) -> N
     refused(model("check", described, folder=described.parent), InvalidDescription, "not-canonical", exit_code=2)
 
 
+@pytest.mark.parametrize(("text", "reason"), [("{", "not-json"), (json.dumps(DRAFT), "not-canonical"), ("{}", "field")])
+def test_check_refuses_a_json_file_that_is_no_description(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "lamp.json"
+    path.write_text(text)
+    refused(model("check", path, folder=tmp_path), InvalidDescription, reason, exit_code=2)
+
+
 def test_a_text_is_a_model_without_a_description(tmp_path: Path) -> None:
     text = EXAMPLES / "blink" / "model.md"
     done = model("check", text, EXAMPLES / "blink" / "blink.mcap", "--json", folder=tmp_path)
@@ -180,6 +187,13 @@ def test_new_describes_the_agent_of_a_program_without_running_it(tmp_path: Path)
     (topic,) = description.objective
     assert topic.value is not None
     assert (topic.topic, topic.value.required) == ("/drive", ("speed",))
+
+
+def test_a_title_ends_with_its_sentence(tmp_path: Path) -> None:
+    source = program(
+        tmp_path, PROGRAM.replace("Drive: a robot on wheels.", "Version 2.0 of `drive.py`. It has wheels.")
+    )
+    assert new_model(source).title == "Version 2.0 of `drive.py`"
 
 
 def test_new_takes_the_description_that_a_program_has(tmp_path: Path) -> None:
