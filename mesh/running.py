@@ -99,9 +99,11 @@ async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool
     work = loop.create_task(main(), name="main")
     stopped = False
 
-    def stop() -> None:
+    def stop(number: int) -> None:
         nonlocal stopped
         stopped = True
+        if number == signal.SIGINT and sys.stderr.isatty():
+            print(file=sys.stderr)  # ends the line on which the terminal shows ^C
         for number in STOPPING:
             loop.remove_signal_handler(number)
         work.cancel()
@@ -112,7 +114,7 @@ async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool
         loop.call_later(WAKE_INTERVAL, wake)
 
     for number in STOPPING:
-        loop.add_signal_handler(number, stop)
+        loop.add_signal_handler(number, stop, number)
     try:
         await work
     except asyncio.CancelledError:

@@ -17,6 +17,7 @@ from mesh.running import INTERRUPTED
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.commands import AIRA, SECONDS, environment
 from tests.support.objectives import objective
+from tests.support.ports import free_port
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -137,6 +138,15 @@ def test_ctrl_c_restores_the_cursor_and_leaves_no_file(large: Path) -> None:
     assert terminal.end() == INTERRUPTED
     assert terminal.shown.rindex(CURSOR_SHOWN) > terminal.shown.rindex(CURSOR_HIDDEN)
     assert os.listdir(large.parent) == [large.name]
+
+
+def test_what_follows_a_ctrl_c_has_a_line_of_its_own() -> None:
+    terminal = Terminal("router", "--listen", f"tcp/127.0.0.1:{free_port()}")
+    while "tcp/127.0.0.1:" not in terminal.shown:
+        assert terminal.read()
+    terminal.press_ctrl_c()
+    assert terminal.end() == 0
+    assert "^C\r\n" in terminal.shown
 
 
 class InterruptedTerminal(io.StringIO):
