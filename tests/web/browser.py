@@ -250,7 +250,7 @@ class Browser:
 
     def lie(self, path: str, change: str) -> None:
         """From the next page on, pass each answer whose path matches `path` to `change`: code that alters `body`."""
-        script = f"""
+        script = f"""{{
         const honest = window.fetch;
         window.fetch = async (path, init) => {{
           const answer = await honest(path, init);
@@ -261,7 +261,7 @@ class Browser:
           const {{ headers, status }} = answer;
           return new Response(isFile ? body : JSON.stringify(body), {{ headers, status }});
         }};
-        """
+        }}"""
         self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
 
     def type(self, label: str, text: str) -> None:

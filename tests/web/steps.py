@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import json
+import urllib.request
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tests.web.browser import Browser
@@ -48,3 +50,9 @@ def order(browser: Browser, site: Site, *, direction: str = "left", seconds: flo
         browser.connect()
     fill_in(browser, site, direction=direction, seconds=seconds)
     return sign(browser)
+
+
+def facts(site: Site, path: str) -> Any:
+    """What the page's server answers."""
+    with urllib.request.urlopen(f"{site.url}/api/v1/{path}", timeout=30) as response:
+        return json.load(response)

@@ -12,7 +12,7 @@ import pytest
 from tests.support.objectives import objective
 from tests.web.browser import Browser
 from tests.web.conftest import HOSTILE
-from tests.web.steps import fill_in, review
+from tests.web.steps import facts, fill_in, review
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -75,6 +75,25 @@ def test_a_server_that_stores_another_file_is_caught(browser: Browser, site: Sit
     browser.click("#upload")
     browser.sees("stored another file than the one you sent")
     assert not browser.all("#order")
+
+
+def test_tokens_are_allowed_to_another_contract_only_after_a_warning(site: Site) -> None:
+    wallet, rich = site.poor_wallet(), site.wallet()
+    rich.give(wallet.address, token=facts(site, "market")["token"]["address"], units=10**10)
+    rich.give(wallet.address, wei=10**17)
+    with Browser(site.url, wallet) as browser:
+        browser.go()
+        browser.connect()
+        fill_in(browser, site)
+        review(browser)
+        browser.lie(r"v1\/market$", "body.factory = '0x' + '12'.repeat(20)")
+        browser.lie(r"accounts\/0x\w+$", "body.token.allowance = body.xrt.allowance = '0'")
+        browser.driver.refresh()
+        fill_in(browser, site)
+        browser.sees("another contract than the one that you allowed before")
+        assert not browser.all("#allow")
+        browser.press("I know. Use the new contract")
+        assert "0x1212" in browser.find(".callout:has(#allow)").text
 
 
 def test_scripts_in_names_and_recordings_are_text(browser: Browser, site: Site, tmp_path: Path) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import secrets
-import urllib.request
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tests.web.browser import Browser
-from tests.web.steps import fill_in, order, sign
+from tests.web.steps import facts, fill_in, order, sign
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -42,12 +40,6 @@ def log_in(browser: Browser, token: str) -> None:
     browser.type("Token", token)
     browser.press("Log in")
     browser.sees("What should be done?")
-
-
-def facts(site: Site, path: str) -> Any:
-    """What the page's server answers."""
-    with urllib.request.urlopen(f"{site.url}/api/v1/{path}", timeout=30) as response:
-        return json.load(response)
 
 
 def test_operators_finish_a_job_and_strangers_may_not(site: Site, tmp_path: Path) -> None:

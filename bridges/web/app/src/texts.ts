@@ -124,6 +124,8 @@ export const texts = {
   copyAddress: "Copy my address",
   checkAgain: "Check again",
   mustAllow: (sum: string) => `The market's contract moves the price into the contract of your job. For that, allow it to take ${sum} from your account, once.`,
+  otherContract: "This server names another contract than the one that you allowed before. If nobody told you that the market's contract changes, don't go on: it could take your tokens.",
+  useOtherContract: "I know. Use the new contract",
   allow: (sum: string) => `Allow ${sum}`,
   allowedNow: (sum: string) => `The market may take ${sum}.`,
   localSigns: "The server's local account orders and pays. It signs without asking again.",

@@ -76,6 +76,18 @@ export function ownOrders(): OwnOrder[] {
   }
 }
 
+const contractKey = (market: Market) => `aira-contract-${market.chainId}-${market.generation}`;
+
+/** The market's contract that this browser allowed to take tokens before, on this chain; null if it allowed none. */
+export function allowedContract(market: Market): Address | null {
+  return localStorage.getItem(contractKey(market)) as Address | null;
+}
+
+/** Remembers the market's contract as the one that may take tokens. */
+export function rememberContract(market: Market): void {
+  localStorage.setItem(contractKey(market), market.factory);
+}
+
 /** Reads contracts through the wallet's node if it is on the same chain: the server can't change those answers. */
 export function readerFor(account: Account | null, market: Market): { reader: Reader; independent: boolean } {
   if (account?.kind === "wallet" && account.chainId === market.chainId) {

@@ -9,6 +9,7 @@ import { orderLocally, prepare, signAndPost } from "../ordering";
 import type { Draft } from "../ordering";
 import { calls } from "../contracts";
 import { texts } from "../texts";
+import { allowedContract, rememberContract } from "../trust";
 import type { AccountState, Agent, Model, Objective } from "../types";
 import { Action, Badge, Dialog, Facts, Field, Name, Problem, Show, Strange } from "../ui";
 import { ObjectiveChoice } from "./objective";
@@ -163,6 +164,7 @@ export function OrderButton(props: { draft: Draft | null }) {
   const state = useData<AccountState>(account ? `accounts/${account.address}` : null);
   const [review, setReview] = useState<{ demand: Demand; hash: Hex } | null>(null);
   const [error, setError] = useState<unknown>(null);
+  const [known, setKnown] = useState(() => allowedContract(market));
   const { draft } = props;
   if (!account) return null;
   const needs = draft && state.data ? needsOf(draft, state.data, market.token.address === market.xrt.address) : [];
@@ -177,8 +179,13 @@ export function OrderButton(props: { draft: Draft | null }) {
   };
   const allow = async (need: Need) => {
     await send(market[need.token].address, calls.approve(market.factory, need.amount));
+    trust();
     notify(texts.allowedNow(amount(need.amount, market[need.token])));
     state.reload();
+  };
+  const trust = () => {
+    rememberContract(market);
+    setKnown(market.factory);
   };
   return (
     <div class="sign">
@@ -199,7 +206,7 @@ export function OrderButton(props: { draft: Draft | null }) {
         </div>
       ))}
       {unallowed.map((need) => (
-        <div class="callout" key={need.token}>
+        <div class={`callout ${known && known !== market.factory ? "warn" : ""}`} key={need.token}>
           {BigInt(state.data!.eth) === 0n ? (
             <>
               <p>{texts.noGas(ether(state.data!.eth))}</p>
@@ -208,9 +215,14 @@ export function OrderButton(props: { draft: Draft | null }) {
                 <Action class="button small quietly" run={state.reload}>{texts.checkAgain}</Action>
               </p>
             </>
+          ) : known && known !== market.factory ? (
+            <>
+              <p>{texts.otherContract} <Name text={known} /> → <Name text={market.factory} /></p>
+              <Action class="button quietly" run={async () => trust()}>{texts.useOtherContract}</Action>
+            </>
           ) : (
             <>
-              <p>{texts.mustAllow(amount(need.amount, market[need.token]))}</p>
+              <p>{texts.mustAllow(amount(need.amount, market[need.token]))} <Name text={market.factory} /></p>
               <Action class="button" id="allow" run={() => allow(need)}>{texts.allow(amount(need.amount, market[need.token]))}</Action>
             </>
           )}
