@@ -218,6 +218,7 @@ def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_pa
             browser.sees("Drive a circle")
             browser.sees("2 XRT")
             browser.picture(pictures / "robot-frame.png")
+            assert browser.violations() == []
             browser.connect()
             browser.click("#make")
             sign(browser)
