@@ -63,10 +63,10 @@ async def _checked(method: str, path: str, response: ClientResponse, status: int
 
 @pytest.fixture
 def serve(place: Place, tmp_path: Path) -> Callable[..., AbstractAsyncContextManager[Browser]]:
-    """Serves a page at the test's market: with the account of a `role`, or without one."""
+    """Serves a page at the test's market: with the account of a `role`, or without one, and `settings` changed."""
 
     @asynccontextmanager
-    async def serving(role: str = "", **options: Any) -> AsyncIterator[Browser]:
+    async def serving(role: str = "", settings: dict[str, Any] | None = None, **options: Any) -> AsyncIterator[Browser]:
         static = tmp_path / "static"
         static.mkdir(exist_ok=True)
         (static / "index.html").write_text("<!doctype html><title>page</title>")
@@ -75,7 +75,7 @@ def serve(place: Place, tmp_path: Path) -> Callable[..., AbstractAsyncContextMan
         account = place.market.accounts[role] if role else None
         chain = place.chains[role or "provider"]
         async with (
-            opened(place.settings(role or "page"), account=account, chain=chain) as components,
+            opened(place.settings(role or "page", **(settings or {})), account=account, chain=chain) as components,
             PageServer(components, chosen) as server,
             ClientSession() as session,
         ):

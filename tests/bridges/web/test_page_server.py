@@ -166,6 +166,14 @@ async def test_an_order_that_no_provider_could_use_is_refused_with_the_reason(pl
         assert (await browser.post("orders", past, status=400))["error"]["reason"] == "expired"
 
 
+async def test_the_default_lifetime_is_one_that_is_accepted(place: Place, serve: Any) -> None:
+    async with place.provider(), serve(settings={"deadline_limit": 40}) as browser:
+        market = await browser.get("market")
+        assert (market["defaultLifetime"], market["limits"]["lifetime"]) == (40, 40)
+        demand = await signed_demand(browser, place.market.accounts["person"], MODEL, cost=0, lifetime=40)
+        await browser.post("orders", demand, status=202)
+
+
 async def test_posting_again_changes_nothing(place: Place, serve: Any) -> None:
     async with place.provider(), serve() as browser:
         demand = await signed_demand(browser, place.market.accounts["person"], MODEL, cost=0)

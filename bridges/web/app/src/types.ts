@@ -32,7 +32,7 @@ export interface Market {
   role: "anybody" | "operator";
   providers: Address[];
   connected: { router: boolean; chain: boolean };
-  limits: { upload: number; orders: number };
+  limits: { upload: number; orders: number; lifetime: number };
   robot: Robot | null;
   explorer: string;
   version: string;

@@ -10,7 +10,7 @@ import type { Draft } from "../ordering";
 import { calls } from "../contracts";
 import { texts } from "../texts";
 import { allowedContract, rememberContract } from "../trust";
-import type { AccountState, Agent, Model, Objective } from "../types";
+import type { AccountState, Agent, Market, Model, Objective } from "../types";
 import { Action, Badge, Dialog, Facts, Field, Name, Problem, Show, Strange } from "../ui";
 import { ObjectiveChoice } from "./objective";
 
@@ -111,6 +111,11 @@ function typicalPrice(price: string | undefined, symbol: string): string {
   return unit === symbol ? number : "";
 }
 
+/** For how many blocks an order is valid that waits so long. */
+function blocksOf(minutes: number, market: Market): number {
+  return Math.max(2, Math.round((minutes * 60) / Math.max(market.blockTime, 0.1)));
+}
+
 function PriceAndSign(props: { model: string; objective: Objective; price?: string }) {
   const { market, account } = useApp();
   const [price, setPrice] = useState(typicalPrice(props.price, market.token.symbol) || "1");
@@ -122,10 +127,9 @@ function PriceAndSign(props: { model: string; objective: Objective; price?: stri
   const wrongValidator = validator !== "" && !isAddress(validator);
   const draft = useMemo<Draft | null>(() => {
     if (cost === null || validatorFee === null || wrongValidator) return null;
-    const blocks = Math.max(2, Math.round((minutes * 60) / Math.max(market.blockTime, 0.1)));
     return {
       model: props.model, objective: props.objective.cid, cost, validatorFee,
-      validator: (validator as Address) || zeroAddress, lifetime: minutes === 10 ? market.defaultLifetime : blocks,
+      validator: (validator as Address) || zeroAddress, lifetime: minutes === 10 ? market.defaultLifetime : blocksOf(minutes, market),
     };
   }, [price, minutes, validator, fee, props.model, props.objective.cid]);
   return (
@@ -137,7 +141,7 @@ function PriceAndSign(props: { model: string; objective: Objective; price?: stri
         <Field label={texts.waitFor} hint={texts.waitForHint}>
           {(id, described) => (
             <select id={id} aria-describedby={described} class="big" value={minutes} onChange={(event) => setMinutes(Number(event.currentTarget.value))}>
-              {LIFETIMES.map((one) => <option key={one} value={one}>{duration(one * 60)}</option>)}
+              {LIFETIMES.filter((one) => one <= 10 || blocksOf(one, market) <= market.limits.lifetime).map((one) => <option key={one} value={one}>{duration(one * 60)}</option>)}
             </select>
           )}
         </Field>
