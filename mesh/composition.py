@@ -24,8 +24,10 @@ def load_account(settings: AccountSettings) -> Account:
     return Account.from_keyfile(*settings.keyfile_and_password())
 
 
-def chain_of(settings: ChainSettings, account: Account | None) -> Chain:
+def chain_of(settings: ChainSettings, account: Account | None, *, attempts: int = 4) -> Chain:
     """The chain that the settings name, not yet opened, for `account` or for reading only.
+
+    A request is made up to `attempts` times before the node counts as unreachable.
 
     What is sent is written down in the settings' folder, so that a number that was used stays used after a restart,
     and in other programs of the same account. Raises `ConfigurationError`.
@@ -44,6 +46,7 @@ def chain_of(settings: ChainSettings, account: Account | None) -> Chain:
             poll_interval=settings.poll_interval,
             confirmations=settings.confirmations,
             reorg_depth=settings.reorg_depth,
+            attempts=attempts,
         ),
         fees=FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI)),
         transactions=settings.state_directory / "transactions",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from mesh.amounts import ETH, XRT, Unit
-from mesh.cli.chain_client import open_chain, own_address
+from mesh.cli.chain_client import READ_ATTEMPTS, open_chain, own_address
 from mesh.cli.errors import AlreadyDeployed
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.lighthouse import check_lighthouse
@@ -164,7 +164,7 @@ async def status(settings: Settings, as_json: bool) -> None:
 
     account = await asyncio.to_thread(own_address, settings)
     trouble: ChainError | None = None
-    async with chain_of(settings, None).node as node:
+    async with chain_of(settings, None, attempts=READ_ATTEMPTS).node as node:
         facts = dict.fromkeys(CONTRACT_FACTS) | await _node_facts(node, account)
         try:
             async with open_chain(settings) as chain:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 SLOW: Final = 3.0
 """Seconds after which a command reports that it waits for a transaction."""
 FACTORY: Final = "factory"
+READ_ATTEMPTS: Final = 2
+"""Of a command that only reads: its user sees at once that a node is missing, and can repeat it."""
 
 
 @asynccontextmanager
@@ -32,7 +34,7 @@ async def open_chain(settings: Settings) -> AsyncIterator[Chain]:
     """The chain of the settings, opened for reading. Raises `NodeUnreachable`, `NoContracts`."""
     from mesh.composition import chain_of
 
-    async with chain_of(settings, None) as chain:
+    async with chain_of(settings, None, attempts=READ_ATTEMPTS) as chain:
         yield chain
 
 
