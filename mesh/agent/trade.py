@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from schemas.signing import Rejection
 
 log = logging.getLogger(__name__)
-
 ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: orders stay open until their deadline")
 
 
@@ -186,8 +185,7 @@ class Trader(Lifecycle):
 
     def reorganised(self) -> None:
         """A reorganisation may have reverted the allowance of open orders: they wait until it is ensured."""
-        orders = [order for order in self._orders.values() if order.is_open]
-        self._send_when_covered([order for order in orders if any(self._chain.costs.of(order.signed).values())])
+        self._send_when_covered([order for order in self._orders.values() if order.is_open])
 
     async def new_head(self, block: int) -> None:
         """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
@@ -250,10 +248,12 @@ class Trader(Lifecycle):
             order.reject(rejection)
         if order is None or not order.is_open:
             return
-        used = await self._chain.liabilities.next_nonce(self._address) if order.nonce is not None else 0
+        used = 0 if order.nonce is None else await self._chain.liabilities.next_nonce(self._address)
         await self._parts.chain_head.reached(await self._chain.block_number())
         if (order := self._orders.get(identity)) is None or not order.is_open:
             return
+        if reason == "ERC20InsufficientAllowance" and not order.is_overtaken(used - 1):
+            self._send_when_covered([order])  # a reorganisation took the allowance in a block that was not read here
         if order.is_overtaken(used - 1):
             await self._renew_overtaken(used - 1)
         elif order.reject(rejection):

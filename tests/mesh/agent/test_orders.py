@@ -74,6 +74,21 @@ async def test_resumed_orders_are_not_sent_before_their_allowance_is_ensured(pla
     assert resumed.hash == order.hash
 
 
+async def test_an_allowance_that_a_provider_misses_is_ensured_again(place: Place) -> None:
+    chain = place.chains["person"]
+
+    async def is_ensured() -> bool:
+        return await allowance(place, "person") == 4000
+
+    async with place.agent("person") as person:
+        order = await person.order(OBJECTIVE, cost=4000)
+        await chain.tokens.approve(chain.factory, 0)  # as a reorganisation that the agent does not notice
+        async with place.provider() as provider:
+            await until_found(is_ensured, what="the allowance")
+            await until(lambda: len(provider.book) == 1, what="the demand at the provider")
+            await order.withdraw()
+
+
 async def test_a_resumed_order_that_can_not_be_covered_is_reported(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
