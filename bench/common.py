@@ -15,6 +15,7 @@ from schemas import ZERO_ADDRESS, Demand, Signer, cid_of_digest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
 SPAWN: Final = multiprocessing.get_context("spawn")
 LIGHTHOUSE: Final = "airalab.lighthouse.3.robonomics.eth"
@@ -45,6 +46,16 @@ def signed_demands(count: int, *, lighthouse: str = ADDRESS) -> list[Demand]:
     return [
         people[number % 16].sign(demand) for number, demand in enumerate(unsigned_demands(count, lighthouse=lighthouse))
     ]
+
+
+def installed_anvil() -> Path | None:
+    """The anvil that `make peers` installed; None if there is none, and then the embedded chain serves."""
+    from peers.catalog import PeerMissing, locate  # of the checkout, whose folder the caller puts on the path
+
+    try:
+        return locate("anvil")
+    except PeerMissing:
+        return None
 
 
 @contextmanager

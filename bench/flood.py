@@ -31,17 +31,15 @@ from typing import TYPE_CHECKING, Any, Final
 import bridge_flood
 from floods import FLOODS, Attacker
 
-from common import SPAWN, router
+from common import SPAWN, installed_anvil, router
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # `peers` finds anvil
 
 from mesh import Agent
 from mesh.demo.lamp import write_objective
-from mesh.devchain.anvil import find_anvil
 from mesh.devchain.development import serve_chain
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
-from peers.catalog import PeerMissing, locate
 from schemas import cid_of_bytes, cid_of_file
 
 if TYPE_CHECKING:
@@ -163,12 +161,8 @@ async def measure(name: str) -> dict[str, Any]:
     async with AsyncExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         endpoint, pid = stack.enter_context(router())
-        try:
-            anvil = find_anvil(locate("anvil"))
-        except PeerMissing:
-            anvil = None
         served = await stack.enter_async_context(
-            serve_chain(Settings(data_dir=folder), host="127.0.0.1", port=0, block_time=1.0, anvil=anvil)
+            serve_chain(Settings(data_dir=folder), host="127.0.0.1", port=0, block_time=1.0, anvil=installed_anvil())
         )
         place = Place(
             endpoint=endpoint,

@@ -4,7 +4,7 @@ Router, chain, page server, sender and browser are processes on this machine. Th
 from the moment before an order is put on Zenoh until the frame in which its row is first on the screen; the page shows
 the latest orders ten times a second, so it skips some. `first_view_ms` is from the navigation to the whole market view,
 before the orders come. `tab_mb` and `server_mb` are the most resident memory, of the tab's process and the server, and
-`tab_cpu` and `server_cpu` the share of a core that each takes, which tells more than times on a busy machine.
+`tab_cpu` and `server_cpu` the share of a core that each takes, which says more than times on a busy machine.
 
 Bars: at most 150 kB of gzip, at least 30 frames a second, p99 at most 250 ms, first view at most 1 s; and between the
 second and the last quarter neither memory grows by more than a tenth and 5 MB. The exit status is 1 if one is missed.
@@ -24,15 +24,14 @@ from contextlib import AsyncExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from common import SPAWN, arguments, router, show, unsigned_demands
+from common import SPAWN, arguments, installed_anvil, router, show, unsigned_demands
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # `tests` has the browser, `peers` finds it
 
-from mesh.devchain.anvil import find_anvil
 from mesh.devchain.development import serve_chain
 from mesh.network import Endpoints, Network, message_key
 from mesh.settings import Settings
-from peers.catalog import PeerMissing, locate
+from peers.catalog import locate
 from schemas import Signer, encode, verify
 from tests.web.browser import Browser
 
@@ -131,12 +130,8 @@ async def measure(seconds: int) -> dict[str, Any]:
     async with AsyncExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         endpoint, _ = stack.enter_context(router())
-        try:
-            anvil = find_anvil(locate("anvil"))
-        except PeerMissing:
-            anvil = None
         served = await stack.enter_async_context(
-            serve_chain(Settings(data_dir=folder), host="127.0.0.1", port=0, block_time=1.0, anvil=anvil)
+            serve_chain(Settings(data_dir=folder), host="127.0.0.1", port=0, block_time=1.0, anvil=installed_anvil())
         )
         deployment = served.market.deployment
         async with served.market.chain(served.url, "person") as chain:

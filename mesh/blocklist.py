@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from mesh.clock import SYSTEM_CLOCK
 from mesh.errors import ConfigurationError
+from mesh.fresh_file import FreshFile
 from mesh.log_context import log_event
 from schemas import InputError, parse_address
 
@@ -16,11 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.clock import Clock
+    from mesh.errors import AiraError
 
 log = logging.getLogger(__name__)
 
-CHECK_INTERVAL: Final = 1.0
-"""Seconds between two looks at whether the file has changed."""
 SIZE_LIMIT: Final = 4 * 1024 * 1024
 """The largest file, in bytes: about 90,000 addresses."""
 
@@ -46,11 +45,7 @@ class Blocklist:
     def __init__(self, path: Path, *, parse: Callable[[str], str] = parse_address, clock: Clock = SYSTEM_CLOCK) -> None:
         self._path = path
         self._parse = parse
-        self._clock = clock
-        self._lock = threading.Lock()
-        self._version = self._stat()
-        self._entries = self._read()
-        self._checked = clock.monotonic()
+        self._file = FreshFile(path, self._read, on_error=_log_error, on_change=self._log_change, clock=clock)
 
     def __contains__(self, entry: object) -> bool:
         return entry in self.entries
@@ -58,44 +53,24 @@ class Blocklist:
     @property
     def entries(self) -> frozenset[str]:
         """All of them; the same object as long as nothing has changed."""
-        if self._clock.monotonic() - self._checked >= CHECK_INTERVAL:
-            self._check()
-        return self._entries
+        return self._file.content
 
-    def _check(self) -> None:
-        with self._lock:
-            self._checked = self._clock.monotonic()
-            try:
-                version = self._stat()
-                if version == self._version:
-                    return
-                self._version = version
-                self._entries = self._read()
-            except BlocklistUnusable as error:
-                log.warning("the blocklist stays as it was: %s", error, extra=log_event("blocklist-unusable"))
-            else:
-                facts = log_event("blocklist-read", blocked=len(self._entries), path=str(self._path))
-                log.info("%d are blocked by %s", len(self._entries), self._path, extra=facts)
+    def _log_change(self, entries: frozenset[str]) -> None:
+        facts = log_event("blocklist-read", blocked=len(entries), path=str(self._path))
+        log.info("%d are blocked by %s", len(entries), self._path, extra=facts)
 
-    def _stat(self) -> tuple[int, int, int] | None:
+    def _read(self, path: Path) -> frozenset[str]:
         try:
-            found = self._path.stat()
-        except OSError:
-            return None  # reading it says why
-        return found.st_mtime_ns, found.st_size, found.st_ino
-
-    def _read(self) -> frozenset[str]:
-        try:
-            with self._path.open("rb") as file:
+            with path.open("rb") as file:
                 data = file.read(SIZE_LIMIT + 1)
             lines = data.decode().splitlines()
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "it is not text"
             raise BlocklistUnusable(
-                f"can't read the blocklist {self._path}: {reason}", hint="name a file, which may be empty"
+                f"can't read the blocklist {path}: {reason}", hint="name a file, which may be empty"
             ) from None
         if len(data) > SIZE_LIMIT:
-            raise BlocklistUnusable(f"the blocklist {self._path} is larger than {SIZE_LIMIT} bytes")
+            raise BlocklistUnusable(f"the blocklist {path} is larger than {SIZE_LIMIT} bytes")
         return frozenset(filter(None, map(self._entry, range(1, len(lines) + 1), lines)))
 
     def _entry(self, number: int, line: str) -> str:
@@ -106,6 +81,10 @@ class Blocklist:
             raise BlocklistUnusable(
                 f"line {number} of the blocklist {self._path} can't be used: {error}", hint="write one entry a line"
             ) from None
+
+
+def _log_error(error: AiraError) -> None:
+    log.warning("the blocklist stays as it was: %s", error, extra=log_event("blocklist-unusable"))
 
 
 def blocklist_at(path: str) -> BlockedSigners:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from schemas.status import ALIVE, OFF, Status
+from mesh.telemetry.health import is_healthy
+from schemas.status import BridgeStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -22,25 +23,29 @@ ALERTS: Final = 256
 
 def alerts_of(found: Mapping[str, RoleStatus | None], head: int) -> list[dict[str, Any]]:
     """The alerts about these addresses, at most `ALERTS`; `head` is the last block that the page knows."""
-    told = [
+    alerts = [
         {"agent": address, "code": code, "detail": detail[:LONGEST]}
         for address, status in found.items()
         for code, detail in _alerts(status, head)
     ]
-    return told[:ALERTS]
+    return alerts[:ALERTS]
+
+
+def waiting_parts(status: RoleStatus) -> list[str]:
+    """The parts of an agent, a provider or a bridge that do not work now, each with its state."""
+    if isinstance(status, BridgeStatus):
+        return [] if status.state in ("connected", "alone") else [f"bridge: {status.state}"]
+    return [f"{part}: {state}" for part, state in status.parts.items() if not is_healthy(state)]
 
 
 def _alerts(status: RoleStatus | None, head: int) -> Iterator[tuple[str, str]]:
     if status is None:
         yield "silent", ""
         return
-    if not isinstance(status, Status):
-        if status.state not in ("connected", "alone"):
-            yield "part-waits", f"bridge: {status.state}"
+    for waiting in waiting_parts(status):
+        yield "part-waits", waiting
+    if isinstance(status, BridgeStatus):
         return
-    for part, state in status.parts.items():
-        if state not in (ALIVE, OFF):
-            yield "part-waits", f"{part}: {state}"
     if status.head + BEHIND < head:
         yield "behind", f"{head - status.head} blocks"
     if status.work is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
@@ -22,6 +21,8 @@ from bridges.web.answers import (
 )
 from bridges.web.errors import InvalidRequest, OperatorsOnly, PageNotFound
 from bridges.web.file_api import FileApi
+from bridges.web.orders import PER_SIGNER
+from bridges.web.reference import OPENAPI
 from bridges.web.views import liability_json
 from mesh.agent.orders import default_lifetime
 from mesh.errors import ChainError
@@ -45,7 +46,6 @@ FACTS_AGE: Final = 10.0
 """Seconds for which facts of the market are used."""
 LISTED: Final = 500
 """Things in one list."""
-OPENAPI: Final = Path(__file__).with_name("openapi.json")
 _DRIVEN: Final = {"start": StartLiability, "restart": RestartLiability}
 
 
@@ -178,7 +178,7 @@ class Api:
             "token": await self._market.contracts.labels.learn(parts.token),
             "defaultLifetime": min(await default_lifetime(chain), settings.deadline_limit),
             "providers": sorted(await self._market.providers()),
-            "limits": {"upload": self._files.upload_limit, "orders": 64, "lifetime": settings.deadline_limit},
+            "limits": {"upload": self._files.upload_limit, "orders": PER_SIGNER, "lifetime": settings.deadline_limit},
             "robot": self._server.options.robot,
             "explorer": self._server.options.explorer,
             "version": mesh.__version__,

@@ -44,9 +44,9 @@ JOBS: Final = 16_384
 STEPS: Final = 32
 """Steps of one job that are remembered."""
 READ_AT_ONCE: Final = 32
-"""ContractFollower that are read in one call."""
+"""Contracts that are read in one call."""
 EARLY: Final = 1024
-"""ContractFollower of which agents spoke before they were read."""
+"""Contracts of which agents spoke before they were read."""
 REPORTED: Final = Rate(per_second=4.0, burst=16)
 """Reports of an agent about its playbacks."""
 PHASES: Final = {"incoming": "incoming", "ready": "ready", "playing": "running", "result": "complete"}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from bridges.web.alerts import alerts_of
+from bridges.web.alerts import alerts_of, waiting_parts
 from bridges.web.views import liability_json, result_json
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
@@ -16,7 +16,7 @@ from mesh.evidence import Claim, Verdict, check_end, verify
 from mesh.watching import present, statuses
 from mesh.work.notes import read_reason
 from schemas import ZERO_ADDRESS, encode, parse_cid
-from schemas.status import ALIVE, OFF, BridgeStatus, Status
+from schemas.status import Status
 
 if TYPE_CHECKING:
     from bridges.web.components import WebComponents
@@ -237,9 +237,7 @@ def _own_model(status: RoleStatus | None) -> set[str]:
 def _health(status: RoleStatus | None) -> str:
     if status is None:
         return "silent"
-    if isinstance(status, BridgeStatus):
-        return "alive" if status.state in ("connected", "alone") else "degraded"
-    return "alive" if all(state in (ALIVE, OFF) for state in status.parts.values()) else "degraded"
+    return "degraded" if waiting_parts(status) else "alive"
 
 
 class AccountRecord(msgspec.Struct):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hmac
+import logging
 import secrets
 import ssl
 import time
@@ -15,21 +16,24 @@ from bridges.web.answers import answer, body_of
 from bridges.web.errors import LoginRequired, TooManyRequests
 from bridges.web.options import is_loopback
 from mesh.flood import BoundedDict, Rate, RateLimiter
+from mesh.fresh_file import FreshFile
 from mesh.identity.roster import read_roster
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from aiohttp import web
 
     from bridges.web.options import WebOptions
-    from mesh.identity.roster import Member
+    from mesh.errors import AiraError
+    from mesh.identity.roster import Member, Roster
+
+log = logging.getLogger(__name__)
 
 COOKIE: Final = "aira_session"
 ATTEMPTS: Final = Rate(per_second=0.2, burst=10)
 """Attempts to log in, of one address."""
 SESSIONS: Final = 1024
 SESSION_SECONDS: Final = 12 * 3600.0
-ROSTER_AGE: Final = 2.0
-"""Seconds after which a changed roster counts."""
 
 
 class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,13 +43,18 @@ class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Logins:
-    """The sessions of one server. Raises `RosterError` for a roster that can't be read."""
+    """The sessions of one server, and the members of its roster, which may change at any time.
+
+    Raises `RosterError` for a roster that can't be read at the start.
+    """
 
     def __init__(self, options: WebOptions) -> None:
         self._options = options
         self._attempts = RateLimiter(per_sender=ATTEMPTS)
         self._sessions: BoundedDict[str, tuple[str, float]] = BoundedDict(SESSIONS)
-        self._roster = RosterFile(Path(options.roster)) if options.roster else None
+        self._roster: FreshFile[Roster] | None = None
+        if options.roster:
+            self._roster = FreshFile(Path(options.roster).expanduser(), read_roster, on_error=_log_error)
 
     @property
     def is_needed(self) -> bool:
@@ -93,32 +102,14 @@ class Logins:
         return context
 
     def _member(self, request: web.Request) -> Member | None:
-        """The member of the roster whose certificate the browser showed."""
+        """The member of the roster whose certificate the browser showed, unless it is revoked."""
         certificate: Any = request.get_extra_info("peercert")
         if self._roster is None or not certificate:
             return None
         names = [value for part in certificate.get("subject", ()) for kind, value in part if kind == "commonName"]
-        return self._roster.find(names[0]) if len(names) == 1 else None
-
-
-class RosterFile:
-    """A roster that may change at any time. One that can't be read any more leaves the last one in force."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path.expanduser()
-        self._roster = read_roster(self._path)
-        self._read_at = time.monotonic()
-        self._changed = self._stamp()
-
-    def find(self, address: str) -> Member | None:
-        """The member with this address who is not revoked."""
-        if time.monotonic() - self._read_at > ROSTER_AGE:
-            self._read_at = time.monotonic()
-            if (changed := self._stamp()) != self._changed:
-                self._roster, self._changed = read_roster(self._path), changed
-        member = self._roster.find(address.lower())
+        member = self._roster.content.find(names[0].lower()) if len(names) == 1 else None
         return None if member is None or member.revoked else member
 
-    def _stamp(self) -> tuple[int, int]:
-        found = self._path.stat()
-        return found.st_mtime_ns, found.st_size
+
+def _log_error(error: AiraError) -> None:
+    log.warning("the roster stays as it was: %s", error, extra=log_event("roster-unusable", code=error.code))

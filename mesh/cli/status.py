@@ -22,8 +22,9 @@ from mesh.cli.output import (
 )
 from mesh.flood import Drops
 from mesh.settings import NetworkSettings, options_of
+from mesh.telemetry.health import is_healthy
 from schemas import parse_address
-from schemas.status import ALIVE, OFF, BridgeStatus, Status
+from schemas.status import ALIVE, BridgeStatus, Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -185,7 +186,7 @@ def summarize_status(how: RoleStatus | None) -> str:
         activity = "active" if how.carries else "standby"
         words = [how.state, activity, f"{plural(len(how.ipfs_peers), 'node')} on the IPFS side"]
     else:
-        failures = [f"{part} {state}" for part, state in how.parts.items() if state not in (ALIVE, OFF)]
+        failures = [f"{part} {state}" for part, state in how.parts.items() if not is_healthy(state)]
         words = [*(failures or [ALIVE]), f"block {how.head:,}"]
         if how.work is not None:
             words.append(plural(_open_jobs(how.work), "open job"))

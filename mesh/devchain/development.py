@@ -204,10 +204,10 @@ async def _new_market(anvil: Path, state: Path | None) -> AsyncIterator[Path | N
     chain when they all are there: whatever happens before, the next start begins with nothing.
     """
     if state is not None:
-        await asyncio.to_thread(prepare_state, state)
         if await asyncio.to_thread(state.exists):
             yield None
             return
+        await asyncio.to_thread(prepare_state, state)
     with tempfile.TemporaryDirectory(prefix="aira-market-") as folder:
         new = Path(folder) / "chain.json"
         async with serve_anvil(anvil, host="127.0.0.1", port=0, block_time=None, state=new) as node:

@@ -10,9 +10,10 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.blocklist import CHECK_INTERVAL, Blocklist
+from mesh.blocklist import Blocklist
 from mesh.chain import InsufficientFunds
 from mesh.flood import Drops, FairQueue
+from mesh.fresh_file import CHECK_INTERVAL
 from mesh.log_context import LogSource, source_context
 from mesh.market.book import LIMIT, Match, OrderBook
 from mesh.market.earnings import Earnings, EarningsLedger

@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import zenoh
 
 from mesh.background import call_in_loop
-from mesh.blocklist import CHECK_INTERVAL, Blocklist
+from mesh.blocklist import Blocklist
 from mesh.clock import SYSTEM_CLOCK
 from mesh.flood import HEAVIEST, REPORT_INTERVAL
+from mesh.fresh_file import CHECK_INTERVAL
 from mesh.log_context import log_event
 from schemas import parse_address
 

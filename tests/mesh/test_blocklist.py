@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from mesh.blocklist import CHECK_INTERVAL, Blocklist, BlocklistUnusable, blocklist_at
+from mesh.blocklist import Blocklist, BlocklistUnusable, blocklist_at
+from mesh.fresh_file import CHECK_INTERVAL
 from mesh.network.validation import MessageValidator, message_key
 from schemas import Demand, Signer, encode
 from tests.schemas.samples import DEMAND

@@ -1,4 +1,4 @@
-"""A robot whose model has a description: it drives, and tells its position, what it said and what it saw."""
+"""A robot whose model has a description: it drives, and publishes its position, texts and pictures."""
 
 from __future__ import annotations
 

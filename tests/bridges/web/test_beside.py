@@ -31,9 +31,9 @@ def answer(url: str) -> Any:
 def test_a_development_market_has_a_page_that_orders_for_the_person(tmp_path: Path) -> None:
     where = ("--listen", f"tcp/127.0.0.1:{free_port()}", "--port", "0", "--data-dir", tmp_path, "--web-port", "0")
     with Serving(*AIRA, "up", *where, "--engine", "embedded", "--local-account", says="provider    0x") as up:
-        told = dict(re.findall(r"^(page|person) +(.*)$", up.log(), re.MULTILINE))
-        market = answer(f"{told['page']}/api/v1/market")
-        assert market["account"] == told["person"].split()[-1]
+        printed = dict(re.findall(r"^(page|person) +(.*)$", up.log(), re.MULTILINE))
+        market = answer(f"{printed['page']}/api/v1/market")
+        assert market["account"] == printed["person"].split()[-1]
         assert market["connected"] == {"router": True, "chain": True}
         code, _ = up.end(signal.SIGINT)
         assert code == 0, up.log()

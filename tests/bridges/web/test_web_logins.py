@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp import ClientConnectionError, ClientSession, CookieJar, TCPConnector, WSServerHandshakeError
 
-from bridges.web import logins
 from bridges.web.components import opened
 from bridges.web.errors import NotOpenToOthers
 from bridges.web.options import WebOptions
 from bridges.web.server import PageServer
+from mesh import fresh_file
 from mesh.background import Background
 from mesh.identity import Member
 from mesh.market.provider import Provider
@@ -92,7 +92,7 @@ async def test_other_machines_log_in_by_tls(serve: Any, site: Site) -> None:
 async def test_members_log_in_by_their_certificates(
     serve: Any, site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(logins, "ROSTER_AGE", -1.0)
+    monkeypatch.setattr(fresh_file, "CHECK_INTERVAL", -1.0)
     boss = site.enlist(Member(name="boss", address=BOSS, roles=("operator",)))
     ann = site.enlist(Member(name="ann", address=ANN, roles=("person",)))
     gone = site.enlist(Member(name="gone", address=GONE, roles=("operator",), revoked=True))
@@ -109,6 +109,10 @@ async def test_members_log_in_by_their_certificates(
             async with visitor(site, page.server, none) as browser:
                 with pytest.raises(ClientConnectionError):
                     await browser.get("market")
+        for change in (lambda: site.roster.write_text("garbage"), site.roster.unlink):
+            change()  # the last roster that could be read stays in force
+            async with visitor(site, page.server, boss) as browser:
+                assert (await browser.get("market"))["role"] == "operator"
         site.roster.write_text(f'lighthouses = ["{MARKET}"]\n')
         async with visitor(site, page.server, boss) as browser:
             await browser.get("market", status=401)

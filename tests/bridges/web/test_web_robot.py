@@ -28,9 +28,9 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_a_toml_file_describes_a_robots_page_and_options_change_it(tmp_path: Path) -> None:
-    told = {"model": MODEL, "objective": MODEL, "cost": "1500", "title": "The lamp", "text": "It blinks."}
-    assert robot_of(options(written(tmp_path, FULL))) == told
-    assert robot_of(options(written(tmp_path, FULL), cost="7")) == told | {"cost": "7"}
+    robot = {"model": MODEL, "objective": MODEL, "cost": "1500", "title": "The lamp", "text": "It blinks."}
+    assert robot_of(options(written(tmp_path, FULL))) == robot
+    assert robot_of(options(written(tmp_path, FULL), cost="7")) == robot | {"cost": "7"}
     assert robot_of(options()) is None
     alone = {"model": MODEL, "objective": None, "cost": None, "title": "", "text": ""}
     assert robot_of(options(model=MODEL)) == alone

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import secrets
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -24,7 +25,9 @@ from tests.support.objectives import objective
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent
+    from collections.abc import AsyncIterator, Callable
+
+    from mesh.agent import Agent, Order
     from mesh.work.job import Job
 
 
@@ -86,18 +89,33 @@ def test_a_decline_needs_a_word_for_programs() -> None:
             Declined(word)
 
 
-async def test_a_decline_is_believed_of_agents_that_are_present(place: Place) -> None:
-    """Not of accounts that are not; not if it has another's signature; and of each agent once."""
-    stranger, heard = Signer(secrets.token_bytes(32)), list[Progress]()
+@asynccontextmanager
+async def demanding(
+    place: Place, heard: list[Progress]
+) -> AsyncIterator[tuple[Agent, Agent, Order, Callable[[Decline], None]]]:
+    """A robot and a person who waits for a contract: both, the order, and a way for anybody to put declines of it."""
     async with (
         place.agent("robot") as robot,
         place.agent("person") as person,
         Network(Endpoints(connect=(place.endpoint,))) as network,
     ):
+        key = str(DeclineKey(person.channel.lighthouse, place.address("person")))
+
+        def put(decline: Decline) -> None:
+            network.session.put(key, decline.encode())
+
         demand = asyncio.create_task(person.demand(OBJECTIVE, on_progress=heard.append))
         await posted(person)
         (order,) = person.orders()
-        key = str(DeclineKey(person.channel.lighthouse, place.address("person")))
+        yield robot, person, order, put
+        demand.cancel()
+        await asyncio.wait([demand])
+
+
+async def test_a_decline_is_believed_of_agents_that_are_present(place: Place) -> None:
+    """Not of accounts that are not; not if it has another's signature; and of each agent once."""
+    stranger, heard = Signer(secrets.token_bytes(32)), list[Progress]()
+    async with demanding(place, heard) as (robot, person, order, put):
         absent = Decline(order=order.hash, code="busy", detail="", agent=stranger.address).signed_by(stranger)
         true = Decline(order=order.hash, code="busy", detail="", agent=robot.address).signed_by(robot.parts.signer)
         forged = replace(absent, agent=robot.address, detail="forged")
@@ -105,39 +123,27 @@ async def test_a_decline_is_believed_of_agents_that_are_present(place: Place) ->
 
         def are_heard() -> bool:
             for decline in (absent, forged, other, true):
-                network.session.put(key, decline.encode())
+                put(decline)
             return bool(heard) and "declines" in person.drops.totals()
 
         await until(are_heard)
         assert heard == [Progress(kind="declined", agent=robot.address, code="busy")]
-        demand.cancel()
-        await asyncio.wait([demand])
 
 
 async def test_an_agent_that_goes_on_declining_is_not_heard(place: Place) -> None:
     """Each of its declines differs from the one before."""
     heard: list[Progress] = []
-    async with (
-        place.agent("robot") as robot,
-        place.agent("person") as person,
-        Network(Endpoints(connect=(place.endpoint,))) as network,
-    ):
-        demand = asyncio.create_task(person.demand(OBJECTIVE, on_progress=heard.append))
-        await posted(person)
-        (order,) = person.orders()
-        key = str(DeclineKey(person.channel.lighthouse, place.address("person")))
+    async with demanding(place, heard) as (robot, person, order, put):
         signer, numbers = robot.parts.signer, itertools.count()
 
         def are_dropped() -> bool:
             for _ in range(10):
                 decline = Decline(order=order.hash, code="busy", detail=str(next(numbers)), agent=robot.address)
-                network.session.put(key, decline.signed_by(signer).encode())
+                put(decline.signed_by(signer))
             return person.drops.totals().get("declines", 0) > 100
 
         await until(are_dropped, pause=0.05)
         assert 0 < len(heard) < next(numbers) - 100
-        demand.cancel()
-        await asyncio.wait([demand])
 
 
 async def test_declines_are_limited_for_each_maker(place: Place) -> None:
