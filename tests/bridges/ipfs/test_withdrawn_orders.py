@@ -59,7 +59,8 @@ async def test_a_withdrawn_order_is_not_relayed(
         await until(lambda: len(bob.heard) == 3 and encode(last) in mesh.payloads, seconds=SECONDS)
         assert set(bob.heard) == {legacy_json(message) for message in (kept, two, last)}
         assert encode(two) not in mesh.payloads
-        assert bridge.status().to_ipfs.invalid == bridge.status().to_mesh.invalid == {"withdrawn": 1}
+        await until(lambda: bridge.status().to_ipfs.invalid == {"withdrawn": 1}, seconds=SECONDS)
+        await until(lambda: bridge.status().to_mesh.invalid == {"withdrawn": 1}, seconds=SECONDS)
 
 
 async def test_an_order_that_waits_is_dropped_when_it_is_withdrawn(
