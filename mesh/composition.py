@@ -1,7 +1,7 @@
 """From settings to open parts: the account, the chain and the network that the settings name.
 
 The command line, agents, bridges and tests compose their parts here, and nowhere else. The chain is imported on first
-use: what runs without one never loads web3.
+use: what runs without one never loads it.
 """
 
 from __future__ import annotations

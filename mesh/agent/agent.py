@@ -171,7 +171,7 @@ class Agent(HandlerDecorators, ReadingAgent):
             tasks.start(repeat(seconds, handler), f"every {seconds:g} s")
 
     async def _open_runtime(self, stack: AsyncExitStack, account: Account) -> AgentRuntime:
-        from mesh.agent.runtime import AgentRuntime  # loads web3, which an agent that watches does without
+        from mesh.agent.runtime import AgentRuntime  # loads the chain, which an agent that watches does without
 
         make = partial(working, self.settings, account, self._given_chain, resend=self._resend, drops=self.drops)
         parts = await open_when_ready(stack, self.settings, make, role="agent", on_wait=self.telemetry.starting)

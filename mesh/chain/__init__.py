@@ -1,6 +1,7 @@
 """The chain: accounts, names, contracts, events.
 
-Importing this package loads web3, which takes a second: what also runs without a chain imports it where it is needed.
+Importing this package loads aiohttp, which takes a quarter of a second: what also runs without a chain
+imports it where it is needed.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coincurve import PrivateKey
-from eth_keyfile.keyfile import create_keyfile_json, decode_keyfile_json
 
 from mesh.errors import ConfigurationError, InputError
 from schemas.address import keccak256, parse_address
@@ -144,6 +143,8 @@ def write_keyfile(path: Path | str, private_key: bytes, password: str) -> str:
     Takes most of a second. Raises `KeyfileError` when the file exists or can't be written, `InputError` for an
     invalid `private_key`.
     """
+    from eth_keyfile.keyfile import create_keyfile_json  # takes half a second
+
     address = Account(private_key).address
     content = create_keyfile_json(private_key, password.encode())
     try:
@@ -179,6 +180,8 @@ def keyfile_address(keyfile: Path | str) -> str | None:
 
 def _open_keyfile(keyfile: Path, password: bytes, *, password_from: object) -> bytes:
     """The private key in a keyfile. Raises `KeyfileError`, `WrongPassword`."""
+    from eth_keyfile.keyfile import decode_keyfile_json  # takes half a second
+
     content = _read_keyfile(keyfile)
     version = next((value for name, value in content.items() if name.lower() == "version"), None)
     if version != VERSION:

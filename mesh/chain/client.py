@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mesh.chain.contracts import ContractKind
     from mesh.chain.following import BlockEvents, History
     from mesh.chain.policy import FeePolicy, Timing
-    from mesh.chain.web3_provider import Endpoint
+    from mesh.chain.rpc_client import Endpoint
     from mesh.errors import AiraError
     from mesh.outage_log import OutageLog
     from mesh.telemetry.metrics import MetricFamily

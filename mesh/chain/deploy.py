@@ -15,8 +15,8 @@ from schemas import keccak256
 if TYPE_CHECKING:
     from mesh.chain.abi import ContractCall, ContractFunctions
     from mesh.chain.accounts import Account
+    from mesh.chain.rpc_client import Endpoint
     from mesh.chain.transactions import Receipt
-    from mesh.chain.web3_provider import Endpoint
 
 WN: Final = 1
 XRT: Final = 10**9 * WN

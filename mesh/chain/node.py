@@ -14,8 +14,8 @@ from mesh.chain.metrics import NodeMetrics
 from mesh.chain.multicall import read, read_all
 from mesh.chain.pending import PendingTransactions
 from mesh.chain.policy import FeePolicy, Fees, GasMarket, Timing
+from mesh.chain.rpc_client import rpc_client
 from mesh.chain.transaction_store import TransactionStore
-from mesh.chain.web3_provider import open_provider
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
     from mesh.chain.abi import ContractCall
     from mesh.chain.answers import Log, MinedTransaction
-    from mesh.chain.web3_provider import Endpoint
+    from mesh.chain.rpc_client import Endpoint
 
 PRIORITY_SECONDS: Final = 60.0
 """How long the priority fee that the node suggests is used; the base fee is that of the latest block."""
 
 
 class Node:
-    """A node reached at `endpoint`: `http(s)://…`, `ws(s)://…` or a web3 provider object (which stays open).
+    """A node reached at `endpoint`: `http(s)://…`, `ws(s)://…` or a `Transport` (which stays open).
 
     Several endpoints (a sequence, or one text with commas) are nodes of one chain: when one does not answer, the next
     is asked, and stays in use until it fails in turn.
@@ -58,7 +58,7 @@ class Node:
         self.metrics = NodeMetrics()
         self._transactions = transactions
         self._chain_folder: Path | None = None
-        self._provider = open_provider(endpoint, self.timing, self.metrics)
+        self._rpc = rpc_client(endpoint, self.timing, self.metrics)
         self.heads = Heads(
             self._ask_latest, self.header, interval=self.timing.poll_interval, request_pushes=self._request_pushes
         )
@@ -70,7 +70,7 @@ class Node:
     @property
     def endpoint(self) -> str:
         """Where the node is, for people to read."""
-        return self._provider.endpoint
+        return self._rpc.endpoint
 
     @property
     def chain_id(self) -> int:
@@ -80,24 +80,24 @@ class Node:
         return self._chain_id
 
     async def __aenter__(self) -> Self:
-        self._provider.open()
+        self._rpc.open()
         try:
             self._chain_id = int(await self._ask("eth_chainId"))
-            await self._provider.check_chains(self._chain_id)
+            await self._rpc.check_chains(self._chain_id)
             if self._transactions is not None:
                 self._chain_folder = self._transactions / await self._chain_name()
         except BaseException:
-            await self._provider.close()
+            await self._rpc.close()
             raise
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
         self._chain_id = None
-        await self._provider.close()
+        await self._rpc.close()
 
     async def request(self, method: str, *params: Any) -> Any:
         """The result of any JSON-RPC method, as JSON."""
-        return await self._provider.request(method, list(params))
+        return await self._rpc.request(method, list(params))
 
     async def client_version(self) -> str:
         """The name and version of the node's program."""
@@ -124,7 +124,7 @@ class Node:
 
     async def _ask_latest(self) -> BlockHeader:
         """A null is asked again like any other spoiled answer: every chain has a latest block."""
-        found: BlockHeader = await self._provider.request("eth_getBlockByNumber", ["latest", False], kind=BlockHeader)
+        found: BlockHeader = await self._rpc.request("eth_getBlockByNumber", ["latest", False], kind=BlockHeader)
         return found
 
     async def block_hash(self, number: int) -> bytes:
@@ -231,7 +231,7 @@ class Node:
 
     async def _ask(self, method: str, *params: Any) -> Any:
         """What the node answers to one of the methods in `ANSWERS`, with the type that is declared there."""
-        return await self._provider.request(method, list(params), kind=ANSWERS[method])
+        return await self._rpc.request(method, list(params), kind=ANSWERS[method])
 
     async def _suggested_priority(self, base: int) -> int:
         """The priority fee that the node suggests, or how far its gas price is above the base fee."""
@@ -247,7 +247,7 @@ class Node:
         return f"{self.chain_id}-{(await self.block_hash(0)).hex()[:16]}"
 
     def _request_pushes(self) -> None:
-        self._provider.push_heads(self.heads.pushed)
+        self._rpc.push_heads(self.heads.pushed)
 
     def contract(self, name: str, address: str) -> ContractFunctions:
         """The functions of the contract at an address with the ABI of one of ours (`artifacts.NAMES`)."""

@@ -1,44 +1,45 @@
-"""JSON-RPC over HTTP or WebSocket: web3 providers that keep one connection open until they are closed.
-
-web3's own HTTP provider opens a connection for each request, and its WebSocket provider waits by spinning.
-"""
+"""JSON-RPC over HTTP or WebSocket, on one connection that stays open until it is closed."""
 
 from __future__ import annotations
 
 import asyncio
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, cast
+from itertools import count
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 from aiohttp import ClientError, ClientResponse, ClientSession, ClientWebSocketResponse, WSMsgType
-from web3.providers.async_base import AsyncJSONBaseProvider
 
 from mesh.chain.answers import MAX_ANSWER, SpoiledAnswer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from web3.types import RPCEndpoint, RPCResponse
-
-
 TOO_MANY_REQUESTS: Final = 429
 PIECE: Final = 1 << 16
 """Bytes that are read of an answer at a time."""
 
 
-class HttpTransport(AsyncJSONBaseProvider):
+class Transport(Protocol):
+    """What carries requests to a node; web3's asynchronous providers do."""
+
+    async def make_request(self, method: Any, params: Any) -> Any:
+        """The node's response, a JSON object with a result or an error. Raises as `HttpTransport` does."""
+
+
+class HttpTransport:
     """A node at `http(s)://…`. Raises aiohttp's errors, `OSError`, and `ValueError` for an answer that is not JSON."""
 
     def __init__(self, url: str) -> None:
-        super().__init__()
         self._url = url
+        self._numbers = count()
         self._session: ClientSession | None = None
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         """The node's response, with a result or an error."""
         if self._session is None:
             self._session = ClientSession(headers={"Content-Type": "application/json"})
-        async with self._session.post(self._url, data=self.encode_rpc_request(method, params)) as response:
+        async with self._session.post(self._url, data=_encode(next(self._numbers), method, params)) as response:
             body = await _read(response)
             # Some nodes answer errors with HTTP 4xx or 5xx and a JSON-RPC error in the body. "Too many requests" is
             # raised for a retry.
@@ -56,17 +57,17 @@ class HttpTransport(AsyncJSONBaseProvider):
         return self._url
 
 
-class WebSocketTransport(AsyncJSONBaseProvider):
+class WebSocketTransport:
     """A node at `ws(s)://…`. Raises as `HttpTransport`, and `ConnectionError` for a lost connection."""
 
     def __init__(self, url: str) -> None:
-        super().__init__()
         self._url = url
+        self._numbers = count()
         self._opening = asyncio.Lock()
         self._session: ClientSession | None = None
         self._socket: ClientWebSocketResponse | None = None
         self._listening: asyncio.Task[None] | None = None
-        self._waiting: dict[int, asyncio.Future[RPCResponse]] = {}
+        self._waiting: dict[int, asyncio.Future[Any]] = {}
         self._on_head: Callable[[Any], None] | None = None
         self._subscribing: asyncio.Task[None] | None = None
         self._subscription: Any = None
@@ -81,15 +82,14 @@ class WebSocketTransport(AsyncJSONBaseProvider):
             if self._socket is not None and not self._socket.closed:
                 self._subscribing = asyncio.create_task(self._subscribe(), name="aira-chain-heads")
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         """The node's response, with a result or an error."""
         socket = await self._opened()
-        request = self.form_request(method, params)
-        number = cast("int", request["id"])
-        answer: asyncio.Future[RPCResponse] = asyncio.get_running_loop().create_future()
+        number = next(self._numbers)
+        answer: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         self._waiting[number] = answer
         try:
-            await socket.send_bytes(self.encode_rpc_dict(request))
+            await socket.send_bytes(_encode(number, method, params))
             return await answer
         finally:
             self._waiting.pop(number, None)
@@ -120,7 +120,7 @@ class WebSocketTransport(AsyncJSONBaseProvider):
     async def _subscribe(self) -> None:
         """Ask for new blocks. A failure changes nothing: blocks are polled then."""
         with suppress(OSError, ValueError, ClientError):
-            response = await self.make_request(cast("RPCEndpoint", "eth_subscribe"), ["newHeads"])
+            response = await self.make_request("eth_subscribe", ["newHeads"])
             self._subscription = response.get("result")
 
     async def _read(self, socket: ClientWebSocketResponse) -> None:
@@ -174,11 +174,14 @@ async def _read(response: ClientResponse) -> bytes:
     return bytes(body)
 
 
-def _decode(text: str | bytes) -> RPCResponse:
+def _encode(number: int, method: str, params: Any) -> bytes:
+    return msgspec.json.encode({"jsonrpc": "2.0", "id": number, "method": method, "params": params})
+
+
+def _decode(text: str | bytes) -> Any:
     """The JSON of an answer. Raises `ValueError`: `SpoiledAnswer` for one that begins as an answer does."""
     try:
-        response: RPCResponse = msgspec.json.decode(text)
+        return msgspec.json.decode(text)
     except (ValueError, RecursionError):
         begins = text.lstrip()[:1] in (b"{", "{")
         raise SpoiledAnswer("its answer is not JSON to the end") if begins else ValueError("not JSON") from None
-    return response

@@ -25,9 +25,8 @@ from schemas import Demand, Verified, cid_of_bytes, cid_of_file
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from web3.providers.async_base import AsyncBaseProvider
-
     from mesh.agent import Contract, Outcome
+    from mesh.chain.transports import Transport
     from mesh.demo.narration import Narrator
     from mesh.market.book import Match
     from mesh.recording import Objective
@@ -138,7 +137,7 @@ class Demo:
             xrt=deployment.xrt,
         )
 
-    async def _open_provider(self, stack: AsyncExitStack, node: AsyncBaseProvider) -> None:
+    async def _open_provider(self, stack: AsyncExitStack, node: Transport) -> None:
         network = await stack.enter_async_context(Network(Endpoints(connect=(self._endpoint,))))
         chain = await stack.enter_async_context(self._market.chain(node, "provider"))
         lighthouse = self._market.deployment.lighthouse_name
@@ -150,7 +149,7 @@ class Demo:
         tasks.start(provider.run(), "demo provider")
         self._report_account("provider", provider.address, network.id)
 
-    async def _open_agent(self, stack: AsyncExitStack, node: AsyncBaseProvider, role: str) -> Agent:
+    async def _open_agent(self, stack: AsyncExitStack, node: Transport, role: str) -> Agent:
         settings = Settings(
             connect=(self._endpoint,),
             data_dir=str(self._folder / role),

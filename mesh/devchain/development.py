@@ -34,8 +34,7 @@ from mesh.private_files import make_private_folder
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-    from web3.providers.async_base import AsyncBaseProvider
-
+    from mesh.chain.transports import Transport
     from mesh.settings import StorageSettings
 
 ROLES: Final = ("provider", "robot", "person")
@@ -55,7 +54,7 @@ class DevelopmentMarket:
     deployment: Deployment
     accounts: dict[str, Account]
 
-    def chain(self, endpoint: str | AsyncBaseProvider, role: str) -> Chain:
+    def chain(self, endpoint: str | Transport, role: str) -> Chain:
         """The chain as `role` uses it, not yet open."""
         return Chain(endpoint, account=self.accounts[role], ens=self.deployment.ens, timing=TIMING)
 
@@ -113,7 +112,7 @@ class DevelopmentChain:
 
 
 async def deploy_market(
-    endpoint: str | AsyncBaseProvider, keys: Sequence[bytes], *, plan: DeploymentPlan = PLAN
+    endpoint: str | Transport, keys: Sequence[bytes], *, plan: DeploymentPlan = PLAN
 ) -> DevelopmentMarket:
     """Deploy the contracts with the first of `keys`, give each role its tokens, and stake for the provider."""
     accounts = _accounts_of(keys)

@@ -7,8 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from web3.providers.async_base import AsyncBaseProvider
-
 from mesh.chain import restrain_recursion
 from mesh.devchain.jsonrpc import CHANGES, LIMIT_EXCEEDED, RUNS, RpcError
 from mesh.devchain.rpc_server import JsonRpcServer
@@ -18,8 +16,6 @@ from mesh.extras import needs_extra
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from typing import Self
-
-    from web3.types import RPCEndpoint, RPCResponse
 
     from mesh.devchain.methods import Methods
 
@@ -148,23 +144,18 @@ class _Threads:
             thread.shutdown(wait=False, cancel_futures=True)
 
 
-class EmbeddedProvider(AsyncBaseProvider):
-    """A web3 provider for an `EmbeddedChain`."""
+class EmbeddedProvider:
+    """The transport of requests to an `EmbeddedChain`."""
 
     def __init__(self, chain: EmbeddedChain) -> None:
-        super().__init__()
         self._chain = chain
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         """A JSON-RPC response with the result or the error."""
         try:
             return {"jsonrpc": "2.0", "id": 0, "result": await self._chain.request(method, params)}
         except RpcError as error:
-            return {"jsonrpc": "2.0", "id": 0, "error": error.as_object()}  # type: ignore[typeddict-item]
-
-    async def is_connected(self, show_traceback: bool = False) -> bool:
-        """Whether the chain is open."""
-        return self._chain._threads is not None
+            return {"jsonrpc": "2.0", "id": 0, "error": error.as_object()}
 
     def __str__(self) -> str:
         return "the embedded chain"

@@ -18,8 +18,7 @@ from mesh.log_context import log_event
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from web3.providers.async_base import AsyncBaseProvider
-    from web3.types import RPCEndpoint
+    from mesh.chain.transports import Transport
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +119,7 @@ def camel(name: str) -> str:
 class Dispatcher:
     """Answers JSON-RPC requests with the results of a provider; any other text with a JSON-RPC error."""
 
-    def __init__(self, provider: AsyncBaseProvider, *, max_response_bytes: int = MAX_RESPONSE_BYTES) -> None:
+    def __init__(self, provider: Transport, *, max_response_bytes: int = MAX_RESPONSE_BYTES) -> None:
         self._provider = provider
         self._max_response_bytes = max_response_bytes
 
@@ -152,7 +151,7 @@ class Dispatcher:
 
     async def ask(self, method: str, params: list[Any]) -> Any:
         """The result of a method of the provider. Raises `RpcError`, and what the provider raises."""
-        response = cast("dict[str, Any]", await self._provider.make_request(cast("RPCEndpoint", method), params))
+        response = cast("dict[str, Any]", await self._provider.make_request(method, params))
         if "error" in response:
             error = response["error"]
             raise RpcError(int(error["code"]), str(error["message"]), data=error.get("data"))

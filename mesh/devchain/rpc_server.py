@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable
     from typing import Self
 
-    from web3.providers.async_base import AsyncBaseProvider
+    from mesh.chain.transports import Transport
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]", "::1"})
 
 
 class JsonRpcServer:
-    """Serves `provider` (any whose results are JSON, as those of the embedded chain and of web3's HTTP provider).
+    """Serves `provider` (the embedded chain's, or another whose results are JSON).
 
     Requests are sent by POST or over a WebSocket, at the same address; a WebSocket also has `eth_subscribe` (`newHeads`
     and `logs`) and `eth_unsubscribe`.
@@ -52,7 +52,7 @@ class JsonRpcServer:
 
     def __init__(
         self,
-        provider: AsyncBaseProvider,
+        provider: Transport,
         *,
         host: str = "127.0.0.1",
         port: int = 0,

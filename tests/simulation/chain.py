@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
-from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain.answers import ANSWERS, Count, decode_answer
 from mesh.chain.events import decode_log
@@ -246,11 +245,10 @@ class SimulatedChain:
         return nonce
 
 
-class SimulatedNode(AsyncBaseProvider):
+class SimulatedNode:
     """A node of that chain, as one process reaches it."""
 
     def __init__(self, chain: SimulatedChain, faults: NodeFaults, number: int = 0) -> None:
-        super().__init__()
         self._number = number
         self._chain = chain
         self._faults = faults

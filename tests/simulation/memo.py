@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import mesh.chain.answers
 import mesh.chain.events
-import mesh.chain.web3_provider
+import mesh.chain.rpc_client
 import schemas.signing
 from mesh.chain.answers import decode_answer
 
@@ -39,7 +39,7 @@ def install() -> None:
         (schemas.signing, "recover", _pair),
     ):
         setattr(module, name, _shared(getattr(module, name), key_of))
-    setattr(mesh.chain.web3_provider, decode_answer.__name__, _decode_answer)
+    setattr(mesh.chain.rpc_client, decode_answer.__name__, _decode_answer)
 
 
 def _words(types: list[str], data: bytes) -> tuple[tuple[str, ...], bytes]:

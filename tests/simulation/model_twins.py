@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from eth.vm.message import Message
 from eth_abi.abi import encode
-from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain import XRT, Account
 from mesh.chain.deploy import DeploymentPlan
@@ -42,11 +41,10 @@ class Outcome(NamedTuple):
     logs: list[tuple[bytes, list[bytes], bytes]]
 
 
-class NodeOf(AsyncBaseProvider):
+class NodeOf:
     """A node that answers at once."""
 
     def __init__(self, evm: Any) -> None:
-        super().__init__()
         self.methods = Methods(evm)
 
     async def make_request(self, method: Any, params: Any) -> Any:

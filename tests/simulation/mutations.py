@@ -122,7 +122,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "a spoiled answer of a node escapes",
-        "mesh.chain.web3_provider:ReliableProvider.request",
+        "mesh.chain.rpc_client:RpcClient.request",
         "except CONNECTION_ERRORS as error:",
         "except OSError as error:",
         "spoilt",

@@ -6,7 +6,6 @@ import secrets
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain import Allowances, Chain, InsufficientTokens
 from schemas import Demand, Offer
@@ -16,20 +15,18 @@ from tests.support.orders import terms
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
-    from web3.types import RPCEndpoint, RPCResponse
-
+    from mesh.chain.transports import Transport
     from tests.support.market import Place
 
 
-class Overtaken(AsyncBaseProvider):
+class Overtaken:
     """The chain, on which something happens before each transaction of ours gets there."""
 
-    def __init__(self, chain: AsyncBaseProvider) -> None:
-        super().__init__()
+    def __init__(self, chain: Transport) -> None:
         self._chain = chain
         self.meanwhile: Callable[[], Awaitable[object]] | None = None
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method == "eth_sendRawTransaction" and self.meanwhile is not None:
             meanwhile, self.meanwhile = self.meanwhile, None
             await meanwhile()

@@ -38,10 +38,8 @@ from tests.support.nodes import Anvil
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator
 
-    from web3.providers.async_base import AsyncBaseProvider
-    from web3.types import RPCEndpoint, RPCResponse
-
     from mesh.chain import BlockEvents, ChainEvent
+    from mesh.chain.transports import Transport
 
 E = TypeVar("E", bound=Exception)
 
@@ -58,7 +56,7 @@ def cid(seed: int) -> str:
 class DeployedMarket:
     """A deployment with a staked provider, a promisee and a promisor, who all approved the factory."""
 
-    endpoint: str | AsyncBaseProvider
+    endpoint: str | Transport
     deployment: Deployment
     deployer: Account
     provider: Account
@@ -108,7 +106,7 @@ def next_nonce() -> str:
     return keccak256(b"nonce" + _used.to_bytes(8, "big")).hex()
 
 
-async def prepare(endpoint: str | AsyncBaseProvider, keys: tuple[bytes, ...]) -> DeployedMarket:
+async def prepare(endpoint: str | Transport, keys: tuple[bytes, ...]) -> DeployedMarket:
     """Deploy everything; stake the provider; give promisee and promisor XRT, and let the factory take it."""
     deployer, provider, promisee, promisor, stranger = (Account.from_key(key) for key in keys[:5])
     async with Node(endpoint, timing=QUICK) as node:
@@ -178,7 +176,7 @@ class Flaky(EmbeddedProvider):
 
     is_lost = False
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if self.is_lost:
             raise ConnectionError("the wire is cut")
         return await super().make_request(method, params)

@@ -16,8 +16,6 @@ from tests.mesh.chain.senders import SHORT, anvil, open_sender, until_pending, u
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from web3.types import RPCEndpoint, RPCResponse
-
     from tests.support.nodes import Anvil
 
 __all__ = ["anvil"]
@@ -51,7 +49,7 @@ class _Swallowing(HttpTransport):
         super().__init__(url)
         self.swallowed: list[str] = []
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method == "eth_sendRawTransaction" and self.swallows:
             self.swallowed.append(params[0])
             return {"jsonrpc": "2.0", "id": 1, "result": "0x" + "00" * 32}
@@ -124,7 +122,7 @@ class _Recording(HttpTransport):
         super().__init__(url)
         self.sent: list[str] = []
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method == "eth_sendRawTransaction":
             self.sent.append(params[0])
         return await super().make_request(method, params)
@@ -163,12 +161,12 @@ class _Indexing(HttpTransport):
 
     asked = 0
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method == "eth_getTransactionReceipt":
             self.asked += 1
             if self.asked < 5:
                 error = {"code": -32000, "message": "transaction indexing is in progress"}
-                return {"jsonrpc": "2.0", "id": 1, "error": error}  # type: ignore[typeddict-item]
+                return {"jsonrpc": "2.0", "id": 1, "error": error}
         return await super().make_request(method, params)
 
 
@@ -208,7 +206,7 @@ class _AnswerLosingTransport(HttpTransport):
 
     loses = False
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         response = await super().make_request(method, params)
         if method == "eth_sendRawTransaction" and self.loses:
             raise ConnectionResetError("the answer was lost")

@@ -36,8 +36,6 @@ from tests.support.log_events import logged_events, logged_facts
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from web3.types import RPCEndpoint, RPCResponse
-
     from tests.mesh.chain.conftest import DeployedMarket
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -154,13 +152,13 @@ class _Choosy(EmbeddedProvider):
         self.limit = limit
         self.ranges: list[int] = []
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method == "eth_getLogs":
             span = int(params[0]["toBlock"], 16) - int(params[0]["fromBlock"], 16) + 1
             self.ranges.append(span)
             if span > self.limit:
                 refused = RpcError(-32005, "query returned more than 10000 results")
-                return {"jsonrpc": "2.0", "id": 1, "error": refused.as_object()}  # type: ignore[typeddict-item]
+                return {"jsonrpc": "2.0", "id": 1, "error": refused.as_object()}
         return await super().make_request(method, params)
 
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from typing import Any
 
-    from web3.types import RPCEndpoint, RPCResponse
-
     from tests.support.nodes import Anvil
 
 __all__ = ["anvil"]
@@ -33,7 +31,7 @@ class _Line(EmbeddedProvider):
 
     cut = False
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if self.cut:
             raise ConnectionResetError("it is cut")
         return await super().make_request(method, params)

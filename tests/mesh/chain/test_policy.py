@@ -19,8 +19,6 @@ from tests.support.nodes import Anvil
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from web3.types import RPCEndpoint, RPCResponse
-
 
 @pytest.fixture
 async def anvil() -> AsyncIterator[Anvil]:
@@ -84,7 +82,7 @@ async def test_a_replacement_offers_the_fees_that_nodes_require_or_is_not_made(a
 class _Plain(HttpTransport):
     """A node that lacks a word for priority fees."""
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method == "eth_maxPriorityFeePerGas":
             return {"jsonrpc": "2.0", "id": 1, "error": {"code": -32601, "message": "the method does not exist"}}
         return await super().make_request(method, params)

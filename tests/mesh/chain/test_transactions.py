@@ -27,8 +27,6 @@ from tests.support.nodes import Anvil
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
-    from web3.types import RPCEndpoint, RPCResponse
-
 
 class _Wire(EmbeddedProvider):
     """The way to an embedded chain, where things happen around the sending of transactions."""
@@ -39,7 +37,7 @@ class _Wire(EmbeddedProvider):
         self.answers_to_lose = 0
         self.sent = 0
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method != "eth_sendRawTransaction":
             return await super().make_request(method, params)
         self.sent += 1
@@ -129,7 +127,7 @@ async def test_senders_of_one_node_fill_a_block_together() -> None:
 class _Forgetful(HttpTransport):
     """A node behind a balancer: the one that counts has not heard of what another was given."""
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method == "eth_getTransactionCount":
             params = [params[0], "latest"]
         return await super().make_request(method, params)

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from hexbytes import HexBytes
-from web3 import AsyncWeb3
 from web3.exceptions import Web3RPCError
 
 from mesh.chain import Account
 from mesh.devchain import EmbeddedChain
 from mesh.errors import ClosedError
+from tests.mesh.devchain.web3_client import web3_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+    from web3 import AsyncWeb3
 
 # PUSH1 size, PUSH1 offset of the rest, PUSH1 0, CODECOPY, PUSH1 size, PUSH1 0, RETURN: deploys what follows.
 DEPLOYER = "60{size:02x}600c60003960{size:02x}6000f3"
@@ -64,7 +66,7 @@ async def _deploy(web3: AsyncWeb3[Any], key: bytes, code: str) -> str:
 
 
 async def test_each_transaction_is_mined_in_a_block_of_its_own(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     to = Account.from_key(node.funded_keys[1]).address
     first = await _send(web3, node.funded_keys[0], to=to, value=5)
     second = await _send(web3, node.funded_keys[0], to=to, value=7)
@@ -77,7 +79,7 @@ async def test_each_transaction_is_mined_in_a_block_of_its_own(node: EmbeddedCha
 
 
 async def test_a_block_has_the_time_at_which_it_was_mined(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     wanted = (await web3.eth.get_block("latest"))["timestamp"] + 2
     while time.time() < wanted:
         await asyncio.sleep(0.05)
@@ -86,7 +88,7 @@ async def test_a_block_has_the_time_at_which_it_was_mined(node: EmbeddedChain) -
 
 
 async def test_blocks_and_their_logs_are_found_by_hash(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     contract = await _deploy(web3, node.funded_keys[0], LOGS)
     receipt = await _send(web3, node.funded_keys[0], to=contract, data=b"\5".rjust(32, b"\0"))
     block = await web3.eth.get_block(receipt["blockHash"])
@@ -99,7 +101,7 @@ async def test_blocks_and_their_logs_are_found_by_hash(node: EmbeddedChain) -> N
 
 
 async def test_storage_and_code_are_read_at_any_block(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     stores_42 = bytes.fromhex("602a600055" + "60006000f3")
     address = (await _send(web3, node.funded_keys[0], data=stores_42))["contractAddress"]
     assert int.from_bytes(await web3.eth.get_storage_at(address, 0)) == 42
@@ -109,7 +111,7 @@ async def test_storage_and_code_are_read_at_any_block(node: EmbeddedChain) -> No
 
 
 async def test_running_out_of_gas_has_its_own_error(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     contract = await _deploy(web3, node.funded_keys[0], COSTLY)
     with pytest.raises(Web3RPCError, match="OutOfGas"):
         await web3.eth.call({"to": contract, "gas": 30_000})
@@ -122,28 +124,28 @@ async def test_the_funded_accounts_are_those_of_other_development_chains(node: E
 
 async def test_blocks_are_mined_on_demand(node: EmbeddedChain) -> None:
     await node.mine(3)
-    assert await AsyncWeb3(node.provider).eth.block_number == 3
+    assert await web3_of(node).eth.block_number == 3
 
 
 async def test_blocks_are_mined_with_a_block_time() -> None:
     async with EmbeddedChain(block_time=0.01) as node:
-        web3 = AsyncWeb3(node.provider)
+        web3 = web3_of(node)
         async with asyncio.timeout(10):
             while await web3.eth.block_number < 3:
                 await asyncio.sleep(0.01)
 
 
 async def test_revert_data_reaches_the_caller_of_calls_and_estimates(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     contract = await _deploy(web3, node.funded_keys[0], REFUSES)
     for method in ("eth_call", "eth_estimateGas"):
-        answer = await node.provider.make_request(method, [{"to": contract}])  # type: ignore[arg-type]
+        answer = await node.provider.make_request(method, [{"to": contract}])
         assert answer["error"]["data"] == "0xdeadbeef"
         assert answer["error"]["code"] == 3
 
 
 async def test_a_transaction_that_reverts_is_mined_as_failed(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     contract = await _deploy(web3, node.funded_keys[0], REFUSES)
     receipt = await _send(web3, node.funded_keys[0], to=contract)
     assert receipt["status"] == 0
@@ -151,7 +153,7 @@ async def test_a_transaction_that_reverts_is_mined_as_failed(node: EmbeddedChain
 
 
 async def test_a_contract_that_calls_itself_without_end_is_an_error(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     contract = await _deploy(web3, node.funded_keys[0], CALLS_ITSELF)
     with pytest.raises(Web3RPCError, match="too deep"):
         await web3.eth.call({"to": contract})
@@ -164,13 +166,13 @@ async def test_a_contract_that_calls_itself_without_end_is_an_error(node: Embedd
 
 
 async def test_a_plain_transfer_is_estimated_exactly(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     address = Account.from_key(node.funded_keys[0]).address
     assert await web3.eth.estimate_gas({"from": address, "to": address, "value": 1}) == 21_000  # type: ignore[typeddict-item]
 
 
 async def test_an_estimate_is_enough_and_not_much_more(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     contract = await _deploy(web3, node.funded_keys[0], LOGS)
     data = "0x" + "22" * 32
     gas = await web3.eth.estimate_gas({"to": contract, "data": data})  # type: ignore[typeddict-item]
@@ -180,7 +182,7 @@ async def test_an_estimate_is_enough_and_not_much_more(node: EmbeddedChain) -> N
 
 
 async def test_an_estimate_counts_the_gas_that_inner_calls_hold_back(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     inner = await _deploy(web3, node.funded_keys[0], COSTLY)
     outer = await _deploy(web3, node.funded_keys[0], CALLS)
     data = "0x" + inner[2:].rjust(64, "0")
@@ -192,7 +194,7 @@ async def test_an_estimate_counts_the_gas_that_inner_calls_hold_back(node: Embed
 
 
 async def test_logs_are_found_by_range_address_and_topic(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     contract, other = [await _deploy(web3, node.funded_keys[0], LOGS) for _ in range(2)]
     for number, where in enumerate((contract, other, contract)):
         await _send(web3, node.funded_keys[0], to=where, data=number.to_bytes(32, "big"))
@@ -215,7 +217,7 @@ async def test_logs_are_found_by_range_address_and_topic(node: EmbeddedChain) ->
 
 @pytest.mark.parametrize(("nonce", "word"), [(0, "nonce too low"), (9, "nonce too high")])
 async def test_a_wrong_nonce_is_refused_and_changes_nothing(node: EmbeddedChain, nonce: int, word: str) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     to = Account.from_key(node.funded_keys[1]).address
     await _send(web3, node.funded_keys[0], to=to)
     with pytest.raises(Web3RPCError, match=word):
@@ -225,7 +227,7 @@ async def test_a_wrong_nonce_is_refused_and_changes_nothing(node: EmbeddedChain,
 
 
 async def test_the_same_transaction_twice_is_already_known(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     to = Account.from_key(node.funded_keys[1]).address
     await _send(web3, node.funded_keys[0], to=to, nonce=0)
     with pytest.raises(Web3RPCError, match="already known"):
@@ -233,14 +235,14 @@ async def test_the_same_transaction_twice_is_already_known(node: EmbeddedChain) 
 
 
 async def test_a_transaction_without_funds_is_refused(node: EmbeddedChain) -> None:
-    web3 = AsyncWeb3(node.provider)
+    web3 = web3_of(node)
     with pytest.raises(Web3RPCError, match="insufficient funds"):
         await _send(web3, b"\7" * 32, to=Account.from_key(node.funded_keys[1]).address)
 
 
 async def test_an_invalid_transaction_is_refused(node: EmbeddedChain) -> None:
     with pytest.raises(Web3RPCError, match="be decoded"):
-        await AsyncWeb3(node.provider).eth.send_raw_transaction(b"\xc3\1\2\3")
+        await web3_of(node).eth.send_raw_transaction(b"\xc3\1\2\3")
 
 
 def chain_threads() -> set[int | None]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from web3 import AsyncWeb3
 from web3.exceptions import Web3RPCError
 
 from mesh.chain import Account, Chain, deploy
@@ -13,6 +12,7 @@ from mesh.devchain import EmbeddedChain
 from mesh.devchain.jsonrpc import INVALID_PARAMS, SERVER_ERROR, RpcError
 from mesh.devchain.methods import MAX_FILTERS
 from tests.mesh.chain.conftest import QUICK
+from tests.mesh.devchain.web3_client import web3_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -42,7 +42,7 @@ def values(logs: list[Any]) -> list[int]:
 
 
 async def test_web3_filters_return_new_logs_and_blocks(node: EmbeddedChain, chain: Chain) -> None:
-    web3: Any = AsyncWeb3(node.provider)
+    web3: Any = web3_of(node)
     logs = await web3.eth.filter({"address": chain.xrt})
     blocks = await web3.eth.filter("latest")
     for value in (1, 2):

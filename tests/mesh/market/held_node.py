@@ -7,22 +7,20 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Self
 
 import aiohttp
-from web3.providers.async_base import AsyncBaseProvider
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from web3.types import RPCEndpoint, RPCResponse
+    from mesh.chain.transports import Transport
 
 
-class HeldNode(AsyncBaseProvider):
+class HeldNode:
     """Another node's answers: `async with HeldNode(node) as held`.
 
     Inside `with held.back(method)`, requests of that method are passed on only afterwards.
     """
 
-    def __init__(self, node: str | AsyncBaseProvider) -> None:
-        super().__init__()
+    def __init__(self, node: str | Transport) -> None:
         self._node = node
         self._released: dict[str, asyncio.Event] = {}
 
@@ -43,12 +41,12 @@ class HeldNode(AsyncBaseProvider):
             del self._released[method]
             released.set()
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method in self._released:
             await self._released[method].wait()
         if not isinstance(self._node, str):
             return await self._node.make_request(method, params)
         request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
         async with self._http.post(self._node, json=request) as response:
-            answer: RPCResponse = await response.json()
+            answer: Any = await response.json()
             return answer

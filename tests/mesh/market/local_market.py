@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
     import zenoh
-    from web3.providers.async_base import AsyncBaseProvider
 
+    from mesh.chain.transports import Transport
     from mesh.devchain.development import DevelopmentMarket
     from schemas import Liability, SignedMessage
 
@@ -40,7 +40,7 @@ class LocalMarket:
     """
 
     def __init__(
-        self, market: DevelopmentMarket, endpoint: str, *, node: str | AsyncBaseProvider, keys: Sequence[bytes]
+        self, market: DevelopmentMarket, endpoint: str, *, node: str | Transport, keys: Sequence[bytes]
     ) -> None:
         self.node = node
         self.deployment = market.deployment
@@ -102,7 +102,7 @@ class LocalMarket:
         """An account's address."""
         return self.accounts[role].address
 
-    def chain_of(self, role: str, endpoint: str | AsyncBaseProvider | None = None, **options: Any) -> Chain:
+    def chain_of(self, role: str, endpoint: str | Transport | None = None, **options: Any) -> Chain:
         """The chain for an account, not yet open."""
         return Chain(
             endpoint or self.node,
@@ -124,7 +124,7 @@ class LocalMarket:
         self,
         role: str = "provider",
         *,
-        endpoint: str | AsyncBaseProvider | None = None,
+        endpoint: str | Transport | None = None,
         timing: Timing = QUICK,
         **options: Any,
     ) -> AsyncIterator[Provider]:

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain import GWEI
 from mesh.devchain import JsonRpcServer
@@ -24,8 +23,6 @@ from tests.support.waiting import until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from web3.types import RPCEndpoint, RPCResponse
-
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
@@ -37,16 +34,15 @@ async def served(local: LocalMarket, port: int) -> AsyncIterator[str]:
         yield server.url
 
 
-class FailingNode(AsyncBaseProvider):
+class FailingNode:
     """The market's node; its gas estimates of calls that contain `data` fail `times` times, as `fails` says."""
 
     def __init__(self, local: LocalMarket, data: bytes, *, times: float = math.inf, fails: str = "silence") -> None:
-        super().__init__()
         assert not isinstance(local.node, str)
         self._node, self._data, self._fails = local.node, data.hex(), fails
         self.left = times
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+    async def make_request(self, method: str, params: Any) -> Any:
         if method == "eth_estimateGas" and self._data in params[0]["data"] and self.left > 0:
             self.left -= 1
             if self._fails == "silence":

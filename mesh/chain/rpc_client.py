@@ -4,35 +4,34 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from aiohttp import ClientError, ClientResponseError
 from aiohttp.http import HttpProcessingError
-from web3.exceptions import Web3Exception
-from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain.answers import ANSWERS, BlockHeader, RpcFailure, SpoiledAnswer, decode_answer
 from mesh.chain.errors import InvalidEndpoint, NodeUnreachable, RequestRefused, WrongChain
 from mesh.chain.metrics import NodeMetrics
 from mesh.chain.reverts import decode_revert
-from mesh.chain.transports import HttpTransport, WebSocketTransport
+from mesh.chain.transports import HttpTransport, Transport, WebSocketTransport
 from mesh.errors import AiraError, ClosedError
 from mesh.log_context import log_event
 from mesh.retry import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from mesh.chain.policy import Timing
 
 log = logging.getLogger(__name__)
 
-CONNECTION_ERRORS: Final = (OSError, TimeoutError, ClientError, Web3Exception, ValueError)
+CONNECTION_ERRORS: Final = (OSError, TimeoutError, ClientError, ValueError)
 """What transports raise for a missing node, a lost connection and an answer that is not JSON; and `SpoiledAnswer`."""
 
-Transport: TypeAlias = HttpTransport | WebSocketTransport
-Endpoint: TypeAlias = "str | AsyncBaseProvider | Sequence[str | AsyncBaseProvider]"
+Connection: TypeAlias = HttpTransport | WebSocketTransport
+Endpoint: TypeAlias = "str | Transport | Sequence[str | Transport]"
 
 SEND: Final = "eth_sendRawTransaction"
 CHAIN_ID: Final = "eth_chainId"
@@ -48,11 +47,11 @@ class NotJsonRpc(ValueError):
 
 
 class Upstream:
-    """One of the nodes. `owned` is the transport that is closed with the provider."""
+    """One of the nodes. `owned` is its connection, if that is closed with the client."""
 
-    def __init__(self, provider: AsyncBaseProvider, *, endpoint: str, owned: Transport | None = None) -> None:
+    def __init__(self, transport: Transport, *, endpoint: str, owned: Connection | None = None) -> None:
         self.endpoint = endpoint
-        self.provider = provider
+        self.transport = transport
         self.owned = owned
         self.is_on_chain = False
         """Whether it said that it is on the chain of the others."""
@@ -60,7 +59,7 @@ class Upstream:
         """Whether it has answered as a node does, so that it is one although it may fail to do so at times."""
 
 
-class ReliableProvider:
+class RpcClient:
     """One or several nodes, with bounded retries.
 
     A request goes to the node that answered last; if its connection fails or its answer is spoiled, to the next, and
@@ -199,25 +198,25 @@ class ReliableProvider:
                 await upstream.owned.close()
 
 
-def open_provider(endpoint: Endpoint, timing: Timing, metrics: NodeMetrics | None = None) -> ReliableProvider:
-    """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, a provider object, or several of them.
+def rpc_client(endpoint: Endpoint, timing: Timing, metrics: NodeMetrics | None = None) -> RpcClient:
+    """The client of an endpoint: `http(s)://…`, `ws(s)://…`, a `Transport`, or several of them.
 
     Several are a sequence, or one text with commas. Nothing is connected yet. `metrics` counts whether they answer.
     Raises `InvalidEndpoint` for any other text.
     """
     metrics = metrics or NodeMetrics()
-    given = [endpoint] if isinstance(endpoint, str | AsyncBaseProvider) else endpoint
+    given = endpoint if isinstance(endpoint, Sequence) and not isinstance(endpoint, str) else [endpoint]
     upstreams: list[Upstream] = []
     for one in given or [""]:
-        if isinstance(one, AsyncBaseProvider):
-            upstreams.append(Upstream(one, endpoint=str(one)))
-        else:
+        if isinstance(one, str):
             upstreams += [_upstream(url.strip()) for url in one.split(",")]
-    return ReliableProvider(upstreams, timing=timing, metrics=metrics)
+        else:
+            upstreams.append(Upstream(one, endpoint=str(one)))
+    return RpcClient(upstreams, timing=timing, metrics=metrics)
 
 
 def _upstream(url: str) -> Upstream:
-    transport: Transport
+    transport: Connection
     if url.startswith(("http://", "https://")):
         transport = HttpTransport(url)
     elif url.startswith(("ws://", "wss://")):
@@ -229,7 +228,7 @@ def _upstream(url: str) -> Upstream:
 
 async def _ask(upstream: Upstream, method: str, params: Any, kind: Any) -> Any:
     """The result or the `RpcFailure` of one request to one node. Raises `CONNECTION_ERRORS`."""
-    response: Any = await upstream.provider.make_request(method, params)  # type: ignore[arg-type]
+    response: Any = await upstream.transport.make_request(method, params)
     if not isinstance(response, dict) or not response.keys() & {"jsonrpc", "result", "error"}:
         raise NotJsonRpc("what answers is not a JSON-RPC server")
     answer = decode_answer(method, response, kind)
