@@ -11,10 +11,14 @@ from typing import Any, Final
 
 from mesh.errors import InputError
 from mesh.extras import needs_extra
+from mesh.ros_interfaces import described, interface_types, type_hash
 from schemas.errors import InvalidPayload
 from schemas.payloads import Payload, PayloadType
 
 NOETIC: Final = "noetic"
+NO_HASH: Final = "TypeHashNotSupported"
+"""What stands for the hash of a type in distributions without hashes."""
+WITHOUT_HASHES: Final = (NOETIC, "dashing", "eloquent", "foxy", "galactic", "humble")
 _ZERO: Final = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 _BYTES: Final = {"octet": "uint8", "byte": "uint8", "char": "uint8"}
 """Types whose arrays are bytes."""
@@ -42,17 +46,37 @@ class RosTypes:
             self._store = get_typestore(Stores[f"ROS{self._version}_{distribution.upper()}"])
         except KeyError:
             raise UnknownRosType(distribution, "no distribution of ROS that is known here") from None
+        self._distribution = distribution
         self._described: dict[str, PayloadType] = {}
+        self._hashes: dict[str, str] = {}
 
     def register(self, name: str, definition: str) -> None:
-        """Add an own type: the text of its `.msg` file. Raises `UnknownRosType` if that can't be read."""
-        from rosbags.typesys import get_types_from_msg
+        """Add an own type: the text of its `.msg` file, or the data of its schema in a recording.
+
+        Of ROS 2 also the text of a `.srv` or `.action` file: its parts are messages with names such as
+        `my_robot/srv/Turn_Request`. Raises `UnknownRosType` if the text can't be read.
+        """
         from rosbags.typesys.base import TypesysError
 
         try:
-            self._store.register(get_types_from_msg(definition, _full(name)))
-        except TypesysError as error:
+            self._store.register(interface_types(_full(name), definition))
+        except (TypesysError, SyntaxError, ValueError) as error:
             raise UnknownRosType(name, f"its definition can't be read: {error}") from None
+
+    def type_hash(self, name: str) -> str:
+        """The hash of a message, service (`my_robot/srv/Turn`) or action's part by which ROS 2 tells definitions apart.
+
+        It is `TypeHashNotSupported` in distributions before Iron. Raises `UnknownRosType`.
+        """
+        self.type(name)
+        if self._distribution in WITHOUT_HASHES:
+            return NO_HASH
+        if name not in self._hashes:
+            try:
+                self._hashes[name] = type_hash(self._store, _full(name))
+            except KeyError as error:
+                raise UnknownRosType(name, f"it contains {error}, of which there is no definition") from None
+        return self._hashes[name]
 
     def type(self, name: str) -> Any:
         """The class of a type, whose instances are messages. Raises `UnknownRosType`."""
@@ -79,7 +103,7 @@ class RosTypes:
         name = str(message.__msgtype__)
         write = self._store.serialize_ros1 if self._version == 1 else self._store.serialize_cdr
         try:
-            return Payload(bytes(write(message, name)), self._type_of(name))
+            return Payload(bytes(write(message, name)), self.payload_type(name))
         except (SerdeError, struct.error, TypeError, ValueError, AttributeError) as error:
             raise InvalidPayload(name, str(error)) from None
 
@@ -120,9 +144,12 @@ class RosTypes:
                 return [self._value(inner, one) for one in ([None] * length if value is None else value)]
         return value
 
-    def _type_of(self, name: str) -> PayloadType:
+    def payload_type(self, name: str) -> PayloadType:
+        """The type of a message's payload, with its definition. Raises `UnknownRosType`."""
+        self.type(name)
+        name = _full(name)
         if name not in self._described:
-            definition, _ = self._store.generate_msgdef(name, ros_version=self._version)
+            definition = described(self._store, name, self._version)
             kind, shown = ("ros1", name.replace("/msg/", "/")) if self._version == 1 else ("cdr", name)
             schema = "ros1msg" if self._version == 1 else "ros2msg"
             self._described[name] = PayloadType(kind, shown, schema, definition.encode())
@@ -131,5 +158,7 @@ class RosTypes:
 
 def _full(name: str) -> str:
     """The name that rosbags has for a type: `std_msgs/msg/Header` for `std_msgs/Header`."""
+    if "/srv/" in name or "/action/" in name:
+        return name
     package, _, kind = name.rpartition("/")
     return f"{package.removesuffix('/msg')}/msg/{kind}"

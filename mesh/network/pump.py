@@ -119,8 +119,9 @@ class Pump(Generic[T]):
     yields some of them every few milliseconds, so that the thread can empty Zenoh's queue in between. They run on the
     pump's thread; the iterator raises what they raise. Items arrive in order, except copies. `capacity` and
     `capacity_bytes` bound the ring. Samples of more than `payload_limit` bytes are refused. `drops` counts what is
-    dropped or refused. Leaving `async with` ends the subscription, the thread and the iteration; undelivered samples
-    are lost. There is one consumer. Raises `ClosedError` before it is entered.
+    dropped or refused. `declare` declares another subscriber than a plain one, of a selector and a handler. Leaving
+    `async with` ends the subscription, the thread and the iteration; undelivered samples are lost. There is one
+    consumer. Raises `ClosedError` before it is entered.
     """
 
     def __init__(
@@ -135,8 +136,10 @@ class Pump(Generic[T]):
         capacity_bytes: int = RING_BYTES,
         payload_limit: int | None = None,
         drops: Drops | None = None,
+        declare: Callable[..., Any] | None = None,
     ) -> None:
         self._session = session
+        self._declare = session.declare_subscriber if declare is None else declare
         self.selector: Final = selector
         """The key expression that is subscribed to."""
         self._copy: Any = copy if convert is None else convert
@@ -161,7 +164,7 @@ class Pump(Generic[T]):
     async def __aenter__(self) -> Self:
         if self._loop is not None:
             raise ClosedError("a subscription can be entered only once", hint="subscribe again")
-        self._subscriber: Any = self._session.declare_subscriber(self.selector, zenoh.handlers.FifoChannel(ZENOH_QUEUE))
+        self._subscriber: Any = self._declare(self.selector, zenoh.handlers.FifoChannel(ZENOH_QUEUE))
         self._loop = asyncio.get_running_loop()
         self._thread = threading.Thread(
             target=self._run, args=(self._loop, self._subscriber.handler), name=f"pump {self.selector}", daemon=True

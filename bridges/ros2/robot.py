@@ -1,0 +1,147 @@
+"""A ROS 2 robot, as a Python program without ROS sees it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+from bridges.ros2.allowed import EVERYTHING, RosAllowed
+from bridges.ros2.dds import Ros2Dds
+from bridges.ros2.definitions import add_definitions
+from bridges.ros2.errors import RosTypeMismatch, TooManyRosPublishers
+from bridges.ros2.names import full_type
+from bridges.ros2.node import RosNode
+from bridges.ros2.qos import DEFAULT_QOS
+from bridges.ros2.tokens import RmwZenoh
+from bridges.ros2.topics import RosPublisher, RosSubscription
+from mesh.errors import ClosedError
+from mesh.extras import needs_extra
+from mesh.flood import Drops
+from mesh.role import Lifecycle
+from schemas.payloads import Payload
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from contextlib import AsyncExitStack
+
+    import zenoh
+
+    from bridges.ros2.graph import RosGraph
+    from bridges.ros2.qos import RosQos
+    from mesh.ros import RosTypes
+
+TIMEOUT = 10.0
+"""Seconds to wait for what a call needs."""
+PUBLISHERS = 256
+"""Publishers of a robot, at most."""
+
+
+class Robot(Lifecycle):
+    """A node of ours in a ROS 2 system: `async with Robot(session, RosTypes("jazzy")) as robot`.
+
+    `session` is a Zenoh session on the router of the robot, `types` has the distribution's types and own ones. `allow`
+    says which topics and services may be used: all by default, so give it where strangers choose names. `drops` counts
+    what is refused. Names are absolute, or in `namespace`.
+    """
+
+    title = "robot"
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        types: RosTypes,
+        *,
+        domain: int = 0,
+        node: str = "aira",
+        namespace: str = "",
+        flavour: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh",
+        allow: RosAllowed = EVERYTHING,
+        drops: Drops | None = None,
+    ) -> None:
+        with needs_extra("ros2", "ROS 2"):
+            import xxhash as xxhash
+        add_definitions(types)
+        self.types = types
+        self.drops = Drops() if drops is None else drops
+        self._allow = allow
+        self._node = RosNode(session, types, _flavour(flavour, domain), node, namespace, self.drops)
+        self._publishers: dict[str, RosPublisher] = {}
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        self._node.open()
+        stack.callback(self._node.close)
+        stack.callback(self._close_publishers)
+
+    @property
+    def graph(self) -> RosGraph:
+        """The nodes, topics, services and actions of the system."""
+        return self._node.graph
+
+    async def ready(self, name: str, *, timeout: float = TIMEOUT) -> None:
+        """Wait until another node publishes, subscribes to or serves a name (topic, service, action).
+
+        Raises `RosUnavailable` after `timeout` seconds.
+        """
+        self._check_open()
+        await self._node.wait(self._node.resolve(name), timeout)
+
+    def publish(
+        self,
+        topic: str,
+        message: Payload | str,
+        fields: Mapping[str, Any] | None = None,
+        *,
+        qos: RosQos | None = None,
+    ) -> None:
+        """Publish a payload of `types.message`, or a message of the type `message` with these `fields`.
+
+        The first message of a topic declares its publisher, with `qos`; subscriptions may need a moment to find it.
+        Raises `RosNotAllowed`, `UnknownRosType`, `InvalidPayload`, `RosTypeMismatch`.
+        """
+        if isinstance(message, Payload):
+            self.advertise(topic, message.type.schema_name, qos=qos).put(message)
+        else:
+            self.advertise(topic, message, qos=qos).put(dict(fields or {}))
+
+    def advertise(self, topic: str, type_name: str, *, qos: RosQos | None = None) -> RosPublisher:
+        """The publisher of a topic, which is declared if there is none yet. It is closed with the robot.
+
+        Raises `RosNotAllowed`, `UnknownRosType`, and `RosTypeMismatch` if the topic has another type.
+        """
+        self._check_open()
+        topic, type_name = self._node.resolve(topic), full_type(type_name)
+        self._allow.check("publish", topic)
+        publisher = self._publishers.get(topic)
+        if publisher is None:
+            if len(self._publishers) >= PUBLISHERS:
+                raise TooManyRosPublishers(topic, PUBLISHERS)
+            self._node.check_type(self._node.others(topic, "subscription"), type_name)
+            publisher = self._publishers[topic] = RosPublisher(self._node, topic, type_name, qos or DEFAULT_QOS)
+        elif publisher.type != type_name:
+            raise RosTypeMismatch(topic, type_name, publisher.type)
+        return publisher
+
+    def subscribe(
+        self, topic: str, type_name: str = "", *, qos: RosQos | None = None, timeout: float = TIMEOUT
+    ) -> RosSubscription:
+        """The messages of a topic from now on, and earlier ones of transient-local publishers.
+
+        Without a type it waits for a publisher, `timeout` seconds at most. Raises `RosNotAllowed`.
+        """
+        self._check_open()
+        topic = self._node.resolve(topic)
+        self._allow.check("subscribe", topic)
+        return RosSubscription(self._node, topic, type_name, qos, timeout)
+
+    def _check_open(self) -> None:
+        if not self.is_open:
+            raise ClosedError("this robot is not open", hint="use it inside `async with`")
+
+    def _close_publishers(self) -> None:
+        publishers, self._publishers = self._publishers, {}
+        if not self._node.session.is_closed():
+            for publisher in publishers.values():
+                publisher.close()
+
+
+def _flavour(name: str, domain: int) -> RmwZenoh | Ros2Dds:
+    return RmwZenoh(domain) if name == "rmw_zenoh" else Ros2Dds(domain)
