@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
@@ -22,7 +22,7 @@ from mesh.cli.files import (
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import format_duration, format_size, plural, print_json, printable, progress, run_sync
-from mesh.recording import GENEROUS, Limits, NotARecording, bag_to_mcap, open_objective, preflight, recover
+from mesh.recording import Limits, RecordingFormat, convert, preflight, recording_file, recording_files, recover
 from mesh.running import report
 from schemas import cid_of_file
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 LIMIT_SETTINGS = {"size": "objective_size_limit", "expanded": "objective_expanded_limit"}
 """The settings for fields of `Limits`."""
 CHECK_SETTINGS = (*STORE_SETTINGS, *LIMIT_SETTINGS.values())
+_FORMATS: Final[dict[str, RecordingFormat]] = {".mcap": "mcap", ".bag": "bag"}
 PIN = "user"
 """The pin of files that a user added; they are never evicted."""
 
@@ -70,8 +71,7 @@ def add(settings: Settings, files: tuple[Path, ...], as_json: bool) -> None:
 
 
 def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> list[ObjectiveUnfit]:
-    for path in files:
-        require_readable(path)
+    files = tuple(require_readable(recording_file(path)) for path in files)
     if not settings.keyfile:
         click.echo("no agent serves the store of no account; --keyfile FILE selects that of yours", err=True)
     added, refused = [], []
@@ -172,7 +172,8 @@ def _find_file(store: Store, objective: str) -> tuple[Path, str]:
     if isinstance(named, str):
         with progress(f"hashing {named[:8]}…") as tell:
             return store.verify(named, progress=tell), named
-    return require_readable(named), cid_of_file(named)
+    path = require_readable(recording_file(named))
+    return path, cid_of_file(path)
 
 
 def _check_store(store: Store, *, as_json: bool) -> bool:
@@ -187,43 +188,64 @@ def _check_store(store: Store, *, as_json: bool) -> bool:
     return not check.damaged
 
 
-@command.command("convert", short_help="convert a ROS 1 bag to MCAP without loss")
-@click.argument("bag", type=click.Path(path_type=Path))
+@command.command("convert", short_help="convert between MCAP, ROS 1 bags and rosbag2")
+@click.argument("source", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "--storage",
+    type=click.Choice(["mcap", "sqlite3"]),
+    default="mcap",
+    show_default=True,
+    help="storage of a folder of rosbag2",
+)
+@click.option("--topic", "topics", multiple=True, help="only topics of this pattern (/camera/*); may be repeated [all]")
+@click.option("--leave-out", is_flag=True, help="leave out topics that can't be converted, instead of refusing")
+@click.option(
+    "--distribution",
+    default="jazzy",
+    show_default=True,
+    help="ROS 2 distribution with the types that SOURCE leaves out",
+)
 @with_json
-def convert(bag: Path, out: Path | None, as_json: bool) -> None:
-    """Convert a ROS 1 bag to the MCAP file OUT [BAG with the suffix .mcap], and print its CID.
+def convert_recording(
+    source: Path,
+    out: Path | None,
+    storage: Literal["mcap", "sqlite3"],
+    topics: tuple[str, ...],
+    leave_out: bool,
+    distribution: str,
+    as_json: bool,
+) -> None:
+    """Convert SOURCE, an MCAP file, a ROS 1 bag, or a file or folder of rosbag2, to OUT [SOURCE with the suffix .mcap],
+    and print the CID of the file.
 
-    Preserves payloads, types, times, topics and connection headers, and records the bag's CID."""
-    run_sync(lambda: _convert(bag, out or bag.with_suffix(".mcap"), as_json=as_json))
+    OUT is an MCAP file if its name ends with .mcap, a ROS 1 bag with .bag, and else a folder of rosbag2. To MCAP
+    everything is kept: payloads, types, times, topics and connection headers. Bags and rosbag2 hold ROS messages only;
+    other topics are named."""
+    out = out or source.with_suffix(".mcap")
+    of: RecordingFormat = "rosbag2-mcap" if storage == "mcap" else "rosbag2-sqlite3"
+    to = _FORMATS.get(out.suffix, of)
+    options = {"to": to, "topics": topics, "leave_out": leave_out, "distribution": distribution}
+    run_sync(lambda: _convert(source, out, options, as_json=as_json))
 
 
-def _convert(bag: Path, out: Path, *, as_json: bool) -> None:
-    require_readable(bag)
+def _convert(source: Path, out: Path, options: dict[str, Any], *, as_json: bool) -> None:
+    files = [require_readable(path) for path in recording_files(source)]
     require_new_file(out)
-    with progress(f"reading {bag.name}") as tell:
-        if open_objective(bag, GENEROUS, progress=tell).format != "bag":
-            raise NotARecording(bag, "it is not a ROS 1 bag")
-    source = cid_of_file(bag)
+    cid = ",".join(map(cid_of_file, files))
     try:
-        with progress(f"converting {bag.name}") as tell:
-            bag_to_mcap(bag, out, cid=source, limits=GENEROUS, progress=tell)
+        with progress(f"converting {source.name}") as tell:
+            done = convert(source, out, cid=cid, progress=tell, **options)
     except OSError as error:
         raise write_error(out, error) from None
-    with progress(f"checking {out.name}") as tell:
-        converted = open_objective(out, GENEROUS, progress=tell)
-    cid = cid_of_file(out)
+    made = cid_of_file(done.path)
     if as_json:
-        facts = {
-            "cid": cid,
-            "file": str(out),
-            "source": source,
-            "messages": converted.count,
-            "durationNs": converted.duration_ns,
-        }
-        print_json(facts)
-    else:
-        click.echo(f"{cid}  {out}  {plural(converted.count, 'message')}, {format_duration(converted.duration_ns)}")
+        written = {"messages": done.messages, "durationNs": done.duration_ns, "leftOut": done.left_out}
+        print_json({"cid": made, "file": str(done.path), "source": cid, **written})
+        return
+    click.echo(f"{made}  {done.path}  {plural(done.messages, 'message')}, {format_duration(done.duration_ns)}")
+    for topic, why in done.left_out.items():
+        click.echo(f"left out: {printable(topic)}: {printable(why)}", err=True)
 
 
 @command.command("recover", short_help="save the readable part of a damaged file")

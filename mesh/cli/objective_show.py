@@ -22,7 +22,7 @@ from mesh.cli.output import (
     progress,
     run_sync,
 )
-from mesh.recording import GENEROUS, Objective, TopicRates, open_objective, rates_of
+from mesh.recording import GENEROUS, Objective, TopicRates, open_objective, rates_of, recording_file
 from mesh.running import run_to_end
 from schemas import cid_of_file
 
@@ -85,8 +85,7 @@ def local_file(settings: Settings, objective: str) -> Path:
     """The file that a user named, or the one with that CID, fetched if needed. Exits if there is none."""
     path = run_sync(lambda: file_or_cid(objective))
     path = _fetched(settings, path) if isinstance(path, str) else path
-    run_sync(lambda: require_readable(path))
-    return path
+    return run_sync(lambda: require_readable(recording_file(path)))
 
 
 def _fetched(settings: Settings, cid: str) -> Path:
@@ -160,7 +159,7 @@ def _print_summary(objective: Objective) -> None:
     print_facts(
         {
             "cid": cid_of_file(objective.path),
-            "format": {"mcap": "MCAP", "bag": "ROS 1 bag"}[objective.format],
+            "format": {"mcap": "MCAP", "bag": "ROS 1 bag", "sqlite3": "rosbag2 (sqlite3)"}[objective.format],
             "size": format_size(objective.size),
             "messages": f"{objective.count:,}",
             "duration": format_duration(objective.duration_ns),

@@ -1,5 +1,13 @@
-"""Recordings: objectives of unknown origin (MCAP or ROS 1 bags) checked and played, and jobs recorded."""
+"""Recordings: objectives of unknown origin (MCAP, ROS 1 bags, rosbag2) checked and played, and jobs recorded."""
 
+from mesh.recording.converting import (
+    ConversionSummary,
+    RecordingFormat,
+    Unconvertible,
+    convert,
+    recording_file,
+    recording_files,
+)
 from mesh.recording.errors import (
     CorruptRecording,
     NotARecording,

@@ -30,6 +30,7 @@ from mesh.recording.source import (
     RecordingSource,
     Segment,
     load_block,
+    reading_file,
     survey_block,
 )
 
@@ -59,8 +60,8 @@ def open_bag(
             if progress is not None:
                 progress(part.offset, size)
     check_window(path, reader.segments, limits)
-    read_messages = partial(_messages_of_chunk, path)
-    return RecordingSource(path, "bag", size, reader.channels, tuple(reader.segments), {}, read_messages)
+    reading = partial(reading_file, path, partial(_messages_of_chunk, path))
+    return RecordingSource(path, "bag", size, reader.channels, tuple(reader.segments), {}, reading)
 
 
 def _outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> list[RecordingBlock | BagRecord]:

@@ -21,10 +21,12 @@ class RecordingError(InputError, code="recording-error"):
 
 
 class NotARecording(RecordingError, code="not-a-recording"):
-    """A file is neither MCAP nor a ROS 1 bag, or can't be read at all."""
+    """A file is neither MCAP, nor a ROS 1 bag, nor of rosbag2, or can't be read at all."""
 
     def __init__(self, path: Path, why: str) -> None:
-        super().__init__(path, why, reason="not-a-recording", hint="an objective is an MCAP file or a ROS 1 bag")
+        super().__init__(
+            path, why, reason="not-a-recording", hint="an objective is an MCAP file, a ROS 1 bag, or a file of rosbag2"
+        )
 
 
 class CorruptRecording(RecordingError, code="corrupt-recording"):

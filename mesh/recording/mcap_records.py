@@ -1,4 +1,4 @@
-"""Parsing the records of an MCAP file, trusting none of the lengths in it.
+"""The records of an MCAP file: parsing them, trusting none of the lengths, and their bytes.
 
 Source: the MCAP specification, version 0. The `mcap` package can't be used here: it allocates what a length field asks
 for, and accepts a text that is shorter than stated.
@@ -10,6 +10,8 @@ import zlib
 from struct import Struct
 from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
+from mcap import records
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from mesh.recording.decoding import Cursor
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from mesh.recording.limits import Limits
 
 MAGIC: Final = b"\x89MCAP0\r\n"
+LIBRARY: Final = "aira-mesh"
 
 _PREFIX: Final = Struct("<BQ")
 _MESSAGE: Final = Struct("<HIQQ")
@@ -32,6 +35,7 @@ _CHUNK_HEAD: Final = 40
 _LONGEST_COMPRESSION: Final = 32
 _ATTACHMENT_HEAD: Final = 64 << 10
 """Bytes at the start of an attachment that must contain its names and times."""
+_LONGEST_PROFILE: Final = 4
 _PIECE: Final = 1 << 20
 
 
@@ -202,3 +206,17 @@ def check_range_crc(path: Path, file: BinaryIO, *, start: int, end: int, crc: in
         found, left = zlib.crc32(piece, found), left - len(piece)
     if found != crc:
         raise CorruptRecording(path, "a checksum is wrong")
+
+
+def header_of(profile: str) -> bytes:
+    """The header record, whose length is the same for each profile: readers skip what follows its fields."""
+    header = bytes_of(records.Header(profile, LIBRARY)) + bytes(_LONGEST_PROFILE - len(profile))
+    return _PREFIX.pack(Opcode.HEADER, len(header) - _PREFIX.size) + header[_PREFIX.size :]
+
+
+def bytes_of(*members: records.McapRecord) -> bytes:
+    """Records as they are in a file."""
+    builder = RecordBuilder()
+    for record in members:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]

@@ -40,6 +40,7 @@ from mesh.recording.source import (
     RecordingStatistics,
     Segment,
     load_block,
+    reading_file,
     survey_block,
 )
 
@@ -113,7 +114,6 @@ class McapReader:
 
     def source(self, size: int) -> RecordingSource:
         """The file, as far as it was read."""
-        read_messages = partial(messages_of_chunk, self.path)
         return RecordingSource(
             self.path,
             "mcap",
@@ -121,7 +121,7 @@ class McapReader:
             self.channels,
             tuple(self.segments),
             self.metadata,
-            read_messages,
+            partial(reading_file, self.path, partial(messages_of_chunk, self.path)),
             tuple(self.attachments),
             self.statistics,
             self.unchecked,

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 import zstandard
 from mcap import records
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from mesh.recording.errors import Unrecordable
+from mesh.recording.mcap_records import MAGIC, bytes_of, header_of
 from schemas.payloads import JSON
 
 if TYPE_CHECKING:
@@ -26,10 +26,9 @@ if TYPE_CHECKING:
     from mesh.recording.source import Attachment
     from schemas.payloads import PayloadType
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-LIBRARY: Final = "aira-mesh"
 CHUNK_SIZE: Final = 128 << 10
 """Bytes of a chunk. With the package's default of 1 MiB, writing one stalls for 13 ms, and a crash loses more."""
+ROS2_SCHEMAS: Final = ("ros2msg", "ros2idl")
 MAX_CHANNELS: Final = 0xFFFF
 MAX_TIME: Final = (1 << 64) - 1
 
@@ -72,7 +71,8 @@ class McapWriter:
         self._indexes: dict[int, list[int]] = {}
         """For each channel of the open chunk: log time and offset of one message after the other."""
         self.messages = 0
-        stream.write(MAGIC + _bytes_of(records.Header(profile, LIBRARY)))
+        self._profile = profile
+        stream.write(MAGIC + header_of(profile))
 
     def add(
         self,
@@ -134,7 +134,7 @@ class McapWriter:
             schema_id=self._schema(type),
             metadata=dict(metadata),
         )
-        self._append(_bytes_of(record))
+        self._append(bytes_of(record))
         self._channels.append(record)
         channel = self._known_channels[key] = WriterChannel(record.id)
         return channel
@@ -143,7 +143,7 @@ class McapWriter:
         """Write a metadata record. Raises `Unrecordable`."""
         for text in (name, *values, *values.values()):
             _check_text(text)
-        record = _bytes_of(records.Metadata(name=name, metadata=dict(values)))
+        record = bytes_of(records.Metadata(name=name, metadata=dict(values)))
         self._metadata.append(records.MetadataIndex(offset=self._stream.tell(), length=len(record), name=name))
         self._stream.write(record)
 
@@ -151,7 +151,7 @@ class McapWriter:
         """Write an attachment: `data` under the names and times of `attachment`."""
         create_time, log_time = attachment.create_time, attachment.log_time
         name, media_type = attachment.name, attachment.media_type
-        record = _bytes_of(records.Attachment(create_time, log_time, name, media_type, data))
+        record = bytes_of(records.Attachment(create_time, log_time, name, media_type, data))
         offset = self._stream.tell()
         self._attachments.append(
             records.AttachmentIndex(offset, len(record), log_time, create_time, len(data), name, media_type)
@@ -164,16 +164,28 @@ class McapWriter:
         self._stream.flush()
 
     def finish(self) -> None:
-        """Write the index and the end of the file; the stream stays open."""
+        """Write the index and the end of the file; the stream stays open.
+
+        If all channels are of ROS 2, so is the file's profile, without which readers of rosbag2 refuse it.
+        """
         self._close_chunk()
-        self._stream.write(_bytes_of(records.DataEnd(0)))
+        if not self._profile and self._channels and all(map(self._is_ros2, self._channels)):
+            end = self._stream.tell()
+            self._stream.seek(len(MAGIC))
+            self._stream.write(header_of("ros2"))
+            self._stream.seek(end)
+        self._stream.write(bytes_of(records.DataEnd(0)))
         start = self._stream.tell()
         summary, offsets = self._summary(start)
         offsets_start = start + len(summary)
-        summary += _bytes_of(*offsets)
+        summary += bytes_of(*offsets)
         crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, 8 + 8 + 4, start, offsets_start), zlib.crc32(summary))
         footer = records.Footer(summary_start=start, summary_offset_start=offsets_start, summary_crc=crc)
-        self._stream.write(summary + _bytes_of(footer) + MAGIC)
+        self._stream.write(summary + bytes_of(footer) + MAGIC)
+
+    def _is_ros2(self, channel: records.Channel) -> bool:
+        has_schema = channel.schema_id and self._schemas[channel.schema_id - 1].encoding in ROS2_SCHEMAS
+        return bool(has_schema) and channel.message_encoding == "cdr"
 
     def _schema(self, type: PayloadType) -> int:
         """The number of a type's schema; 0, which means none, for bytes of no known type."""
@@ -187,7 +199,7 @@ class McapWriter:
             return known
         name, encoding, data = key
         schema = records.Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
-        self._append(_bytes_of(schema))
+        self._append(bytes_of(schema))
         self._schemas.append(schema)
         self._known_schemas[key] = schema.id
         return schema.id
@@ -210,7 +222,7 @@ class McapWriter:
             uncompressed_crc=zlib.crc32(data),
             uncompressed_size=len(data),
         )
-        start, record = self._stream.tell(), _bytes_of(chunk)
+        start, record = self._stream.tell(), bytes_of(chunk)
         indexes, offsets = self._message_indexes(start + len(record))
         self._stream.write(record + indexes)
         self._chunks.append(
@@ -252,7 +264,7 @@ class McapWriter:
         ]
         summary, offsets = b"", []
         for opcode, members in groups:
-            group = _bytes_of(*members)
+            group = bytes_of(*members)
             if group:
                 offsets.append(records.SummaryOffset(opcode, start + len(summary), len(group)))
             summary += group
@@ -289,10 +301,3 @@ def _check_text(text: str) -> None:
         text.encode()
     except UnicodeEncodeError:
         raise Unrecordable(f"{text[:40]!a} can't be encoded as UTF-8") from None
-
-
-def _bytes_of(*members: records.McapRecord) -> bytes:
-    builder = RecordBuilder()
-    for record in members:
-        record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]

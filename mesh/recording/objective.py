@@ -14,6 +14,8 @@ from mesh.recording.bag_source import open_bag
 from mesh.recording.errors import NotARecording, RecordingTooLarge
 from mesh.recording.limits import Limits
 from mesh.recording.mcap_source import open_mcap
+from mesh.recording.ros_values import ros_value
+from mesh.recording.sqlite_source import SQLITE_MAGIC, open_sqlite
 from schemas.errors import InvalidPayload
 from schemas.payloads import Empty, PayloadType, String, decode_value
 
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from mesh.recording.source import OnMessage, RecordingChannel, RecordingSource
 
 _DEFAULT: Final = Limits()
+_ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 
 
 class Topic(Struct, frozen=True):
@@ -50,7 +53,12 @@ class Played(Struct, frozen=True):
 
     @property
     def value(self) -> Any:
-        """A number, a text, a list, None for an empty message, JSON data; else bytes."""
+        """A number, a text, a list, None for an empty message, JSON data, a ROS 2 message as a dict; else bytes.
+
+        A ROS 2 message needs its definition in the recording, and the package rosbags (`aira-mesh[ros]`).
+        """
+        if self.type.encoding == "cdr":
+            return ros_value(self.payload, self.type)
         try:
             value = decode_value(self.payload, self.type)
         except InvalidPayload:
@@ -70,9 +78,9 @@ class ChannelMessage(Struct, frozen=True):
 class Objective:
     """A recording that was checked completely. No file stays open; the messages are read again each time.
 
-    `format` is `mcap` or `bag`, `size` is in bytes, `count` the number of messages, `metadata` the metadata records by
-    name, and `attachments` the files in it (bags have neither). `statistics` is what an MCAP file states about itself,
-    if it does, and `unchecked` the number of message blocks without a checksum.
+    `format` is `mcap`, `bag` or `sqlite3` (of rosbag2), `size` is in bytes, `count` the number of messages, `metadata`
+    the metadata records by name, and `attachments` the files in it (only MCAP files have these). `statistics` is what
+    an MCAP file states about itself, if it does, and `unchecked` the number of message blocks without a checksum.
     """
 
     def __init__(self, source: RecordingSource) -> None:
@@ -111,7 +119,7 @@ class Objective:
 
 
 def open_objective(path: str | Path, limits: Limits = _DEFAULT, *, progress: Progress | None = None) -> Objective:
-    """Check the whole recording at `path`, an MCAP file or a ROS 1 bag, and open it.
+    """Check the whole recording at `path`, and open it: an MCAP file, a ROS 1 bag, or a database of rosbag2 (`.db3`).
 
     Reads the whole file: use a thread. The limits bound the memory, whatever the file states; schema texts are never
     parsed. `progress` is called with the bytes read, of all. Raises `NotARecording`, `RecordingTooLarge`,
@@ -131,8 +139,12 @@ def open_source(
         source = open_mcap(path, size, limits, on_message=on_message, progress=progress)
     elif magic.startswith(bag_records.MAGIC):
         source = open_bag(path, size, limits, on_message=on_message, progress=progress)
+    elif magic.startswith(SQLITE_MAGIC):
+        source = open_sqlite(path, size, limits, on_message=on_message, progress=progress)
+    elif magic.startswith(_ZSTD_MAGIC):
+        raise NotARecording(path, "it is compressed as a whole; decompress it first: zstd -d")
     else:
-        raise NotARecording(path, "it is neither an MCAP file nor a ROS 1 bag")
+        raise NotARecording(path, "it is neither an MCAP file, nor a ROS 1 bag, nor a database of rosbag2")
     if progress is not None:
         progress(size, size)
     return source
@@ -173,6 +185,6 @@ def _size_and_magic(path: Path) -> tuple[int, bytes]:
         if not stat.S_ISREG(status.st_mode):
             raise NotARecording(path, "it is not a file")
         with path.open("rb") as file:
-            return status.st_size, file.read(len(bag_records.MAGIC))
+            return status.st_size, file.read(len(SQLITE_MAGIC))
     except OSError as error:
         raise NotARecording(path, f"it can't be read: {error.strerror}") from error

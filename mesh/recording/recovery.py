@@ -89,10 +89,7 @@ def readable_part(path: Path) -> tuple[RecordingSource, str]:
 
 def copy_content(source: RecordingSource, writer: McapWriter, *, progress: Progress | None = None) -> None:
     """Write all messages of a source, in file order and on equal channels, and its attachments."""
-    with source.path.open("rb") as stream:
-        for attachment in source.attachments:
-            stream.seek(attachment.offset)
-            writer.add_attachment(attachment, stream.read(attachment.size))
+    copy_attachments(source, writer)
     total = sum(segment.count for segment in source.segments)
     for done, (number, sequence, log_time, publish_time, payload) in enumerate(source.in_file_order(), 1):
         channel = source.channels[number]
@@ -107,6 +104,14 @@ def copy_content(source: RecordingSource, writer: McapWriter, *, progress: Progr
         )
         if progress is not None:
             progress(done, total)
+
+
+def copy_attachments(source: RecordingSource, writer: McapWriter) -> None:
+    """Write the attachments of a source."""
+    with source.path.open("rb") as stream:
+        for attachment in source.attachments:
+            stream.seek(attachment.offset)
+            writer.add_attachment(attachment, stream.read(attachment.size))
 
 
 def last_time(source: RecordingSource) -> int:

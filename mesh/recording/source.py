@@ -1,8 +1,9 @@
-"""A checked recording, MCAP or bag: its channels, and its messages in blocks that are read one at a time."""
+"""A checked recording: its channels, and its messages in blocks that are read one at a time."""
 
 from __future__ import annotations
 
 import heapq
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
@@ -12,6 +13,7 @@ from mesh.recording.errors import CorruptRecording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
+    from contextlib import AbstractContextManager
     from pathlib import Path
     from typing import TypeAlias
 
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
     OnMessage: TypeAlias = Callable[["RecordingChannel", bytes], None]
     """Is called with the channel and payload of each message, in file order, while the file is checked."""
+    BlockReader: TypeAlias = Callable[["RecordingBlock"], Iterator["RecordedMessage"]]
+    """Returns the messages of a block. May raise `CorruptRecording`."""
 
 _RECORD_COST: Final = 256
 """Bytes of memory that a message takes besides its payload while its segment is being sorted."""
@@ -70,7 +74,10 @@ class RecordingStatistics(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RecordingBlock:
-    """Where a block of messages is in a file: `stored` bytes at `offset`, which expand to `size`."""
+    """Where a block of messages is in a file: `stored` bytes at `offset`, which expand to `size`.
+
+    In a database `offset` is the first row, and `stored` the last one.
+    """
 
     offset: int
     stored: int
@@ -97,10 +104,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class RecordingSource:
-    """A checked file: its content, and how to read the messages of its blocks.
-
-    `read_messages` takes the decompressed bytes of a block and may raise `CorruptRecording`.
-    """
+    """A checked file: its content, and how to read the messages of its blocks: `reading` opens the file for that."""
 
     path: Path
     format: str
@@ -108,7 +112,7 @@ class RecordingSource:
     channels: Mapping[int, RecordingChannel]
     segments: tuple[Segment, ...]
     metadata: Mapping[str, Mapping[str, str]]
-    read_messages: Callable[[bytes], Iterator[RecordedMessage]]
+    reading: Callable[[], AbstractContextManager[BlockReader]]
     attachments: tuple[Attachment, ...] = ()
     statistics: RecordingStatistics | None = None
     unchecked: int = 0
@@ -116,28 +120,28 @@ class RecordingSource:
 
     def in_file_order(self) -> Iterator[RecordedMessage]:
         """All messages in file order."""
-        with self.path.open("rb") as file:
+        with self.reading() as read:
             for segment in self.segments:
-                yield from self.read_messages(load_block(self.path, file, segment.block))
+                yield from read(segment.block)
 
     def in_time_order(self, *, skip: int = 0) -> Iterator[RecordedMessage]:
         """All messages by log time, without the first `skip`; those of equal time in file order."""
-        with self.path.open("rb") as file:
+        with self.reading() as read:
             waiting = sorted(self.segments, key=lambda segment: (segment.start, segment.number))
             position, skip = _skip_whole(waiting, skip)
-            merged = self._merge(file, waiting[position:])
+            merged = self._merge(read, waiting[position:])
             for _ in zip(range(skip), merged, strict=False):
                 pass
             yield from merged
 
-    def _merge(self, file: BinaryIO, waiting: list[Segment]) -> Iterator[RecordedMessage]:
+    def _merge(self, read: BlockReader, waiting: list[Segment]) -> Iterator[RecordedMessage]:
         """Merge segments by time, holding each in memory only during its time span. `waiting` is sorted by start."""
         following = iter(waiting)
         upcoming = next(following, None)
         heap: list[tuple[int, int, RecordedMessage, Iterator[RecordedMessage]]] = []
         while heap or upcoming:
             while upcoming and (not heap or upcoming.start <= heap[0][0]):
-                self._open(file, upcoming, heap)
+                self._open(read, upcoming, heap)
                 upcoming = next(following, None)
             _, number, record, rest = heap[0]
             yield record
@@ -148,15 +152,25 @@ class RecordingSource:
                 heapq.heapreplace(heap, (after.log_time, number, after, rest))
 
     def _open(
-        self, file: BinaryIO, segment: Segment, heap: list[tuple[int, int, RecordedMessage, Iterator[RecordedMessage]]]
+        self,
+        read: BlockReader,
+        segment: Segment,
+        heap: list[tuple[int, int, RecordedMessage, Iterator[RecordedMessage]]],
     ) -> None:
-        records = self.read_messages(load_block(self.path, file, segment.block))
+        records = read(segment.block)
         if not segment.sorted:
             records = iter(sorted(records, key=lambda record: record.log_time))
         first = next(records, None)
         if first is None:
             raise CorruptRecording(self.path, "the file changed while it was being read")
         heapq.heappush(heap, (first.log_time, segment.number, first, records))
+
+
+@contextmanager
+def reading_file(path: Path, read_messages: Callable[[bytes], Iterator[RecordedMessage]]) -> Iterator[BlockReader]:
+    """Open a file of chunks. `read_messages` takes the decompressed bytes of a block."""
+    with path.open("rb") as file:
+        yield lambda block: read_messages(load_block(path, file, block))
 
 
 def load_block(path: Path, file: BinaryIO, block: RecordingBlock) -> bytes:

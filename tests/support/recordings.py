@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap_ros1.decoder import DecoderFactory as Ros1Decoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 
-from mesh.recording.mcap_writer import MAGIC
+from mesh.recording.mcap_records import MAGIC
 from peers.catalog import PEERS
 
 if TYPE_CHECKING:

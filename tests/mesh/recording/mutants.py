@@ -1,4 +1,4 @@
-"""Valid recordings of seven kinds, and random mutations of them."""
+"""Valid recordings of eight kinds, and random mutations of them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from mcap.writer import CompressionType
 
 from tests.mesh.recording.files import T0, with_messages
 from tests.support.bags import Bag, BagMessage, string
+from tests.support.rosbag2 import database_bytes
 
 if TYPE_CHECKING:
     import random
@@ -23,6 +24,7 @@ FILES = {
     "bag": Bag(SENT, per_chunk=40).encode(),
     "bag bz2": Bag(SENT, "bz2", per_chunk=40).encode(),
     "bag lz4": Bag(SENT, "lz4", per_chunk=40).encode(),
+    "rosbag2 sqlite3": database_bytes(rows=[(1, time, string(f"message {n}")) for n, time in enumerate(TIMES)]),
 }
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[3]
 MUTANTS = 40
-"""Of each of the seven valid files."""
+"""Of each of the eight valid files."""
 MEMORY = 256 << 20
 SECONDS = 5.0
 """Of the processor, which others at work on the machine hardly change. The slowest file takes half of it where this was
