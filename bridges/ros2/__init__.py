@@ -16,11 +16,13 @@ if TYPE_CHECKING:
         RosNotAllowed,
         RosTypeMismatch,
         RosUnavailable,
-        TooManyRosPublishers,
+        TooManyRosEndpoints,
     )
     from bridges.ros2.graph import RosGraph
+    from bridges.ros2.parameters import RosParameters
     from bridges.ros2.qos import LATCHED, SENSOR_DATA, RosQos
     from bridges.ros2.robot import Robot
+    from bridges.ros2.services import RosServer
     from bridges.ros2.tokens import RosEntity
     from bridges.ros2.topics import RosMessage, RosPublisher, RosSubscription
 
@@ -37,23 +39,27 @@ __all__ = [
     "RosGraph",
     "RosMessage",
     "RosNotAllowed",
+    "RosParameters",
     "RosPublisher",
     "RosQos",
+    "RosServer",
     "RosSubscription",
     "RosTypeMismatch",
     "RosUnavailable",
-    "TooManyRosPublishers",
+    "TooManyRosEndpoints",
 ]
 
 _NAMES: Final = {
     "bridges.ros2.allowed": "RosAllowed",
     "bridges.ros2.errors": (
         "InvalidRosName InvalidRosToken RosCallFailed RosGoalFailed RosNotAllowed RosTypeMismatch RosUnavailable "
-        "TooManyRosPublishers"
+        "TooManyRosEndpoints"
     ),
     "bridges.ros2.graph": "RosGraph",
     "bridges.ros2.qos": "LATCHED SENSOR_DATA RosQos",
+    "bridges.ros2.parameters": "RosParameters",
     "bridges.ros2.robot": "Robot",
+    "bridges.ros2.services": "RosServer",
     "bridges.ros2.tokens": "RosEntity",
     "bridges.ros2.topics": "RosMessage RosPublisher RosSubscription",
 }

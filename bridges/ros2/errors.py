@@ -30,11 +30,11 @@ class RosNotAllowed(ConfigurationError, code="ros-not-allowed"):
         self.use = use
 
 
-class TooManyRosPublishers(InputError, code="too-many-ros-publishers"):
-    """Another topic would need one publisher more than a robot may have."""
+class TooManyRosEndpoints(InputError, code="too-many-ros-endpoints"):
+    """Another topic or service would need one publisher or client more than a robot may have."""
 
     def __init__(self, name: str, limit: int) -> None:
-        super().__init__(f"{name}: this robot has {limit} publishers already")
+        super().__init__(f"{name}: this robot has {limit} publishers or clients already")
         self.name = name
 
 

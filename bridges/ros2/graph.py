@@ -45,7 +45,8 @@ class RosGraph:
     def start(self, session: zenoh.Session) -> None:
         """Follow the tokens on a session, beginning with those that are there."""
         self._loop = asyncio.get_running_loop()
-        self._subscriber = session.liveliness().declare_subscriber(self._flavour.selector, self._receive, history=True)
+        receive = zenoh.handlers.Callback(self._receive, indirect=False)
+        self._subscriber = session.liveliness().declare_subscriber(self._flavour.selector, receive, history=True)
 
     def close(self) -> None:
         """Stop following. Call it while the session is open."""

@@ -150,6 +150,10 @@ class RosNode:
         except UnknownRosType:
             return PayloadType("cdr", type_name)
 
+    def payload(self, type_name: str, data: bytes) -> Payload:
+        """Bytes of a type."""
+        return Payload(data, self.payload_type(type_name))
+
     def _checked(self, type_name: str, payload: Payload) -> bytes:
         found = payload.type.schema_name
         if payload.type.encoding != "cdr" or full_type(found) != full_type(type_name):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+import asyncio
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from bridges.ros2.allowed import EVERYTHING, RosAllowed
 from bridges.ros2.dds import Ros2Dds
 from bridges.ros2.definitions import add_definitions
-from bridges.ros2.errors import RosTypeMismatch, TooManyRosPublishers
+from bridges.ros2.errors import RosTypeMismatch, TooManyRosEndpoints
 from bridges.ros2.names import full_type
 from bridges.ros2.node import RosNode
+from bridges.ros2.parameters import RosParameters
 from bridges.ros2.qos import DEFAULT_QOS
+from bridges.ros2.services import REQUESTS, RosClient, RosServer
 from bridges.ros2.tokens import RmwZenoh
 from bridges.ros2.topics import RosPublisher, RosSubscription
 from mesh.errors import ClosedError
@@ -20,19 +23,20 @@ from mesh.role import Lifecycle
 from schemas.payloads import Payload
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Awaitable, Callable, Mapping
     from contextlib import AsyncExitStack
 
     import zenoh
 
     from bridges.ros2.graph import RosGraph
     from bridges.ros2.qos import RosQos
+    from bridges.ros2.services import RosRecorder
     from mesh.ros import RosTypes
 
-TIMEOUT = 10.0
+TIMEOUT: Final = 10.0
 """Seconds to wait for what a call needs."""
-PUBLISHERS = 256
-"""Publishers of a robot, at most."""
+ENDPOINTS: Final = 256
+"""Publishers of a robot, at most, and clients."""
 
 
 class Robot(Lifecycle):
@@ -65,11 +69,13 @@ class Robot(Lifecycle):
         self._allow = allow
         self._node = RosNode(session, types, _flavour(flavour, domain), node, namespace, self.drops)
         self._publishers: dict[str, RosPublisher] = {}
+        self._clients: dict[tuple[str, str], RosClient] = {}
+        self._servers: list[RosServer] = []
 
     async def _open(self, stack: AsyncExitStack) -> None:
         self._node.open()
         stack.callback(self._node.close)
-        stack.callback(self._close_publishers)
+        stack.push_async_callback(self._close_endpoints)
 
     @property
     def graph(self) -> RosGraph:
@@ -112,8 +118,8 @@ class Robot(Lifecycle):
         self._allow.check("publish", topic)
         publisher = self._publishers.get(topic)
         if publisher is None:
-            if len(self._publishers) >= PUBLISHERS:
-                raise TooManyRosPublishers(topic, PUBLISHERS)
+            if len(self._publishers) >= ENDPOINTS:
+                raise TooManyRosEndpoints(topic, ENDPOINTS)
             self._node.check_type(self._node.others(topic, "subscription"), type_name)
             publisher = self._publishers[topic] = RosPublisher(self._node, topic, type_name, qos or DEFAULT_QOS)
         elif publisher.type != type_name:
@@ -132,15 +138,79 @@ class Robot(Lifecycle):
         self._allow.check("subscribe", topic)
         return RosSubscription(self._node, topic, type_name, qos, timeout)
 
+    async def call(
+        self, name: str, type_name: str, request: object, *, timeout: float = TIMEOUT, job: RosRecorder | None = None
+    ) -> Any:
+        """Call a service; returns the decoded reply.
+
+        `request` is a dict of the request's fields, a message or a payload. With `job` request and reply become part
+        of its recording, on the topics `NAME/_request` and `NAME/_reply`. Raises `RosUnavailable` or `RosCallFailed`
+        if no reply comes within `timeout` seconds, `RosNotAllowed`, `RosTypeMismatch`, `UnknownRosType`,
+        `InvalidPayload`.
+        """
+        name = self._node.resolve(name)
+        self._allow.check("call", name)
+        return await self._call(name, full_type(type_name, "srv"), request, timeout, job)
+
+    def parameters(self, node: str, *, timeout: float = TIMEOUT, job: RosRecorder | None = None) -> RosParameters:
+        """The parameters of a node (its name with namespace). Raises `RosNotAllowed`."""
+        node = self._node.resolve(node)
+        self._allow.check("call", node)
+        return RosParameters(
+            node,
+            lambda service, kind, request: self._call(
+                f"{node}/{service}", f"rcl_interfaces/srv/{kind}", request, timeout, job
+            ),
+        )
+
+    def serve(
+        self, name: str, type_name: str, handler: Callable[[Any], Awaitable[object]], *, limit: int = REQUESTS
+    ) -> RosServer:
+        """Offer a service until the robot is closed.
+
+        `handler` takes the decoded request, and returns a dict of the reply's fields, a message or a payload. `limit`
+        requests are handled at a time. Raises `RosNotAllowed`, `UnknownRosType`.
+        """
+        self._check_open()
+        name = self._node.resolve(name)
+        self._allow.check("serve", name)
+        return self._serve(name, full_type(type_name, "srv"), handler, limit)
+
+    async def _call(self, name: str, type_name: str, request: object, timeout: float, job: RosRecorder | None) -> Any:
+        self._check_open()
+        self.types.type_hash(type_name)
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout
+        self._node.check_type(await self._node.wait(name, timeout, "server"), type_name)
+        return await self._client(name, type_name).call(request, timeout=deadline - loop.time(), job=job)
+
+    def _client(self, name: str, type_name: str) -> RosClient:
+        client = self._clients.get((name, type_name))
+        if client is None:
+            if len(self._clients) >= ENDPOINTS:
+                raise TooManyRosEndpoints(name, ENDPOINTS)
+            client = self._clients[name, type_name] = RosClient(self._node, name, type_name)
+        return client
+
+    def _serve(self, name: str, type_name: str, handler: Callable[[Any], Awaitable[object]], limit: int) -> RosServer:
+        server = RosServer(self._node, name, type_name, handler, limit=limit)
+        self._servers.append(server)
+        return server
+
     def _check_open(self) -> None:
         if not self.is_open:
             raise ClosedError("this robot is not open", hint="use it inside `async with`")
 
-    def _close_publishers(self) -> None:
-        publishers, self._publishers = self._publishers, {}
+    async def _close_endpoints(self) -> None:
+        servers, self._servers = self._servers, []
+        for server in servers:
+            await server.close()
+        endpoints: list[RosPublisher | RosClient] = [*self._publishers.values(), *self._clients.values()]
+        self._publishers.clear()
+        self._clients.clear()
         if not self._node.session.is_closed():
-            for publisher in publishers.values():
-                publisher.close()
+            for endpoint in endpoints:
+                endpoint.close()
 
 
 def _flavour(name: str, domain: int) -> RmwZenoh | Ros2Dds:

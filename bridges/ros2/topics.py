@@ -60,11 +60,11 @@ class RosPublisher:
         A congested link drops it rather than block. Raises `InvalidPayload`.
         """
         payload = self._node.encoded(self.type, message)
-        options: dict[str, Any] = {}
+        attachment = None
         if self._node.flavour.has_attachments:
             self._sequence += 1
-            options["attachment"] = RosAttachment(self._sequence, time.time_ns(), self._endpoint.gid).encode()
-        self._publisher.put(payload.data, **options)
+            attachment = RosAttachment(self._sequence, time.time_ns(), self._endpoint.gid).encode()
+        self._publisher.put(payload.data, attachment=attachment)
         return payload
 
     @property

@@ -17,7 +17,7 @@ from bridges.ros2 import (
     RosQos,
     RosTypeMismatch,
     RosUnavailable,
-    TooManyRosPublishers,
+    TooManyRosEndpoints,
 )
 from bridges.ros2.attachment import parse_attachment
 from bridges.ros2.names import topic_key
@@ -253,13 +253,13 @@ async def test_what_would_stop_a_robots_process_is_not_published(here: zenoh.Ses
 async def test_publishers_and_tokens_are_bounded(
     here: zenoh.Session, there: zenoh.Session, domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bridges.ros2.robot.PUBLISHERS", 2)
+    monkeypatch.setattr("bridges.ros2.robot.ENDPOINTS", 2)
     monkeypatch.setattr("bridges.ros2.graph.PER_SESSION", 3)
     drops = Drops()
     async with Robot(here, RosTypes("jazzy"), domain=domain, drops=drops) as ours:
         for name in ("/a", "/b"):
             ours.advertise(name, "std_msgs/String", qos=SENSOR_DATA)
-        with pytest.raises(TooManyRosPublishers):
+        with pytest.raises(TooManyRosEndpoints):
             ours.advertise("/c", "std_msgs/String")
         tokens = [
             there.liveliness().declare_token(f"{PREFIX}/{domain}/ab/0/{number}/NN/%/%/node{number}")
