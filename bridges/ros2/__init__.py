@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 from schemas.loading import on_demand
 
 if TYPE_CHECKING:
+    from bridges.ros2.actions import RosActionServer, RosGoal
     from bridges.ros2.allowed import RosAllowed
     from bridges.ros2.errors import (
         InvalidRosName,
@@ -32,9 +33,11 @@ __all__ = [
     "InvalidRosName",
     "InvalidRosToken",
     "Robot",
+    "RosActionServer",
     "RosAllowed",
     "RosCallFailed",
     "RosEntity",
+    "RosGoal",
     "RosGoalFailed",
     "RosGraph",
     "RosMessage",
@@ -50,6 +53,7 @@ __all__ = [
 ]
 
 _NAMES: Final = {
+    "bridges.ros2.actions": "RosActionServer RosGoal",
     "bridges.ros2.allowed": "RosAllowed",
     "bridges.ros2.errors": (
         "InvalidRosName InvalidRosToken RosCallFailed RosGoalFailed RosNotAllowed RosTypeMismatch RosUnavailable "

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from bridges.ros2.actions import RosActionClient, RosActionServer
 from bridges.ros2.allowed import EVERYTHING, RosAllowed
 from bridges.ros2.dds import Ros2Dds
 from bridges.ros2.definitions import add_definitions
 from bridges.ros2.errors import RosTypeMismatch, TooManyRosEndpoints
-from bridges.ros2.names import full_type
+from bridges.ros2.names import ACTION, SEND_GOAL, full_type
 from bridges.ros2.node import RosNode
 from bridges.ros2.parameters import RosParameters
 from bridges.ros2.qos import DEFAULT_QOS
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from bridges.ros2.actions import RosGoal
     from bridges.ros2.graph import RosGraph
     from bridges.ros2.qos import RosQos
     from bridges.ros2.services import RosRecorder
@@ -70,7 +72,7 @@ class Robot(Lifecycle):
         self._node = RosNode(session, types, _flavour(flavour, domain), node, namespace, self.drops)
         self._publishers: dict[str, RosPublisher] = {}
         self._clients: dict[tuple[str, str], RosClient] = {}
-        self._servers: list[RosServer] = []
+        self._servers: list[RosServer | RosActionServer] = []
 
     async def _open(self, stack: AsyncExitStack) -> None:
         self._node.open()
@@ -152,6 +154,33 @@ class Robot(Lifecycle):
         self._allow.check("call", name)
         return await self._call(name, full_type(type_name, "srv"), request, timeout, job)
 
+    async def action(
+        self,
+        name: str,
+        type_name: str,
+        goal: object,
+        *,
+        feedback: Callable[[Any], Awaitable[None] | None] | None = None,
+        timeout: float | None = None,
+        job: RosRecorder | None = None,
+    ) -> Any:
+        """Have a goal achieved by an action server; returns the decoded result.
+
+        `goal` is a dict of the goal's fields, a message or a payload. `feedback` is called with each decoded feedback.
+        If the call is cancelled, or takes more than `timeout` seconds, the goal is cancelled. With `job` goal,
+        feedback and result become part of its recording. Raises `RosGoalFailed` if the server rejects, aborts or
+        cancels the goal, and what `call` raises.
+        """
+        self._check_open()
+        name, type_name = self._node.resolve(name), full_type(type_name, "action")
+        self._allow.check("call", name)
+        service = f"{name}{ACTION}send_goal"
+        self.types.type_hash(f"{type_name}{SEND_GOAL}")
+        servers = await self._node.wait(service, TIMEOUT if timeout is None else min(TIMEOUT, timeout), "server")
+        self._node.check_type(servers, f"{type_name}{SEND_GOAL}")
+        client = RosActionClient(self._node, name, type_name, self._client, job)
+        return await client.run(goal, feedback, timeout)
+
     def parameters(self, node: str, *, timeout: float = TIMEOUT, job: RosRecorder | None = None) -> RosParameters:
         """The parameters of a node (its name with namespace). Raises `RosNotAllowed`."""
         node = self._node.resolve(node)
@@ -174,7 +203,25 @@ class Robot(Lifecycle):
         self._check_open()
         name = self._node.resolve(name)
         self._allow.check("serve", name)
-        return self._serve(name, full_type(type_name, "srv"), handler, limit)
+        server = RosServer(self._node, name, full_type(type_name, "srv"), handler, limit=limit)
+        self._servers.append(server)
+        return server
+
+    def serve_action(
+        self, name: str, type_name: str, handler: Callable[[RosGoal], Awaitable[object]]
+    ) -> RosActionServer:
+        """Offer an action until the robot is closed.
+
+        `handler` achieves a goal, and returns a dict of the result's fields, a message or a payload. It is cancelled
+        when the client cancels the goal; it may then return a result all the same. Raises `RosNotAllowed`,
+        `UnknownRosType`.
+        """
+        self._check_open()
+        name = self._node.resolve(name)
+        self._allow.check("serve", name)
+        server = RosActionServer(self._node, name, full_type(type_name, "action"), handler)
+        self._servers.append(server)
+        return server
 
     async def _call(self, name: str, type_name: str, request: object, timeout: float, job: RosRecorder | None) -> Any:
         self._check_open()
@@ -191,11 +238,6 @@ class Robot(Lifecycle):
                 raise TooManyRosEndpoints(name, ENDPOINTS)
             client = self._clients[name, type_name] = RosClient(self._node, name, type_name)
         return client
-
-    def _serve(self, name: str, type_name: str, handler: Callable[[Any], Awaitable[object]], limit: int) -> RosServer:
-        server = RosServer(self._node, name, type_name, handler, limit=limit)
-        self._servers.append(server)
-        return server
 
     def _check_open(self) -> None:
         if not self.is_open:
