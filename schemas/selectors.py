@@ -74,9 +74,9 @@ def event_selector(agent: str = "*", liability: str = "*") -> str:
     return f"aira/agent/{_any_or(address_chunk, agent)}/liability/{_any_or(address_chunk, liability)}/*"
 
 
-def objective_selector(agent: str, liability: str) -> str:
-    """All topics of a liability's objective."""
-    return f"aira/agent/{address_chunk(agent)}/liability/{address_chunk(liability)}/objective/**"
+def objective_selector(agent: str, liability: str = "*") -> str:
+    """All topics of the objective of a liability of an agent, or of any of its liabilities."""
+    return f"aira/agent/{address_chunk(agent)}/liability/{_any_or(address_chunk, liability)}/objective/**"
 
 
 def topic_selector(agent: str, liability: str = "*", topic: str = "/**") -> str:

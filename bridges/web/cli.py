@@ -107,8 +107,8 @@ def web_options(settings: Settings, options: dict[str, Any]) -> WebOptions:
         host=host,
         port=port,
         names=options["names"],
-        token=_token(options["token_file"]),
-        operator_token=_token(options["operator_token_file"]),
+        token=token_in(options["token_file"]),
+        operator_token=token_in(options["operator_token_file"]),
         certificate=str(options["certificate"] or ""),
         key=str(options["key"] or ""),
         roster=settings.roster,
@@ -148,7 +148,7 @@ def robot_of(options: dict[str, Any]) -> dict[str, Any] | None:
     }
 
 
-def _token(path: Path | None) -> str:
+def token_in(path: Path | None) -> str:
     """The token in a file; empty without a file."""
     if path is None:
         return ""

@@ -157,7 +157,7 @@ async def play(
     starts that long after the first message (after the one at `start_index`). Cancelling, or leaving the loop, stops
     reading. Raises `CorruptRecording` if the file has changed since it was opened.
     """
-    messages = _read_ahead(objective.messages(from_index=start_index))
+    messages = read_ahead(objective.messages(from_index=start_index))
     async with aclosing(messages):
         async for step in paced(messages, pace, clock, first_index=start_index, start_ns=start_ns):
             yield step
@@ -185,7 +185,7 @@ class _Schedule:
         return Step(self._index, self._pace.due_ns(self._position, elapsed), message)
 
 
-async def _read_ahead(messages: Iterator[Played]) -> AsyncGenerator[Played, None]:
+async def read_ahead(messages: Iterator[Played]) -> AsyncGenerator[Played, None]:
     """The same messages, read in a thread batch by batch: one batch is read while the one before is played."""
     reading = asyncio.ensure_future(asyncio.to_thread(_batch, messages))
     try:

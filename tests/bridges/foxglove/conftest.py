@@ -1,0 +1,45 @@
+"""A Foxglove server on a free port."""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from bridges.foxglove.front import FoxgloveFront
+from bridges.foxglove.options import FoxgloveOptions
+from bridges.foxglove.server import FoxgloveServer
+from mesh.flood import Drops
+from tests.support.market import founded, place
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from contextlib import AbstractAsyncContextManager
+
+__all__ = ["founded", "place"]
+
+
+@pytest.fixture
+def front() -> Callable[..., FoxgloveFront]:
+    """A front on a free port, not yet open."""
+
+    def made(**options: Any) -> FoxgloveFront:
+        return FoxgloveFront(FoxgloveOptions(**({"port": 0} | options)), Drops())
+
+    return made
+
+
+@pytest.fixture
+def serve(front: Callable[..., FoxgloveFront]) -> Callable[..., AbstractAsyncContextManager[FoxgloveServer]]:
+    """Serves a view; `server.front` has its address."""
+
+    @asynccontextmanager
+    async def serving(known: Any = (), **options: Any) -> AsyncIterator[FoxgloveServer]:
+        async with (
+            front(**options) as open_front,
+            FoxgloveServer(open_front, "test", open_front.drops, known=known) as server,
+        ):
+            yield server
+
+    return serving

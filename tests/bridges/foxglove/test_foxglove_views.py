@@ -1,0 +1,145 @@
+"""The market, an agent and a job at a real market, as a viewer sees them."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from bridges.foxglove.jobs import show_job_until_end, show_recording
+from bridges.foxglove.server import FoxgloveServer
+from bridges.foxglove.sources import show_agent, show_market
+from bridges.web.components import opened
+from mesh import Job, String  # noqa: TC001  handlers are read at run time
+from mesh.agent.components import watching
+from mesh.background import Background
+from mesh.cli.errors import NoRecording
+from schemas.agent_keys import DeviceTopicKey
+from tests.bridges.foxglove.viewer import PLAY, viewing
+from tests.support.market import MODEL, offering
+from tests.support.objectives import objective
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from tests.support.market import Place
+
+COST = 100
+
+
+def blinking(place: Place) -> Any:
+    """A robot that says on `/blinked` what it plays."""
+    robot = offering(place.agent("robot"))
+
+    @robot.on("/blink")
+    async def blink(job: Job, message: String) -> None:
+        job.publish("/blinked", message.data)
+
+    return robot
+
+
+@asynccontextmanager
+async def showing_market(place: Place, front: Any) -> AsyncIterator[str]:
+    async with AsyncExitStack() as stack:
+        enter = stack.enter_async_context
+        view = await enter(front())
+        network, channel = await enter(watching(place.settings("viewer")))
+        server = await enter(FoxgloveServer(view, "market", view.drops))
+        tasks = await enter(Background())
+        tasks.start(show_market(server, network.session, channel), "market")
+        yield view.url
+
+
+async def test_the_market_is_seen_as_a_stream(place: Place, front: Any) -> None:
+    robot = blinking(place)
+    async with showing_market(place, front) as url, viewing(url) as viewer, place.at_work(robot) as person:
+        path = place.save(objective(("/blink", "on")))
+        contract = await person.demand(path, model=MODEL, cost=COST)
+        await contract.outcome()
+        (demand, *_) = await viewer.until_seen("/market/demand")
+        assert (demand["signer"], demand["cost"]) == (person.address, str(COST))
+        (result, *_) = await viewer.until_seen("/market/result")
+        assert result["liability"] == contract.address
+        await until(lambda: "complete" in {job["event"] for job in viewer.values("/market/job")})
+        robot.publish("/battery", 0.5)
+        await viewer.until_seen(f"/{robot.address.lower()}/battery")
+        await until(lambda: any(counts["reading"] for counts in viewer.values("/aira/counts")))
+        lines = [line["message"] for line in viewer.values("/aira/log")]
+        assert any(str(contract.address) in line for line in lines)
+
+
+async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, front: Any) -> None:
+    robot = blinking(place)
+    async with AsyncExitStack() as stack:
+        enter = stack.enter_async_context
+        view = await enter(front())
+        network, channel = await enter(watching(place.settings("viewer")))
+        server = await enter(FoxgloveServer(view, "agent", view.drops))
+        person = await enter(place.at_work(robot))
+        tasks = await enter(Background())
+        shown = show_agent(server, network.session, robot.address, channel.lighthouse, drops=view.drops)
+        tasks.start(shown, "agent")
+        viewer = await enter(viewing(view.url))
+        (status, *_) = await viewer.until_seen("/aira/status")
+        assert status["address"] == robot.address
+        robot.publish("/battery", 0.5)
+        assert (await viewer.until_seen("/reading/battery"))[0].data == 0.5
+        key = str(DeviceTopicKey(robot.address, "arm", "/angle"))
+        robot.parts.network.session.put(key, b'{"degrees": 3}', encoding="application/json")
+        assert await viewer.until_seen("/device/arm/angle") == [{"degrees": 3}]
+        contract = await person.demand(place.save(objective(("/blink", "on"))), model=MODEL, cost=COST)
+        await contract.outcome()
+        assert (await viewer.until_seen("/job/blinked"))[0].data == "on"
+        await until(lambda: "complete" in {job["event"] for job in viewer.values("/aira/job")})
+        await until(lambda: viewer.values("/aira/log"))
+
+
+async def test_a_job_is_seen_live_and_then_played_from_its_recording(place: Place, front: Any) -> None:
+    robot, released = offering(place.agent("robot")), asyncio.Event()
+
+    @robot.on("/blink")
+    async def blink(job: Job, message: String) -> None:
+        await released.wait()
+        job.publish("/blinked", message.data)
+
+    async def show(parts: Any, view: Any, address: str) -> None:
+        await show_recording(parts, view, await show_job_until_end(parts, view, address))
+
+    async with AsyncExitStack() as stack:
+        enter = stack.enter_async_context
+        view = await enter(front())
+        parts = await enter(opened(place.settings("viewer"), chain=place.chains["provider"]))
+        person = await enter(place.at_work(robot))
+        held = place.save(objective(*(("/blink", f"{number}") for number in range(100))))
+        contract = await person.demand(held, model=MODEL, cost=COST)
+        tasks = await enter(Background())
+        tasks.start(show(parts, view, contract.address), "job")
+        await until(lambda: view.inner is not None)
+        live = view.inner
+        async with viewing(view.url) as viewer:
+            assert viewer.info["capabilities"] == []
+            released.set()
+            await until(lambda: any(message.data == "99" for message in viewer.values("/blinked")))
+            assert (await viewer.until_seen("/aira/progress"))[0]["total"] == 100
+        assert (await contract.outcome()).success
+        await until(lambda: view.inner not in (None, live), what="the playback")
+        async with viewing(view.url) as viewer:
+            assert "playbackControl" in viewer.info["capabilities"]
+            await viewer.control(PLAY, request="play", speed=10)
+            played = [message.data for message in await viewer.until_seen("/blink", 100)]
+            assert sorted(set(played), key=int) == [f"{number}" for number in range(100)]
+            assert {message.data for message in await viewer.until_seen("/blinked", 100)} == set(played)
+
+
+async def test_a_job_without_a_recording_is_told(place: Place, front: Any) -> None:
+    async with front() as view, opened(place.settings("viewer"), chain=place.chains["provider"]) as parts:
+
+        class Ended:
+            result, address = "", place.address("robot")
+
+        ended: Any = Ended()
+        with pytest.raises(NoRecording):
+            await show_recording(parts, view, ended)
