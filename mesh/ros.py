@@ -85,7 +85,7 @@ class RosTypes:
         except KeyError:
             raise UnknownRosType(name, "there is no such type") from None
 
-    def message(self, name: str, **fields: Any) -> Payload:
+    def message(self, name: str, /, **fields: Any) -> Payload:
         """A message of a type, encoded: a dict is a message in it, and a field that is not given is zero or empty.
 
         Raises `UnknownRosType`, `InvalidPayload`.

@@ -60,6 +60,8 @@ def parse_qos(text: str) -> RosQos:
         raise InvalidRosToken(text, "its quality of service is not as in 1:2:1,10:,:,:,,")
     if not all(_FIELD.fullmatch(field) for part in parts for field in part):
         raise InvalidRosToken(text, "its quality of service has a field that is no number")
+    if parts[5][0] == "2":
+        raise InvalidRosToken(text, "it has a kind of liveliness that ROS 2 has given up")
     (reliability,), (durability,), (history, depth) = parts[:3]
     return RosQos(
         int(depth or _DEFAULT_DEPTH),

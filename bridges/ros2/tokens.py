@@ -32,6 +32,7 @@ _HASH: Final = re.compile(r"[A-Za-z0-9_]{1,128}")
 _NO_TYPE: Final = ("EMPTY_TOPIC_TYPE", "EMPTY_TOPIC_HASH")
 _NODE_PARTS: Final = 9
 _ENDPOINT_PARTS: Final = 13
+"""Newer systems add parts to those of an endpoint, such as the kinds of memory in which it takes messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,8 @@ def _parse(token: str) -> RosEntity:
         raise InvalidRosToken(token, f"it has more than {LONGEST_TOKEN} characters")
     parts = token.split("/")
     kind = cast("RosEntityKind | None", _CODES.get(parts[5])) if len(parts) >= _NODE_PARTS else None
-    if kind is None or parts[0] != PREFIX or len(parts) != (_NODE_PARTS if kind == "node" else _ENDPOINT_PARTS):
+    complete = len(parts) == _NODE_PARTS if kind == "node" else len(parts) >= _ENDPOINT_PARTS
+    if kind is None or parts[0] != PREFIX or not complete:
         raise InvalidRosToken(token, "it has not the parts of a node or endpoint")
     domain, session, node_id, identity = parts[1:5]
     if not all(_NUMBER.fullmatch(number) for number in (domain, node_id, identity)) or not _SESSION.fullmatch(session):
@@ -113,7 +115,7 @@ def _parse(token: str) -> RosEntity:
     entity = RosEntity(
         kind, check_domain(int(domain)), session, int(node_id), int(identity), check_node(parts[8]), namespace, enclave
     )
-    return entity if kind == "node" else _endpoint(token, entity, *parts[9:])
+    return entity if kind == "node" else _endpoint(token, entity, *parts[_NODE_PARTS:_ENDPOINT_PARTS])
 
 
 def _endpoint(token: str, node: RosEntity, name: str, kind: str, type_hash: str, qos: str) -> RosEntity:

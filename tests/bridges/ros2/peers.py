@@ -93,8 +93,9 @@ class RosPeer:
                 return lines
 
 
-def hiroz(role: str, endpoint: str, *, distribution: str = "jazzy", **options: object) -> RosPeer:
-    """The Rust peer in a role, connected to a router."""
+def hiroz(role: str, endpoint: str, **options: object) -> RosPeer:
+    """The Rust peer of a `distribution` in a role, connected to a router."""
+    distribution = options.pop("distribution", "jazzy")
     words = [f"{key}={value}" for key, value in {"connect": endpoint, **options}.items()]
     return RosPeer([require(f"ros2-{distribution}"), role, *words])
 

@@ -39,14 +39,14 @@ async def test_messages_of_a_peer_are_heard_with_number_time_and_sender(
     assert {len(message.gid) for message in heard} == {16}
     assert len({message.gid for message in heard}) == 1
     assert heard[0].payload.type.schema_name == STRING
-    assert b"string data" in heard[0].payload.type.schema
+    assert b"string data" in heard[0].payload.type.schema_data
 
 
 @PEERS
 async def test_a_peer_hears_our_messages(
     peer: Callable[..., RosPeer], router: EmbeddedRouter, our_robot: OurRobot
 ) -> None:
-    async with peer("listener", router.endpoint) as listener, our_robot() as robot:
+    async with peer("listener", router.endpoint, depth=100) as listener, our_robot() as robot:
         await robot.ready("/chatter")
         robot.advertise("/chatter", STRING)
         for number in range(50):
@@ -127,7 +127,7 @@ async def test_a_peer_sees_our_node_and_its_topics_until_we_go(router: EmbeddedR
     async with hiroz("graph", router.endpoint) as graph:
         async with our_robot(node="ours", namespace="/mesh") as robot:
             robot.advertise("/cmd_vel", "geometry_msgs/msg/Twist")
-            seen = await _graph(graph, lambda seen: ["/cmd_vel", "geometry_msgs/msg/Twist"] in seen["topics"])
+            seen = await _graph(graph, lambda seen: ["/cmd_vel", "geometry_msgs::msg::dds_::Twist_"] in seen["topics"])
             assert ["ours", "/mesh"] in seen["nodes"]
         await _graph(graph, lambda seen: ["ours", "/mesh"] not in seen["nodes"])
     async with our_robot() as robot:

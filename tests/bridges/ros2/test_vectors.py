@@ -15,7 +15,7 @@ from bridges.ros2.tokens import RmwZenoh
 from tests.bridges.ros2.definitions import ros_types
 from tests.bridges.ros2.peers import VECTORS
 
-RECORDED = {file.stem: json.loads(file.read_text()) for file in sorted(VECTORS.glob("*.json"))}
+RECORDED = {file.stem: json.loads(file.read_text()) for file in sorted(VECTORS.glob("*-*.json"))}
 DISTRIBUTIONS = {name: "humble" if "humble" in name else "jazzy" for name in RECORDED}
 SENT = [
     pytest.param(name, what, sent, id=f"{name}-{what}-{number}")
@@ -23,6 +23,8 @@ SENT = [
     for what in ("samples", "requests", "replies")
     for number, sent in enumerate(vectors[what])
 ]
+WRONG_HASHES = {"action_msgs/srv/CancelGoal": "RIHS01_022cb8eb7bbae4dedde27098187e94f435faa23942695d7fbc7335182d10baf1"}
+"""Of hiroz 0.2.1. ROS 2 itself has RIHS01_573d8b0a… for that service."""
 TOKENS = [pytest.param(name, token, id=token[-90:]) for name, it in RECORDED.items() for token in it["tokens"]]
 
 
@@ -45,7 +47,7 @@ def test_tokens_are_read_and_written_alike(name: str, token: str) -> None:
     rmw = RmwZenoh(0)
     entity = rmw.parse(token)
     written = rmw.token(entity).split("/")
-    read = token.split("/")
+    read = token.removesuffix("/backends:cpu:").split("/")
     if entity.kind != "node":
         # Values that a reader takes as given are left out by others, and written by us.
         assert parse_qos(written.pop()) == parse_qos(read.pop())
@@ -56,7 +58,7 @@ def test_tokens_are_read_and_written_alike(name: str, token: str) -> None:
 @pytest.mark.parametrize(("name", "token"), TOKENS)
 def test_hashes_of_types_are_those_that_others_compute(name: str, token: str) -> None:
     entity: RosEntity = RmwZenoh(0).parse(token)
-    if entity.type:
+    if entity.type and entity.type_hash != WRONG_HASHES.get(entity.type):
         assert ros_types(DISTRIBUTIONS[name]).type_hash(entity.type) == entity.type_hash
 
 

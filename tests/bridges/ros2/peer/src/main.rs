@@ -67,11 +67,22 @@ fn ready() {
 }
 
 #[tokio::main]
-async fn main() -> Result<()> {
+async fn main() {
+    let ended = run().await;
+    if let Err(error) = &ended {
+        eprintln!("{error}");
+    }
+    // A return would wait for the thread that reads the input.
+    std::process::exit(ended.is_err().into());
+}
+
+async fn run() -> Result<()> {
     let mut words = std::env::args().skip(1);
     let role = words.next().expect("a role");
     let options = Options(
-        words.map(|word| word.split_once('=').map(|(key, value)| (key.into(), value.into())).expect("key=value")).collect(),
+        words
+            .map(|word| word.split_once('=').map(|(key, value)| (key.into(), value.into())).expect("key=value"))
+            .collect(),
     );
     let context = ZContextBuilder::default()
         .with_mode("client")
@@ -79,10 +90,7 @@ async fn main() -> Result<()> {
         .with_domain_id(options.number("domain", 0) as usize)
         .build()?;
     let node = Arc::new(
-        context
-            .create_node(options.text("node", "peer"))
-            .with_namespace(options.text("namespace", ""))
-            .build()?,
+        context.create_node(options.text("node", "peer")).with_namespace(options.text("namespace", "")).build()?,
     );
     tokio::select! {
         done = play(&role, &context, &node, &options) => done,
