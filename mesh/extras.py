@@ -1,14 +1,18 @@
-"""The extras of aira-mesh: optional packages, and the error for one that is not installed."""
+"""The extras of aira-mesh: importing optional packages, and the error for one that is not installed."""
 
 from __future__ import annotations
 
+import sys
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+RECURSION_LIMIT: Final = 3_000
+"""Frames: safe on a stack of 2 MB (measured; 6,000 is not), and enough for contracts that call 200 deep."""
 
 
 class PackageMissing(ConfigurationError, ModuleNotFoundError, code="package-missing"):
@@ -26,7 +30,9 @@ class PackageMissing(ConfigurationError, ModuleNotFoundError, code="package-miss
 def needs_extra(extra: str, user: str) -> Iterator[None]:
     """Raise `PackageMissing` if an import in the body fails. `user` is what needs the package, as in "the chain".
 
-    Of nested ones the outermost names the extra.
+    Of nested ones the outermost names the extra. Afterwards the interpreter's recursion limit is `RECURSION_LIMIT` at
+    most: py_ecc raises it to 100,000, py-evm to 12,288, and then deeply nested JSON overflows the stack of a thread
+    before it is refused, so that a single message could end the process.
     """
     try:
         yield
@@ -37,3 +43,5 @@ def needs_extra(extra: str, user: str) -> Iterator[None]:
         if package in ("", "mesh", "bridges", "schemas"):
             raise
         raise PackageMissing(package, extra=extra, user=user) from error
+    finally:
+        sys.setrecursionlimit(min(sys.getrecursionlimit(), RECURSION_LIMIT))

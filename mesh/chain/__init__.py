@@ -6,9 +6,6 @@ imports it where it is needed.
 
 from __future__ import annotations
 
-import sys
-from typing import Final
-
 from mesh.extras import needs_extra
 
 with needs_extra("chain", "the chain"):
@@ -64,19 +61,3 @@ with needs_extra("chain", "the chain"):
     from mesh.chain.policy import GWEI, FeePolicy, Timing
     from mesh.chain.tokens import Token
     from mesh.chain.transactions import TransactionSender
-
-RECURSION_LIMIT: Final = 3_000
-"""Frames: safe on a stack of 2 MB (measured; 6,000 is not), and enough for contracts that call 200 deep."""
-
-
-def restrain_recursion() -> None:
-    """Lower the interpreter's recursion limit where it is above `RECURSION_LIMIT`.
-
-    py_ecc, which the Ethereum libraries import, raises it to 100,000. Deeply nested JSON then overflows the C stack
-    before it is refused, so a single message could end the process. At 12,288, which py-evm sets, it still does in
-    threads with a stack of 2 MB, such as Zenoh's. Called after the imports that raise it.
-    """
-    sys.setrecursionlimit(min(sys.getrecursionlimit(), RECURSION_LIMIT))
-
-
-restrain_recursion()

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from coincurve import PrivateKey
 
 from mesh.errors import ConfigurationError, InputError
+from mesh.extras import needs_extra
 from schemas.address import keccak256, parse_address
 from schemas.signing import Signer
 
@@ -143,7 +144,8 @@ def write_keyfile(path: Path | str, private_key: bytes, password: str) -> str:
     Takes most of a second. Raises `KeyfileError` when the file exists or can't be written, `InputError` for an
     invalid `private_key`.
     """
-    from eth_keyfile.keyfile import create_keyfile_json  # takes half a second
+    with needs_extra("chain", "keyfiles"):  # takes half a second
+        from eth_keyfile.keyfile import create_keyfile_json
 
     address = Account(private_key).address
     content = create_keyfile_json(private_key, password.encode())
@@ -180,7 +182,8 @@ def keyfile_address(keyfile: Path | str) -> str | None:
 
 def _open_keyfile(keyfile: Path, password: bytes, *, password_from: object) -> bytes:
     """The private key in a keyfile. Raises `KeyfileError`, `WrongPassword`."""
-    from eth_keyfile.keyfile import decode_keyfile_json  # takes half a second
+    with needs_extra("chain", "keyfiles"):  # takes half a second
+        from eth_keyfile.keyfile import decode_keyfile_json
 
     content = _read_keyfile(keyfile)
     version = next((value for name, value in content.items() if name.lower() == "version"), None)

@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from mesh.chain import restrain_recursion
 from mesh.devchain.jsonrpc import CHANGES, LIMIT_EXCEEDED, RUNS, RpcError
 from mesh.devchain.rpc_server import JsonRpcServer
 from mesh.errors import ClosedError
@@ -106,7 +105,6 @@ class EmbeddedChain:
         with needs_extra("demo", "the embedded chain"):
             from mesh.devchain.evm import Evm
             from mesh.devchain.methods import Methods
-        restrain_recursion()
         evm = Evm(run_seconds=self._run_seconds, max_logs=self._max_logs)
         self._funded_keys = evm.funded_keys
         self._methods = Methods(evm)

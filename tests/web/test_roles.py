@@ -131,7 +131,7 @@ def test_a_provider_creates_a_lighthouse_stakes_and_withdraws(browser: Browser, 
     browser.type("XRT", "2")
     browser.click("#stake")
     browser.sees("The stake is in the lighthouse")
-    own = f"//tr[.//*[@title='{browser.wallet.address}']]"
+    own = f"//*[@aria-label='Providers']//tr[.//*[@title='{browser.wallet.address}']]"
     browser.until(lambda: "2 XRT" in browser.driver.find_element("xpath", own).text, "the stake in the list")
     browser.click("#unstake")
     browser.sees("The stake is back in your account")
