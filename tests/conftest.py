@@ -21,12 +21,12 @@ ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """One EVM and one router by default, and one value of each parameter that is marked `sample`; all of them in CI."""
+    """Everything in CI; by default one EVM and one router, no `full` tests, and one value of `sample` parameters."""
     if IN_CI:
         return
     groups: dict[tuple[object, ...], list[pytest.Item]] = {}
     for item in items:
-        if not _is_alternative(item):
+        if not _is_alternative(item) and item.get_closest_marker("full") is None:
             groups.setdefault(_without_samples(item), []).append(item)
     sampled_before: Counter[object] = Counter()
     kept = set[pytest.Item]()

@@ -28,6 +28,7 @@ def test_stakes_can_be_withdrawn(market: Market) -> None:
     assert suite.balance(turns.lighthouse) == 0
 
 
+@pytest.mark.sample("leaver", "passed")
 @pytest.mark.parametrize("leaver", [0, 1, 2])
 @pytest.mark.parametrize("passed", [0, 1, 2])
 def test_a_lighthouse_goes_on_when_a_provider_leaves(market: Market, leaver: int, passed: int) -> None:
@@ -54,6 +55,7 @@ def test_a_lighthouse_goes_on_when_a_provider_leaves(market: Market, leaver: int
     assert set(seen) == set(people)
 
 
+@pytest.mark.sample("passed")
 @pytest.mark.parametrize("passed", [0, 1, 2])
 def test_a_new_provider_waits_until_each_of_the_others_has_had_a_turn(market: Market, passed: int) -> None:
     turns = Round(market, [1, 1, 1])
@@ -68,6 +70,7 @@ def test_a_new_provider_waits_until_each_of_the_others_has_had_a_turn(market: Ma
         turns.send(person)
 
 
+@pytest.mark.sample("leaver", "passed")
 @pytest.mark.parametrize("leaver", [0, 1, 2, 3])
 @pytest.mark.parametrize("passed", [0, 1, 2, 3])
 def test_no_provider_skips_the_queue_when_another_leaves(market: Market, leaver: int, passed: int) -> None:

@@ -88,6 +88,7 @@ def test_a_demand_makes_the_lamp_blink_and_is_paid(protocol: str, market: dict[s
     assert commands == [b""]
 
 
+@pytest.mark.full
 def test_a_ros_bag_makes_the_lamp_blink_as_well(market: dict[str, str], tmp_path: Path) -> None:
     bag, out = tmp_path / "blue.bag", tmp_path / "result.mcap"
     bag.write_bytes(Bag([BagMessage("/blink", string("blue"), 0)], compression="bz2").encode())
@@ -98,6 +99,7 @@ def test_a_ros_bag_makes_the_lamp_blink_as_well(market: dict[str, str], tmp_path
     assert [text for text, _ in said_on(out, "/led")] == ["blue on", "blue off"] * 3
 
 
+@pytest.mark.full
 @pytest.mark.sample("protocol")
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_the_argument_chooses_the_lamp(protocol: str, market: dict[str, str], tmp_path: Path) -> None:

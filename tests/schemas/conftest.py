@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.support.ci import EXAMPLES
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-settings.register_profile("schemas", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("schemas", max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("schemas")
 
 

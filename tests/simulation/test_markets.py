@@ -6,6 +6,8 @@ import json
 from itertools import count
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.simulation.deployment import EVM_EVERY, ON_EVM, ON_MODEL, Deployments, MarketPlan, market_plan
 from tests.simulation.test_simulation import simulate
 
@@ -41,6 +43,7 @@ def test_a_history_is_the_same_alone_and_beside_another() -> None:
     assert beside["trace"] == alone["trace"]
 
 
+@pytest.mark.full
 def test_a_long_history_ends_too(tmp_path: Path) -> None:
     """It has blocks each 12 s, and perhaps more people, long pauses and long jobs."""
     summary = tmp_path / "summary.json"

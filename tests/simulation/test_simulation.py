@@ -68,6 +68,7 @@ def test_a_planted_bug_is_found() -> None:
     assert "1 of 1 planted bugs found" in ended.stdout
 
 
+@pytest.mark.full
 def test_faults_of_each_kind_happen() -> None:
     """Which of them a seed draws changes with the code, so it takes a few."""
     happened = set[str]()

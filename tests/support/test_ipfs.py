@@ -95,6 +95,7 @@ async def test_a_library_node_and_a_js_daemon_are_in_one_swarm_and_hear_each_oth
     assert library.swarm_address.startswith("/ip4/127.0.0.1/tcp/")
 
 
+@pytest.mark.full
 def test_a_killed_js_daemon_starts_again_as_the_same_node() -> None:
     with JsIpfs() as daemon:
         before = daemon.peer_id

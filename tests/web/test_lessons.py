@@ -66,6 +66,7 @@ def recorded(browser: Browser) -> str:
     return "\n".join(topic.text for topic in browser.all(".topic"))
 
 
+@pytest.mark.full
 def test_hello_blink_colours_and_sensor(lesson: Browser, market: dict[str, str]) -> None:
     """One market for all four lessons, one robot after the other."""
     hello = EXAMPLES / "hello_mesh"

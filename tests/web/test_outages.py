@@ -76,6 +76,7 @@ def fragile(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fragile]:
         yield Fragile(Site(url, model, "", node.url, keys["person"], variables, folder), node, router, robot)
 
 
+@pytest.mark.full
 def test_a_job_goes_on_when_router_and_node_come_back(fragile: Fragile) -> None:
     with Browser(fragile.site.url, fragile.site.wallet()) as browser:
         order(browser, fragile.site, seconds=10)
@@ -105,6 +106,7 @@ def test_an_owner_is_alerted_when_a_robot_does_not_answer(fragile: Fragile) -> N
         browser.until(lambda: browser.all("td .dot.good") and "No answer:" not in browser.text(), "the robot's health")
 
 
+@pytest.mark.sample("account")
 @pytest.mark.parametrize("account", ["wallet", "local"])
 def test_the_price_of_a_job_that_nobody_finishes_is_taken_back(fragile: Fragile, account: str) -> None:
     site = fragile.site

@@ -6,6 +6,8 @@ import secrets
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.web.browser import Browser
 from tests.web.steps import facts, fill_in, order, sign
 
@@ -117,6 +119,7 @@ def test_an_allowance_that_the_wallet_refuses_can_be_given_later(site: Site) -> 
         browser.find("#hash")
 
 
+@pytest.mark.full
 def test_a_provider_creates_a_lighthouse_stakes_and_withdraws(browser: Browser, site: Site) -> None:
     browser.go()
     browser.connect()

@@ -46,6 +46,7 @@ async def mesh(router: EmbeddedRouter, topic: str) -> AsyncIterator[Mesh]:
         yield mesh
 
 
+@pytest.mark.full
 async def test_no_accepted_message_is_lost_by_outages_of_the_daemon(
     own_daemon: JsIpfs | Kubo,
     swarm: Swarm,
@@ -88,6 +89,7 @@ async def test_no_accepted_message_is_lost_by_outages_of_the_daemon(
     assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 3
 
 
+@pytest.mark.full
 async def test_a_frozen_daemon_is_detected_and_used_again_afterwards(
     own_daemon: JsIpfs | Kubo,
     swarm: Swarm,
@@ -180,6 +182,7 @@ async def test_a_restarted_bridge_sends_what_waited_and_nothing_twice(
     assert bob.heard == [legacy_json(order) for order in (known, waited, last)]
 
 
+@pytest.mark.full
 async def test_another_bridge_takes_over_when_the_active_one_loses_its_daemon(
     own_daemon: JsIpfs | Kubo,
     swarm: Swarm,

@@ -4,5 +4,7 @@ from __future__ import annotations
 
 from hypothesis import HealthCheck, settings
 
-settings.register_profile("serial", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+from tests.support.ci import EXAMPLES
+
+settings.register_profile("serial", max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("serial")

@@ -37,6 +37,7 @@ def speed(baud: int) -> tuple[str, ...]:
     return (f"BAUD={baud}",)
 
 
+@pytest.mark.sample("sketch", "protocol", "baud")
 @pytest.mark.parametrize(
     ("sketch", "protocol", "baud"),
     [

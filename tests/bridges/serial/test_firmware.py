@@ -207,6 +207,7 @@ def test_a_rosserial_board_that_was_reset_is_found_again() -> None:
         assert client.call("/hear", String("again").encode()).status is CallStatus.READ
 
 
+@pytest.mark.full
 def test_a_damaged_message_of_a_rosserial_board_is_never_accepted() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as client:
         uno.add_noise(0.01, seed=5)

@@ -84,6 +84,7 @@ def recorded(recording: Path, topic: str) -> list[Any]:
     return [decode_value(message.payload, message.type) for message in messages if message.topic == topic]
 
 
+@pytest.mark.sample("reset", "in_doubt", "success", "flashing")
 @pytest.mark.parametrize(
     ("reset", "in_doubt", "success", "flashing"),
     [(False, "fail", True, 1), (True, "fail", False, 1), (True, "again", True, 2)],

@@ -61,6 +61,7 @@ def counting(robot: Agent) -> list[Verified[Demand]]:
     return handled
 
 
+@pytest.mark.sample("cost")
 @pytest.mark.parametrize("cost", [1, 0])
 async def test_an_honest_demand_is_offered_during_a_flood_of_dead_objectives(place: Place, cost: int) -> None:
     robot = offering(place.agent("robot", fetch_timeout=60.0))

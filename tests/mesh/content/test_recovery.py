@@ -122,6 +122,7 @@ def test_a_put_killed_at_any_step_leaves_a_consistent_store(tmp_path: Path) -> N
         assert store.pins() == {put: {"job"}}
 
 
+@pytest.mark.full
 def test_eviction_and_removal_killed_at_any_step_leave_a_consistent_store(tmp_path: Path) -> None:
     with Store(tmp_path, quota=QUOTA) as store:
         pinned = store.put_bytes(bytes(1_000_000), pin="job")

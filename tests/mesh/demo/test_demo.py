@@ -180,6 +180,7 @@ def test_the_default_objective_has_the_same_bytes_each_time(tmp_path: Path) -> N
     assert open_objective(tmp_path / "one").count == 3
 
 
+@pytest.mark.sample("moment")
 @pytest.mark.parametrize("moment", ["router", "contracts", "objective", "match", "running", "complete"])
 def test_ctrl_c_ends_it_at_any_moment(moment: str, tmp_path: Path) -> None:
     variables = {"TMPDIR": str(tmp_path)}

@@ -98,6 +98,7 @@ async def test_an_unfit_objective_ends_it_before_anything_is_opened(tmp_path: Pa
     assert recorder.events == []
 
 
+@pytest.mark.sample("seconds")
 @pytest.mark.parametrize("seconds", [0.0, 0.4, 0.8, 1.3, 1.8])
 def test_ctrl_c_leaves_no_process_no_folder_and_no_traceback(seconds: float, tmp_path: Path) -> None:
     pipe, variables = subprocess.PIPE, environment({"TMPDIR": str(tmp_path)})

@@ -77,6 +77,7 @@ def test_messages_are_printed_without_control_characters(tmp_path: Path) -> None
     assert colours[0] == "red"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("form", [(), ("--json",)])
 def test_a_demo_goes_on_after_its_reader_closed_stdout(form: tuple[str, ...]) -> None:
     """As with `aira demo | head`: no traceback, no hanging."""

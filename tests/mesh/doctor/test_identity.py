@@ -36,6 +36,7 @@ async def test_a_member_of_a_site_is_admitted_and_denied_forbidden_writes(site: 
     assert MARKET in found.one("denied write").message
 
 
+@pytest.mark.sample("role")
 @pytest.mark.parametrize("role", ["agent", "person", "provider", "operator", "bridge", "watcher"])
 async def test_every_role_passes_with_its_rights(site: Site, role: Role) -> None:
     folder = site.enlist(Member(name="somebody", address=ARM, roles=(role,)))

@@ -76,6 +76,7 @@ async def person(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path) -> Person
     return Person(site)
 
 
+@pytest.mark.full
 async def test_run_again_without_a_terminal_it_says_what_can_be_chosen(person: Person) -> None:
     killed = await person.killed()
     again = await asyncio.to_thread(aira, *person.words(), **person.site.variables("person"))
@@ -86,6 +87,7 @@ async def test_run_again_without_a_terminal_it_says_what_can_be_chosen(person: P
     assert await person.orders() == [(killed, "open")]
 
 
+@pytest.mark.full
 async def test_run_again_it_can_wait_for_the_killed_demand(person: Person) -> None:
     killed = await person.killed()
     done: list[str] = []
@@ -117,6 +119,7 @@ async def test_run_again_it_can_withdraw_the_killed_demand(person: Person) -> No
     assert demand_hash.hex() != killed
 
 
+@pytest.mark.full
 async def test_run_again_it_can_post_another_demand_with_allowance_for_both(person: Person) -> None:
     killed = await person.killed()
     done: list[str] = []
@@ -136,6 +139,7 @@ async def test_run_again_it_can_post_another_demand_with_allowance_for_both(pers
     assert killed in hashes
 
 
+@pytest.mark.full
 async def test_run_again_it_can_wait_for_the_contract_of_the_killed_demand(person: Person) -> None:
     """It was killed after the match: a second demand would pay for the work twice."""
     may_work = asyncio.Event()

@@ -60,6 +60,7 @@ def hand_over(folder: Path, key: bytes) -> None:
     write_keyfile(folder / "account.json", key, "secret")
 
 
+@pytest.mark.sample("program", "role")
 @pytest.mark.parametrize(
     ("program", "role"),
     [(PROVIDER, "provider"), (AGENT, "agent")],

@@ -52,6 +52,7 @@ def outages(caplog: pytest.LogCaptureFixture) -> int:
     return sum(getattr(record, "event", "") == "chain-outage" for record in caplog.records)
 
 
+@pytest.mark.sample("end")
 @pytest.mark.parametrize("end", ["stop", "kill"])
 async def test_jobs_from_before_and_after_an_outage_of_the_node_are_done(
     router: EmbeddedRouter, tmp_path: Path, end: str, caplog: pytest.LogCaptureFixture

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 from mesh.agent import Phase
 from tests.mesh.operations.site import FEE, Site, has_event, has_traceback
 from tests.support.log_events import logged_facts
@@ -12,8 +14,6 @@ from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    import pytest
 
     from mesh.agent import Agent
     from mesh.chain import Chain
@@ -85,6 +85,7 @@ async def test_a_reverted_contract_is_created_again_and_its_job_paid_once(
         assert not has_traceback(provider)
 
 
+@pytest.mark.full
 async def test_orders_are_sent_again_only_with_their_allowance_when_a_reorganisation_reverted_it(
     anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -51,6 +51,7 @@ async def site(served: ServedChain, router: EmbeddedRouter, tmp_path: Path) -> S
     return site
 
 
+@pytest.mark.full
 async def test_providers_share_jobs_and_take_over_and_each_job_is_done_once(served: ServedChain, site: Site) -> None:
     done: list[str] = []
     async with site.chain("person") as chain, asyncio.timeout(2 * TIMEOUT):

@@ -70,6 +70,7 @@ def test_mutated_files_are_read_or_refused_within_time_and_memory(tmp_path: Path
         assert len(detail.splitlines()) == 1
 
 
+@pytest.mark.sample("bomb", "reason")
 @pytest.mark.parametrize(("bomb", "reason"), BOMBS.items(), ids=lambda item: getattr(item, "__name__", ""))
 def test_bombs_are_refused_within_time_and_memory(tmp_path: Path, bomb: Callable[[], bytes], reason: str) -> None:
     content = bomb()
@@ -92,6 +93,7 @@ def test_no_opcode_of_the_format_is_private() -> None:
 LIMITS = Limits(size=1 << 20, expanded=4 << 20, record=1 << 20, window=2 << 20, definitions=1 << 20)
 
 
+@pytest.mark.sample("name")
 @pytest.mark.parametrize("name", list(FILES))
 def test_a_mutated_file_is_read_or_refused_within_bounded_memory(tmp_path: Path, name: str) -> None:
     dice = random.Random(name)
