@@ -190,7 +190,7 @@ def test_ctrl_c_ends_it_at_any_moment(moment: str, tmp_path: Path) -> None:
     assert interrupted.seconds < SOON
 
 
-@pytest.mark.parametrize("module", ["click", "asyncio", "msgspec", "web3"])
+@pytest.mark.parametrize("module", ["click", "asyncio", "msgspec", "aiohttp"])
 def test_ctrl_c_ends_it_before_it_prints_anything(module: str) -> None:
     interrupted = Interrupted("demo", "--json", loads=module)
     assert (interrupted.code, interrupted.output) == (130, "")
