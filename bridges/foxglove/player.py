@@ -72,6 +72,12 @@ class PlaybackHead:
                 self.status = PlaybackStatus.Playing if plays else PlaybackStatus.Paused
             return self._state(did_seek=to is not None, request=request.request_id)
 
+    def go_on(self, seeks: int, at_ns: int) -> None:
+        """Reading up to there took time that does not count, unless the position has jumped again."""
+        with self._lock:
+            if seeks == self.seeks:
+                self._at, self._since = at_ns, self._clock()
+
     def end(self, seeks: int) -> PlaybackState | None:
         """All messages are played, after so many jumps; None if there was another one."""
         with self._lock:
@@ -86,7 +92,7 @@ class PlaybackHead:
         return min(self.end_ns, self._at + int((self._clock() - self._since) * self.speed))
 
     def _state(self, *, did_seek: bool, request: str | None) -> PlaybackState:
-        return PlaybackState(self.status, self._now(), self.speed, did_seek, request)
+        return PlaybackState(self.status, self._at, self.speed, did_seek, request)
 
 
 class RecordingPlayer:
@@ -114,8 +120,9 @@ class RecordingPlayer:
         """Play until cancelled. Raises `CorruptRecording` if the file has changed."""
         server.announce((topic, kind) for (topic, _, _), kind in self._types.items())
         while True:
-            seeks = self.head.seeks
-            index = await self._show_moment(server, self.head.now_ns)
+            seeks, at_ns = self.head.seeks, self.head.now_ns
+            index = await self._show_moment(server, at_ns)
+            self.head.go_on(seeks, at_ns)
             await self._play(server, index, seeks)
 
     async def _show_moment(self, server: FoxgloveServer, at_ns: int) -> int:

@@ -8,7 +8,7 @@ import base64
 import json
 import struct
 from collections.abc import Callable  # noqa: TC003 - a dataclass reads it
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -86,6 +86,10 @@ class Viewer:
 
     async def read(self) -> None:
         """Take what comes, until the connection ends."""
+        with suppress(websockets.ConnectionClosed):
+            await self._read()
+
+    async def _read(self) -> None:
         async for frame in self.socket:
             if isinstance(frame, str):
                 await self._text(json.loads(frame))

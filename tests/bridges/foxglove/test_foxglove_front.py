@@ -1,0 +1,181 @@
+"""Who may connect, and what a slow or hostile client can't do."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import ssl
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import websockets
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridges.foxglove import front as front_module
+from bridges.foxglove.errors import ClientRefused
+from bridges.foxglove.front import CLIENTS
+from bridges.foxglove.handshake import LONGEST_FRAME, FrameGuard, Upgrade
+from bridges.foxglove.options import FoxgloveOptions
+from bridges.web.errors import NotOpenToOthers
+from schemas.payloads import RAW, encode_value
+from tests.bridges.foxglove.viewer import viewing
+from tests.support.sites import Site
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+TOKEN = "a token of the tests"
+VIEW = "0x" + "05" * 20
+
+
+async def refusal(url: str, **options: Any) -> int:
+    """The status with which a client is refused."""
+    with pytest.raises(websockets.InvalidStatus) as caught:
+        async with viewing(url, **options):
+            pass
+    return caught.value.response.status_code
+
+
+async def test_a_page_of_another_site_may_not_connect(serve: Any) -> None:
+    async with serve(origins=("https://viewer.example",)) as server:
+        url = server.front.url
+        assert await refusal(url, origin="https://evil.example") == 403
+        assert await refusal(url, origin="null") == 403
+        for origin in (None, "https://app.foxglove.dev", "https://viewer.example"):
+            async with viewing(url, origin=origin) as viewer:
+                assert viewer.info["name"] == "test"
+        assert server.front.drops.totals() == {"foxglove-refused": 2}
+
+
+async def test_the_token_opens_the_view(serve: Any) -> None:
+    async with serve(token=TOKEN) as server:
+        url = server.front.url
+        assert await refusal(url) == 401
+        assert await refusal(f"{url}?token=another+token+of+a+test") == 401
+        async with viewing(f"{url}?token={TOKEN.replace(' ', '+')}") as viewer:
+            assert viewer.info["name"] == "test"
+        async with viewing(url, additional_headers={"Authorization": f"Bearer {TOKEN}"}) as viewer:
+            assert viewer.info["name"] == "test"
+
+
+async def test_the_newer_subprotocol_is_served(serve: Any) -> None:
+    async with serve() as server, viewing(server.front.url, subprotocol="foxglove.sdk.v1.1") as viewer:
+        assert viewer.socket.subprotocol == "foxglove.sdk.v1.1"
+
+
+async def test_a_view_by_tls(serve: Any, tmp_path: Path) -> None:
+    site = Site(tmp_path / "members")
+    folder = site.certify("view", VIEW, "watcher", hosts=("127.0.0.1",))
+    given = {"certificate": str(folder.certificate), "key": str(folder.key), "token": TOKEN}
+    async with serve(**given, host="0.0.0.0") as server:
+        context = ssl.create_default_context(cafile=str(site.authority.certificate))
+        url = server.front.url.replace("0.0.0.0", "127.0.0.1")
+        assert url.startswith("wss://")
+        async with viewing(f"{url}?token={TOKEN.replace(' ', '+')}", ssl=context) as viewer:
+            server.publish("/x", *encode_value("on"))
+            assert (await viewer.until_seen("/x"))[0].data == "on"
+
+
+@pytest.mark.parametrize(
+    "protection", [{}, {"token": TOKEN}, {"certificate": "a", "key": "b"}, {"certificate": "a", "token": TOKEN}]
+)
+def test_other_machines_need_tls_and_a_token(protection: dict[str, Any]) -> None:
+    with pytest.raises(NotOpenToOthers):
+        FoxgloveOptions(host="0.0.0.0", **protection).check()
+    FoxgloveOptions(host="0.0.0.0", certificate="a", key="b", token=TOKEN).check()
+    FoxgloveOptions(host="::1").check()
+
+
+async def test_a_browser_is_told_what_this_is(serve: Any) -> None:
+    async with serve() as server:
+        host, port = server.front.url.removeprefix("ws://").split(":")
+        reader, writer = await asyncio.open_connection(host, int(port))
+        writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        answer = await reader.read()
+        assert answer.startswith(b"HTTP/1.1 426 ")
+        assert b"Foxglove" in answer
+        writer.close()
+
+
+async def test_clients_are_bounded(serve: Any) -> None:
+    async with serve() as server:
+        opened = [viewing(server.front.url) for _ in range(CLIENTS)]
+        viewers = [await one.__aenter__() for one in opened]
+        assert len(viewers) == CLIENTS
+        assert await refusal(server.front.url) == 503
+        for one in opened:
+            await one.__aexit__(None, None, None)
+        await until(lambda: not server.front._admitted)
+        async with viewing(server.front.url) as viewer:
+            assert viewer.info
+
+
+async def test_a_message_that_is_too_long_ends_the_connection(serve: Any) -> None:
+    async with serve() as server, viewing(server.front.url) as viewer:
+        await viewer.socket.send("x" * (LONGEST_FRAME + 1))
+        await until(lambda: viewer.socket.close_code == 1009)
+
+
+async def test_a_client_that_sends_nonsense_hurts_no_other(serve: Any) -> None:
+    async with serve() as server, viewing(server.front.url) as viewer, viewing(server.front.url) as hostile:
+        many = [{"id": number, "channelId": 10**6 + number} for number in range(2000)]
+        for nonsense in ("no JSON", b"\xff\x00", json.dumps({"op": "subscribe", "subscriptions": many}), b""):
+            await hostile.socket.send(nonsense)
+        advertised = [{"id": 1, "topic": "/cmd_vel", "encoding": "json", "schemaName": ""}]
+        await hostile.socket.send(json.dumps({"op": "advertise", "channels": advertised}))
+        server.publish("/x", *encode_value("on"))
+        assert (await viewer.until_seen("/x"))[0].data == "on"
+        await until(lambda: hostile.statuses or hostile.socket.close_code, what="an answer to nonsense")
+        assert set(viewer.topics) == {"/x"}
+
+
+async def test_a_client_that_does_not_read_is_disconnected(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(front_module, "STALLED", 0.2)
+    async with serve() as server, viewing(server.front.url, "/x") as viewer, viewing(server.front.url, "/x") as slow:
+        server.publish("/x", bytes(10), RAW)
+        await viewer.until_seen("/x")
+        await slow.until_seen("/x")
+        slow.socket.transport.pause_reading()
+        picture = bytes(1 << 20)
+
+        def sent() -> bool:
+            server.publish("/x", picture, RAW)
+            return len(server.front._clients) == 1
+
+        await until(sent, what="the end of the slow client")
+        server.publish("/y", *encode_value("on"))
+        await until(lambda: "/y" in viewer.topics)
+
+
+@given(st.lists(st.integers(0, 70_000), max_size=5), st.integers(1, 5000), st.booleans())
+def test_the_guard_follows_the_frames_of_a_client(sizes: list[int], step: int, masked: bool) -> None:
+    data = b"".join(frame(size, masked=masked) for size in sizes)
+    guard = FrameGuard()
+    for at in range(0, len(data), step):
+        guard.feed(data[at : at + step])
+    with pytest.raises(ClientRefused):
+        guard.feed(frame(LONGEST_FRAME + 1, masked=masked)[:14])
+    with pytest.raises(ClientRefused):
+        FrameGuard().feed(b"\x01\x01a")  # the first part of a message
+
+
+def frame(size: int, *, masked: bool) -> bytes:
+    """A frame of a client with that many bytes."""
+    mask = 0x80 if masked else 0
+    if size < 126:
+        head = bytes([0x82, mask | size])
+    elif size < 1 << 16:
+        head = bytes([0x82, mask | 126]) + size.to_bytes(2, "big")
+    else:
+        head = bytes([0x82, mask | 127]) + size.to_bytes(8, "big")
+    return head + bytes(4 if masked else 0) + bytes(size)
+
+
+@given(st.binary(max_size=300))
+def test_no_request_breaks_the_front(head: bytes) -> None:
+    for data in (head, b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n" + head + b"\r\n\r\n"):
+        with pytest.raises(ClientRefused) as caught:
+            Upgrade.parse(data).check(FoxgloveOptions(token=TOKEN))
+        assert caught.value.response().startswith(b"HTTP/1.1 4")
