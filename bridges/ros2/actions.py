@@ -52,10 +52,10 @@ FEEDBACK_GRACE: Final = 0.1
 
 
 class RosActionClient:
-    """Sends goals to the server of an action. `client` makes the client of a service, by name and type."""
+    """Sends goals to the server of an action. `client` makes the client of a service, by name, type and hash."""
 
     def __init__(
-        self, node: RosNode, name: str, type_name: str, client: Callable[[str, str], RosClient], job: RosRecorder | None
+        self, node: RosNode, name: str, type_name: str, client: Callable[..., RosClient], job: RosRecorder | None
     ) -> None:
         self.name: Final = name
         self.type: Final = type_name
@@ -105,7 +105,10 @@ class RosActionClient:
             raise
 
     async def _cancel(self) -> None:
-        client = self._client(f"{self.name}{ACTION}cancel_goal", CANCEL_GOAL)
+        name = f"{self.name}{ACTION}cancel_goal"
+        # The service has been the same in all distributions, but not everyone has the hash for it that ROS 2 has.
+        hashes = [server.type_hash for server in self._node.others(name, "server") if server.type == CANCEL_GOAL]
+        client = self._client(name, CANCEL_GOAL, *hashes[:1])
         with suppress(RosCallFailed):
             await client.call({"goal_info": {"goal_id": self._id}}, timeout=CANCEL_TIMEOUT, job=self._job)
 

@@ -231,12 +231,12 @@ class Robot(Lifecycle):
         self._node.check_type(await self._node.wait(name, timeout, "server"), type_name)
         return await self._client(name, type_name).call(request, timeout=deadline - loop.time(), job=job)
 
-    def _client(self, name: str, type_name: str) -> RosClient:
+    def _client(self, name: str, type_name: str, type_hash: str = "") -> RosClient:
         client = self._clients.get((name, type_name))
         if client is None:
             if len(self._clients) >= ENDPOINTS:
                 raise TooManyRosEndpoints(name, ENDPOINTS)
-            client = self._clients[name, type_name] = RosClient(self._node, name, type_name)
+            client = self._clients[name, type_name] = RosClient(self._node, name, type_name, type_hash)
         return client
 
     def _check_open(self) -> None:

@@ -40,11 +40,11 @@ class RosRecorder(Protocol):
 class RosClient:
     """A client of ours of a service."""
 
-    def __init__(self, node: RosNode, name: str, type_name: str) -> None:
+    def __init__(self, node: RosNode, name: str, type_name: str, type_hash: str = "") -> None:
         self.name: Final = name
         self.type: Final = type_name
         self._node = node
-        self._endpoint = node.declare("client", name, type_name)
+        self._endpoint = node.declare("client", name, type_name, type_hash=type_hash)
         self._sequence = 0
 
     async def call(self, request: object, *, timeout: float | None, job: RosRecorder | None = None) -> Any:

@@ -213,34 +213,42 @@ async fn add_client(node: &ZNode, options: &Options) -> Result<()> {
     Ok(())
 }
 
-/// Every `period` the next number as feedback; `order=0` is aborted, and a negative one is refused.
+/// Every `period` the next number as feedback; an order of 0 is aborted. With `refuse=1` all goals are refused.
+///
+/// Goals are taken here: the handler of hiroz 0.2.1 hears of no cancellation while somebody waits for a result.
 async fn fibonacci_server(node: &ZNode, options: &Options) -> Result<()> {
     let server = node.create_action_server::<Fibonacci>(options.text("action", "/fibonacci")).build()?;
-    let period = options.millis("period", 100);
     ready();
-    let server = server.with_handler(move |goal: ExecutingGoal<Fibonacci>| async move {
-        say(json!({"goal": goal.goal.order, "id": goal.info.goal_id.to_string()}));
-        let mut sequence = vec![0, 1];
-        for _ in 1..goal.goal.order {
-            tokio::time::sleep(period).await;
-            if goal.is_cancel_requested() {
-                say(json!({"canceled": sequence}));
-                goal.canceled(FibonacciResult { sequence }).expect("the goal is executing");
-                return;
-            }
-            sequence.push(sequence[sequence.len() - 1] + sequence[sequence.len() - 2]);
-            goal.publish_feedback(FibonacciFeedback { partial_sequence: sequence.clone() }).expect("a publisher");
-        }
-        say(json!({"result": sequence}));
-        let ended = if goal.goal.order > 0 {
-            goal.succeed(FibonacciResult { sequence })
+    loop {
+        let goal = server.recv_goal().await?;
+        if options.number("refuse", 0) > 0 {
+            goal.reject()?;
         } else {
-            goal.abort(FibonacciResult { sequence })
-        };
-        ended.expect("the goal is executing");
-    });
-    let _serving = server;
-    std::future::pending().await
+            tokio::spawn(fibonacci(goal.accept().execute(), options.millis("period", 100)));
+        }
+    }
+}
+
+async fn fibonacci(goal: ExecutingGoal<Fibonacci>, period: Duration) {
+    say(json!({"goal": goal.goal.order, "id": goal.info.goal_id.to_string()}));
+    let mut sequence = vec![0, 1];
+    for _ in 1..goal.goal.order {
+        tokio::time::sleep(period).await;
+        if goal.try_process_cancel() {
+            say(json!({"canceled": sequence}));
+            goal.canceled(FibonacciResult { sequence }).expect("the goal is executing");
+            return;
+        }
+        sequence.push(sequence[sequence.len() - 1] + sequence[sequence.len() - 2]);
+        goal.publish_feedback(FibonacciFeedback { partial_sequence: sequence.clone() }).expect("a publisher");
+    }
+    say(json!({"result": sequence}));
+    let ended = if goal.goal.order > 0 {
+        goal.succeed(FibonacciResult { sequence })
+    } else {
+        goal.abort(FibonacciResult { sequence })
+    };
+    ended.expect("the goal is executing");
 }
 
 async fn fibonacci_client(node: &ZNode, options: &Options) -> Result<()> {
