@@ -59,7 +59,7 @@ class RosTypes:
         from rosbags.typesys.base import TypesysError
 
         try:
-            self._store.register(interface_types(_full(name), definition))
+            self._store.register(interface_types(full_ros_name(name), definition))
         except (TypesysError, SyntaxError, ValueError) as error:
             raise UnknownRosType(name, f"its definition can't be read: {error}") from None
 
@@ -73,7 +73,7 @@ class RosTypes:
             return NO_HASH
         if name not in self._hashes:
             try:
-                self._hashes[name] = type_hash(self._store, _full(name))
+                self._hashes[name] = type_hash(self._store, full_ros_name(name))
             except KeyError as error:
                 raise UnknownRosType(name, f"it contains {error}, of which there is no definition") from None
         return self._hashes[name]
@@ -81,7 +81,7 @@ class RosTypes:
     def type(self, name: str) -> Any:
         """The class of a type, whose instances are messages. Raises `UnknownRosType`."""
         try:
-            return self._store.types[_full(name)]
+            return self._store.types[full_ros_name(name)]
         except KeyError:
             raise UnknownRosType(name, "there is no such type") from None
 
@@ -114,14 +114,14 @@ class RosTypes:
         self.type(name)
         read = self._store.deserialize_ros1 if self._version == 1 else self._store.deserialize_cdr
         try:
-            return read(payload, _full(name))
+            return read(payload, full_ros_name(name))
         except (SerdeError, struct.error, ValueError, IndexError) as error:
             raise InvalidPayload(name, str(error)) from None
 
     def _made(self, name: str, fields: dict[str, Any]) -> Any:
         """A message with these fields, which may be dicts and lists."""
         kind = self.type(name)
-        _, known = self._store.fielddefs[_full(name)]
+        _, known = self._store.fielddefs[full_ros_name(name)]
         return kind(**fields | {field: self._value(node, fields.get(field)) for field, node in known})
 
     def _value(self, node: Any, value: Any) -> Any:
@@ -147,7 +147,7 @@ class RosTypes:
     def payload_type(self, name: str) -> PayloadType:
         """The type of a message's payload, with its definition. Raises `UnknownRosType`."""
         self.type(name)
-        name = _full(name)
+        name = full_ros_name(name)
         if name not in self._described:
             definition = described(self._store, name, self._version)
             kind, shown = ("ros1", name.replace("/msg/", "/")) if self._version == 1 else ("cdr", name)
@@ -156,7 +156,7 @@ class RosTypes:
         return self._described[name]
 
 
-def _full(name: str) -> str:
+def full_ros_name(name: str) -> str:
     """The name that rosbags has for a type: `std_msgs/msg/Header` for `std_msgs/Header`."""
     if "/srv/" in name or "/action/" in name:
         return name

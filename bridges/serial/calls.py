@@ -24,14 +24,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PRESENT: Final = "/present"
-"""The topic of the liveliness token, which exists as long as the board answers."""
-ABOUT: Final = "/about"
-"""The topic on which the edge agent reports which device it serves."""
-LOG: Final = "/log"
-"""The topic on which the edge agent answers as the service `logs` does."""
-PUT_BY_EDGE: Final = b"edge"
-"""What the attachment of everything that an edge agent puts begins with."""
 ANSWER: Final = "/answer"
 """The topic below a called one on which a job's recording has what the board answered."""
 PATIENCE: Final = 30.0
@@ -80,16 +72,6 @@ class PendingCalls:
         for query in self._queries.values():
             query.drop()  # type: ignore[no-untyped-call]
         self._queries.clear()
-
-
-def said_by(device: str) -> bytes:
-    """The attachment of what a board says."""
-    return PUT_BY_EDGE + b" " + device.encode()
-
-
-def is_put_by_edge(attachment: zenoh.ZBytes | None) -> bool:
-    """Whether an edge agent has put something with this attachment."""
-    return attachment is not None and attachment.to_bytes().startswith(PUT_BY_EDGE)
 
 
 def is_for_device(query: zenoh.Query, device: str) -> bool:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 import zenoh
 
-from bridges.serial.calls import ABOUT, PATIENCE, PRESENT, said_by
+from bridges.devices import ABOUT, PRESENT, said_by
+from bridges.serial.calls import PATIENCE
 from bridges.serial.dialect import CallStatus, Flow
 from bridges.serial.errors import CALL_ERRORS, CallFailed, CallInDoubt, CallNotDone, DeviceSilent, NoSuchTopic
 from mesh.network import Pump
@@ -133,7 +134,11 @@ class Device:
                 is_said = (key.device, key.topic) == (self.name, topic)
             else:
                 by = sample.attachment.to_bytes() if sample.attachment is not None else b""
-                is_said = isinstance(key, LiabilityTopicKey) and key.topic == topic and by == said_by(self.name)
+                is_said = (
+                    isinstance(key, LiabilityTopicKey)
+                    and key.topic == topic
+                    and by.split(b"\n", 1)[0] == said_by(self.name)
+                )
             return decode_value(sample.payload.to_bytes(), payload_type(str(sample.encoding))) if is_said else None
         except (InvalidKey, InvalidPayload):
             return None

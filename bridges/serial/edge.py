@@ -13,24 +13,13 @@ from __future__ import annotations
 import logging
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 
+from bridges.devices import ABOUT, CONNECTION, PRESENT, PUT_BY_EDGE, JobTracker, is_put_by_edge, said_by
 from bridges.serial import dialect as events
-from bridges.serial.calls import (
-    ABOUT,
-    ANSWER,
-    PATIENCE,
-    PRESENT,
-    PUT_BY_EDGE,
-    PendingCalls,
-    convert,
-    is_for_device,
-    is_put_by_edge,
-    reply_about,
-    said_by,
-)
+from bridges.serial.calls import ANSWER, PATIENCE, PendingCalls, convert, is_for_device, reply_about
 from bridges.serial.dialect import BoardTopic, Command, Flow
 from bridges.serial.errors import BoardBusy, InvalidBoardMessage
 from bridges.serial.line import SerialLine
@@ -38,7 +27,7 @@ from bridges.serial.metrics import EdgeCounters
 from mesh.errors import InvalidKey
 from mesh.log_context import liability_context, log_event
 from mesh.network import sending
-from schemas.agent_keys import DeviceTopicKey, EventKey, LiabilityTopicKey, parse_agent_key, topic_chunks
+from schemas.agent_keys import DeviceTopicKey, LiabilityTopicKey, parse_agent_key, topic_chunks
 from schemas.payloads import EMPTY, STRING, String, payload_type
 from schemas.selectors import event_selector, topic_selector
 
@@ -50,38 +39,6 @@ if TYPE_CHECKING:
     from schemas.payloads import PayloadType
 
 log = logging.getLogger(__name__)
-
-CONNECTION: Final = "/aira/device"
-"""The topic of a job, followed by the device's name, that records when the device was absent and present."""
-
-
-class JobTracker:
-    """The agent's jobs that are ready and not complete, in order, as its edge agent sees them."""
-
-    def __init__(self) -> None:
-        self._open: list[str] = []
-
-    @property
-    def current(self) -> str:
-        """The liability (address) that the device works for now: the first one; empty for none."""
-        return self._open[0] if self._open else ""
-
-    def begin(self, liability: str) -> None:
-        """Make this job the current one: a command named it."""
-        self._open = [liability, *(other for other in self._open if other != liability)]
-
-    def handle_event(self, key: str) -> None:
-        """Update the jobs by an event of the agent, given its key."""
-        try:
-            event = parse_agent_key(key)
-        except InvalidKey as error:
-            log.info("%s", error, extra=log_event("key-ignored", key=key))
-            return
-        match event:
-            case EventKey(event="ready", liability=job) if job not in self._open:
-                self._open.append(job)
-            case EventKey(event="complete" | "finalized", liability=job) if job in self._open:
-                self._open.remove(job)
 
 
 class Edge:

@@ -8,29 +8,23 @@ import sys
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import msgspec
-
-from bridges.serial.calls import LOG
+from bridges.devices import LOG, answer_log_queries
 from bridges.serial.detection import AUTO, make_dialect
 from bridges.serial.edge import Edge
 from bridges.serial.line import PortName
 from mesh.cli.output import announce
-from mesh.errors import AiraError
 from mesh.log_context import LogSource
 from mesh.network.connecting import SessionOpening
 from mesh.running import INTERRUPTED
 from mesh.starting import file_delays
-from mesh.telemetry.logs import LogService, set_process_source
+from mesh.telemetry.logs import set_process_source
 from schemas.address import parse_address
 from schemas.agent_keys import DeviceTopicKey
-from schemas.logs import ReadLogs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
-
-    import zenoh
 
     from bridges.serial.metrics import EdgeMetrics
     from mesh.network.endpoints import Endpoints
@@ -110,28 +104,5 @@ def run_edge(options: EdgeOptions, *, endpoints: Endpoints, metrics: EdgeMetrics
             metrics.attach(edge.counters, session)
         set_process_source(LogSource("edge", parse_address(agent)))
         announce(log, "edge-started", words, device=name)
-        with answer_log_queries(session, log_key):
+        with answer_log_queries(session, log_key, "edge"):
             edge.run()
-
-
-@contextmanager
-def answer_log_queries(session: zenoh.Session, key: str) -> Iterator[None]:
-    """Answer queries for this process's log on a key of the device, as an edge agent has no services of its own."""
-    service = LogService("edge", "")
-
-    def on_query(query: zenoh.Query) -> None:  # on a thread of Zenoh's; the log is in memory
-        with query:
-            try:
-                payload = b"{}" if query.payload is None else query.payload.to_bytes()
-                answer = service.read(ReadLogs.decode(payload)).encode()
-            except AiraError as error:
-                query.reply_err(msgspec.json.encode({"error": str(error), "hint": error.hint}))
-            else:
-                query.reply(key, answer, encoding="application/json")
-
-    queryable: Any = session.declare_queryable(key, on_query)
-    try:
-        yield
-    finally:
-        if not session.is_closed():
-            queryable.undeclare()

@@ -23,6 +23,7 @@ from mesh.recording.mcap_writer import McapWriter
 from mesh.recording.objective import open_source
 from mesh.recording.recovery import copy_attachments
 from mesh.recording.ros_conversion import RosConverter
+from mesh.ros import full_ros_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -204,7 +205,7 @@ def _bag_file(target: Path, _sources: Sequence[RecordingSource], _cid: str) -> I
                 if (channel.topic, of) not in connections:
                     text = of.schema_data.decode()
                     connections[channel.topic, of] = writer.add_connection(
-                        channel.topic, _message_name(of), msgdef=text, md5sum=conversion.digest
+                        channel.topic, full_ros_name(of.schema_name), msgdef=text, md5sum=conversion.digest
                     )
                 writer.write(connections[channel.topic, of], message.log_time, message.payload)
 
@@ -226,7 +227,7 @@ def _rosbag2_folder(storage: str, target: Path, *_: object) -> Iterator[tuple[Pa
                 if (channel.topic, of) not in connections:
                     connections[channel.topic, of] = writer.add_connection(
                         channel.topic,
-                        _message_name(of),
+                        full_ros_name(of.schema_name),
                         msgdef=of.schema_data.decode(),
                         rihs01=conversion.digest,
                         offered_qos_profiles=_qos(channel),
@@ -256,11 +257,6 @@ def _qos(channel: RecordingChannel) -> Any:
         return parse_qos(text) if 0 < len(text) <= _LONGEST_QOS else ()
     except Exception:  # of a stranger's text
         return ()
-
-
-def _message_name(type: PayloadType) -> str:
-    package, _, kind = type.schema_name.rpartition("/")
-    return f"{package.removesuffix('/msg')}/msg/{kind}"
 
 
 _VERSIONS: Final = {"mcap": 0, "bag": 1, "rosbag2-mcap": 2, "rosbag2-sqlite3": 2}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.extras import PackageMissing, needs_extra
-from mesh.ros import RosTypes, UnknownRosType
+from mesh.ros import RosTypes, UnknownRosType, full_ros_name
 from schemas.payloads import PayloadType
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class RosConverter:
             return RosConversion(type, why=f"the definition of {type.schema_name} can't be read: {error}")
 
     def _conversion(self, type: PayloadType, version: int) -> RosConversion:
-        name = _full_name(type)
+        name = full_ros_name(type.schema_name)
         described, store = _store(type, name, version=self._version), _store(type, name, version=2)
         text, digest = described.generate_msgdef(name, ros_version=self._version)
         if self._version == 2:
@@ -93,11 +93,6 @@ class RosConverter:
             except PackageMissing:
                 self._known[version] = None
         return self._known[version]
-
-
-def _full_name(type: PayloadType) -> str:
-    package, _, kind = type.schema_name.rpartition("/")
-    return f"{package.removesuffix('/msg')}/msg/{kind}"
 
 
 def _store(type: PayloadType, name: str, *, version: int) -> Any:

@@ -14,6 +14,7 @@ from mesh.settings.groups import (
     MarketSettings,
     NetworkSettings,
     NodeNotSet,
+    Ros2Settings,
     Settings,
     StorageSettings,
     TelemetrySettings,

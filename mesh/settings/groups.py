@@ -220,6 +220,16 @@ class IpfsSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Ros2Settings:
+    """How to reach a ROS 2 system."""
+
+    ros2_connect: tuple[str, ...] = option(
+        ("tcp/127.0.0.1:7447",), "Zenoh routers of the ROS 2 system, tried in order; never those of the mesh"
+    )
+    ros2_distribution: str = option("jazzy", "ROS 2 distribution of that system: humble, jazzy, kilted, …")
+
+
+@dataclass(frozen=True, kw_only=True)
 class TelemetrySettings:
     """How an operator sees what a server does."""
 
@@ -246,6 +256,7 @@ CONTRACT_NAMES: Final = {
 @dataclass(frozen=True, kw_only=True)
 class Settings(
     TelemetrySettings,
+    Ros2Settings,
     IpfsSettings,
     ExecutionSettings,
     MarketSettings,

@@ -17,6 +17,7 @@ from mesh.recording import AtOnce, Unrecordable, play
 from mesh.work.job import HandlerCancelled, Job
 from mesh.work.notes import NOTE_TOPIC
 from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey, ProgressKey, parse_agent_key
+from schemas.definitions import defined_by
 from schemas.payloads import JSON, STRING, PayloadType, String, payload_type
 from schemas.records import PlaybackPosition
 from schemas.selectors import topic_selector
@@ -33,6 +34,8 @@ log = logging.getLogger(__name__)
 
 QUEUED: Final = 1024
 """Most played messages that wait for their handler; then the player waits."""
+LEARNT: Final = 4096
+"""Types of a job whose definitions are remembered, at most."""
 FLUSH: Final = "aira/flush"
 """Encoding of the message that a run sends to itself to know that it has received everything before it."""
 
@@ -191,7 +194,7 @@ class JobRun(Job):
         try:
             key = parse_agent_key(str(sample.key_expr))
             if isinstance(key, LiabilityTopicKey):
-                kind, payload = self._type_of(key.topic, encoding), sample.payload.to_bytes()
+                kind, payload = self._type_of(key.topic, encoding, sample.attachment), sample.payload.to_bytes()
                 self._deliver(key.topic, payload, kind)
                 if self._is_recorded(key.topic):
                     self._recorder.record(key.topic, payload, kind, role="device")
@@ -202,9 +205,19 @@ class JobRun(Job):
             facts = log_event("message-not-recorded", liability=self.liability.address, key=sample.key_expr)
             log.log(level, "%s: can't record %s: %s", self.liability.address, sample.key_expr, error, extra=facts)
 
-    def _type_of(self, topic: str, encoding: str) -> PayloadType:
-        """The type of a received message. Only its name travels; the run may know its description."""
-        return self._types.get((topic, encoding)) or self._types.get(("", encoding)) or payload_type(encoding)
+    def _type_of(self, topic: str, encoding: str, attachment: zenoh.ZBytes | None) -> PayloadType:
+        """The type of a received message. Its name travels; the run may know its definition, or learn it."""
+        known = self._types.get((topic, encoding)) or self._types.get(("", encoding))
+        if known is not None:
+            return known
+        kind = payload_type(encoding)
+        if attachment is None or kind.schema_data or len(self._types) >= LEARNT:
+            return kind
+        defined = defined_by(attachment.to_bytes(), kind)
+        if defined is None:
+            return kind
+        self._types[topic, encoding] = defined
+        return defined
 
     def _is_recorded(self, topic: str) -> bool:
         return self.recorded is None or topic in self.recorded

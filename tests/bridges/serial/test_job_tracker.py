@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bridges.serial.edge import JobTracker
+from bridges.devices import JobTracker
 
 AGENT = "0x" + "11" * 20
 FIRST, SECOND = "0x" + "22" * 20, "0x" + "33" * 20
