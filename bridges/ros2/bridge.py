@@ -99,6 +99,7 @@ class RosBridge(Role):
         loop = asyncio.get_running_loop()
         await stack.enter_async_context(self._robot)
         self._tasks = await stack.enter_async_context(Background())
+        self._tasks.start(self.drops.run(), "drops")
         stack.callback(self._withdraw)
         declared: list[Any] = [
             self._session.declare_subscriber(
@@ -139,6 +140,11 @@ class RosBridge(Role):
                 self._carried[topic] = asyncio.create_task(self._carry(topic), name=f"carry {topic}")
 
     @property
+    def current_job(self) -> str:
+        """The liability (address) that the robot works for now; empty for none."""
+        return self._jobs.current
+
+    @property
     def is_present(self) -> bool:
         """Whether a node of the ROS 2 system is there."""
         return self._present is not None
@@ -168,7 +174,8 @@ class RosBridge(Role):
         else:
             self._withdraw()
         state = "absent" if self._present is None else "present"
-        log.info("the ROS 2 system is %s", state, extra=log_event(f"ros-{state}", device=self._name))
+        facts = log_event("ros-presence", device=self._name, state=state)
+        log.info("the ROS 2 system is %s", state, extra=facts)
         if job:
             payload = self._robot.types.message("std_msgs/String", data=state)
             self._put(job, f"{CONNECTION}/{self._name}", payload.data, payload.type)
