@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ros2 import RosCallFailed
+from bridges.ros2 import RosCallFailed, RosUnavailable
 from tests.bridges.ros2.definitions import ADD_TWO_INTS, ros_types
 from tests.bridges.ros2.peers import RosPeer, hiroz, sdk
 from tests.support.waiting import until
@@ -54,8 +54,8 @@ async def test_a_peer_calls_a_service_of_ours(
 
 async def test_many_calls_at_a_time_get_their_own_replies(router: EmbeddedRouter, our_robot: OurRobot) -> None:
     async with hiroz("add-server", router.endpoint), our_robot() as robot:
-        calls = [robot.call("/add_two_ints", ADD_TWO_INTS, {"a": a, "b": 1}, timeout=20) for a in range(30)]
-        assert [reply.sum for reply in await asyncio.gather(*calls)] == [a + 1 for a in range(30)]
+        calls = [robot.call("/add_two_ints", ADD_TWO_INTS, {"a": a, "b": 1}, timeout=20) for a in range(8)]
+        assert [reply.sum for reply in await asyncio.gather(*calls)] == [a + 1 for a in range(8)]
 
 
 async def test_services_of_a_distribution_without_hashes(router: EmbeddedRouter, our_robot: OurRobot) -> None:
@@ -88,8 +88,8 @@ async def test_a_call_ends_when_its_server_dies(router: EmbeddedRouter, our_robo
     async with our_robot() as robot:
         async with hiroz("add-server", router.endpoint):
             await robot.ready("/add_two_ints")
-        with pytest.raises(RosCallFailed):
-            # The graph may not know yet; what it knows then is not there.
+        # Whether the graph knows that already is left to chance.
+        with pytest.raises((RosCallFailed, RosUnavailable)):
             await robot.call("/add_two_ints", ADD_TWO_INTS, {"a": 1, "b": 2}, timeout=1)
 
 
