@@ -131,17 +131,7 @@ def _number(text: str) -> int | float | str:
     help="rename a topic of the board and all topics below it, as in /led=/left/led or /=/left (may be repeated)",
 )
 @with_settings(*options_of(NetworkSettings), *options_of(TelemetrySettings))
-def command(
-    settings: Settings,
-    port: str,
-    agent: str,
-    name: str,
-    protocol: str,
-    baud: int,
-    patience: float,
-    parameters: dict[str, object],
-    renamed: tuple[tuple[str, str], ...],
-) -> None:
+def command(settings: Settings, renamed: tuple[tuple[str, str], ...], **options: Any) -> None:
     """Connect the device at PORT to its agent. Ctrl-C stops it.
 
     Protocol and baud rate are found by trying, which takes a few seconds: the board gets questions in several protocols
@@ -161,16 +151,6 @@ def command(
     try:
         with serve_metrics(settings.metrics_listen) as metrics:
             wait_for_files(settings)
-            options = EdgeOptions(
-                agent=agent,
-                name=name,
-                port=port,
-                protocol=protocol,
-                baud=baud,
-                patience=patience,
-                parameters=parameters,
-                rename=TopicNames(renamed).of,
-            )
-            run_edge(options, endpoints=endpoints, metrics=metrics)
+            run_edge(EdgeOptions(**options, rename=TopicNames(renamed).of), endpoints=endpoints, metrics=metrics)
     except AiraError as error:
         fail(error)

@@ -46,9 +46,7 @@ async def opened(
 ) -> AsyncIterator[WebComponents]:
     """The components, with the settings' account or `account`, on `chain` (open) or on the settings' own.
 
-    With `agent` (open) they are that agent's.
-
-    Raises `ConfigurationError`, `NetworkUnavailable`, `ChainError`.
+    With `agent` (open) they are that agent's. Raises `ConfigurationError`, `NetworkUnavailable`, `ChainError`.
     """
     settings = replace(settings, metrics_listen="", enable_executor=False)
     drops = Drops()

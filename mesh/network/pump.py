@@ -19,9 +19,10 @@ import zenoh
 
 from mesh.background import call_in_loop
 from mesh.errors import ClosedError
-from mesh.flood import Drops, RecentDict
+from mesh.flood import Drops
 from mesh.log_context import log_event
 from mesh.network import sending
+from mesh.network.ring import ReceiveRing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -34,10 +35,6 @@ RING_CAPACITY: Final = 8192
 """Samples that the ring holds before it drops the oldest."""
 RING_BYTES: Final = 8 * 1024 * 1024
 """Bytes of payloads that the ring holds before it drops the oldest."""
-REMEMBERED: Final = 65_536
-"""Samples that the ring remembers, at most; half of them at least."""
-COPIES: Final = 4
-"""Copies of a sample that the ring tells apart: later ones are like the last of these."""
 BATCH: Final = 256
 """Samples converted for one call into the loop, at most."""
 BATCHES_IN_FLIGHT: Final = 2
@@ -46,69 +43,6 @@ ZENOH_QUEUE: Final = 512
 """Samples in Zenoh's own queue; each may keep 64 KiB alive. While it is full, Zenoh stops reading from the router."""
 SLOT_WAIT: Final = 0.002
 """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
-
-
-class _Lane(deque[tuple[Any, int]]):
-    """Items with their sizes in bytes; the oldest are dropped beyond the bounds, but never the last one."""
-
-    def __init__(self, capacity: int, capacity_bytes: int) -> None:
-        super().__init__()
-        self._capacity = capacity
-        self._capacity_bytes = capacity_bytes
-        self.size = 0
-
-    def add(self, item: Any, size: int) -> int:
-        """Add an item; returns how many were dropped for it."""
-        self.append((item, size))
-        self.size += size
-        before = len(self)
-        while len(self) > self._capacity or (self.size > self._capacity_bytes and len(self) > 1):
-            self.size -= self.popleft()[1]
-        return before - len(self)
-
-    def take(self, number: int, *, newest: bool) -> list[Any]:
-        """Remove up to `number` items, the oldest first, or the newest."""
-        taken = [self.pop() if newest else self.popleft() for _ in range(min(number, len(self)))]
-        self.size -= sum([size for _, size in taken])
-        return [item for item, _ in taken]
-
-
-class ReceiveRing:
-    """Received items that wait for their conversion, the oldest of which are dropped when there are too many.
-
-    With `second_chance`, which needs hashable items, first copies have a lane, second copies another, and so on. Each
-    lane gets the same share of the conversions, and what the others leave. In the lanes of copies the newest go first,
-    and fewer wait: `capacity` and `capacity_bytes` divided by `COPIES`. Honest senders repeat what has no effect, so in
-    a flood of new messages their second copy gets through at once, and in a flood of second copies the third does.
-    """
-
-    def __init__(self, capacity: int, capacity_bytes: int, *, second_chance: bool) -> None:
-        self._second_chance = second_chance
-        self._lanes = [_Lane(capacity, capacity_bytes)]
-        if second_chance:
-            self._lanes += [_Lane(capacity // COPIES, capacity_bytes // COPIES) for _ in range(COPIES - 1)]
-        self._copies: RecentDict[int, int] = RecentDict(REMEMBERED)
-        """How often an item came, by its hash with a key that only this process knows."""
-
-    def __len__(self) -> int:
-        return sum(map(len, self._lanes))
-
-    def append(self, item: Any, size: int) -> int:
-        """Add an item of `size` bytes; returns how many were dropped for it."""
-        lane = 0
-        if self._second_chance:
-            number = hash(item)
-            lane = self._copies.get(number, 0)
-            self._copies[number] = min(lane + 1, COPIES - 1)
-        return self._lanes[lane].add(item, size)
-
-    def take(self, number: int) -> list[Any]:
-        """Remove up to `number` items."""
-        taken: list[Any] = []
-        filled = sorted(filter(None, self._lanes), key=len)
-        for left, lane in zip(range(len(filled), 0, -1), filled, strict=True):
-            taken += lane.take(-(-(number - len(taken)) // left), newest=lane is not self._lanes[0])
-        return taken
 
 
 class Pump(Generic[T]):
