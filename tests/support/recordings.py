@@ -10,6 +10,7 @@ from mcap.decoder import DecoderFactory
 from mcap.reader import make_reader
 from mcap_ros1.decoder import DecoderFactory as Ros1Decoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mesh.recording.mcap_records import MAGIC
 from peers.catalog import PEERS
@@ -32,11 +33,25 @@ class JsonDecoders(DecoderFactory):
         return json.loads
 
 
+class InterfaceDecoders(DecoderFactory):
+    """Decodes requests, replies, goals and feedback, whose names the ROS 2 decoders do not take (`Spawn_Request`)."""
+
+    def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
+        if message_encoding != "cdr" or schema is None or "_" not in schema.name.rpartition("/")[2]:
+            return None
+        name, types = schema.name, get_typestore(Stores.EMPTY)
+        found = get_types_from_msg(schema.data.decode(), name)
+        types.register({each: defined for each, defined in found.items() if each not in types.fielddefs})
+        return lambda payload: types.deserialize_cdr(payload, name)
+
+
 def decoded(path: Path) -> list[tuple[str, Any]]:
     """Each message of an MCAP file: its topic, and the message. Raises if there is no decoder for one."""
     with path.open("rb") as stream:
         reader = make_reader(
-            stream, validate_crcs=True, decoder_factories=[JsonDecoders(), Ros1Decoders(), Ros2Decoders()]
+            stream,
+            validate_crcs=True,
+            decoder_factories=[JsonDecoders(), Ros1Decoders(), InterfaceDecoders(), Ros2Decoders()],
         )
         return [(one.channel.topic, one.decoded_message) for one in reader.iter_decoded_messages()]
 
