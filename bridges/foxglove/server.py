@@ -205,8 +205,6 @@ class FoxgloveServer(Lifecycle):
         if name in self._names:
             name = f"{source.topic} ({source.schema or source.encoding})"
         opened = OpenChannel(name, source, self._declare(name, kind), kind)
-        if known is not None:
-            opened.last, opened.size = known.last, known.size
         self._names.add(name)
         self._channels[source] = self._by_id[opened.channel.id()] = opened
         return opened
@@ -229,14 +227,16 @@ class FoxgloveServer(Lifecycle):
     def repeat_last(self, channel: int, client: int) -> None:
         """Send the last messages of a channel to a client that has subscribed to it."""
         opened = self._by_id.get(channel)
-        if opened is None:
+        if opened is None or not opened.last:
             return
-        for payload, kind, at in list(opened.last):
-            shown = self._types.shown(opened.source.topic, payload, kind)
-            current = self._channel_for(opened.source, shown, "")
-            if current is not opened:  # its schema has changed: the client subscribes to the new one
-                return
-            opened.channel.log(shown.payload, log_time=at, sink_id=client)
+        shown = [(self._types.shown(opened.source.topic, payload, kind), at) for payload, kind, at in opened.last]
+        current = self._channel_for(opened.source, shown[-1][0], "")  # a schema that fits them all
+        if current is opened:
+            for one, at in shown:
+                if one.type.schema_name == opened.shown.schema_name:
+                    opened.channel.log(one.payload, log_time=at, sink_id=client)
+        elif current is not None:  # with another schema: the client subscribes to the new one
+            current.last, current.size = opened.last, opened.size
 
 
 class _Listener(ServerListener):

@@ -70,6 +70,8 @@ async def test_a_recording_is_played_to_its_end_and_again(front: Any, tmp_path: 
 
 async def test_nothing_moves_while_it_is_paused(front: Any, tmp_path: Path) -> None:
     async with playing(front, tmp_path, *STEPS) as viewer:
+        await asyncio.sleep(0.2)
+        assert viewer.seen == []
         await viewer.control(PLAY, request="play", speed=5)
         await viewer.until_seen("/x", 5)
         paused = await viewer.control(PAUSE, request="pause", speed=5)
@@ -93,6 +95,10 @@ async def test_a_jump_shows_the_last_message_of_each_topic_before(front: Any, tm
             await until(lambda: len(viewer.seen) == 2)
             assert seconds(viewer, "/state") == [0.05]
             assert seconds(viewer) == [int(at * 10) / 10]
+        host, port = viewer.socket.remote_address
+        async with viewing(f"ws://{host}:{port}") as later:
+            await until(lambda: len(later.seen) == 2)
+            assert (seconds(later, "/state"), seconds(later)) == ([0.05], [4.5])
         viewer.seen.clear()
         await viewer.control(PLAY, request="on", speed=100)
         await until(lambda: viewer.states[-1].status == "ended")

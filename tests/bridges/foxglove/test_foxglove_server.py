@@ -76,6 +76,17 @@ async def test_a_schema_that_widens_reaches_the_viewer(serve: Any) -> None:
         await viewer.until_seen("/x", 2)
         assert '"b"' in viewer.topics["/x"]["schema"]
         assert len(viewer.channels) == 1
+        assert viewer.values("/x") == [{"a": 1}, {"a": 1, "b": 2}]
+
+
+async def test_the_last_messages_are_repeated_though_their_schema_widens(serve: Any) -> None:
+    async with serve() as server:
+        wanted = [{"a": 1}, {"b": 2}, {"c": 3}]
+        for value in wanted:
+            server.publish_value("/x", value)
+        async with viewing(server.front.url) as viewer:
+            assert await viewer.until_seen("/x", 3) == wanted
+            assert '"c"' in viewer.topics["/x"]["schema"]
 
 
 async def test_two_types_on_a_topic_are_two_topics(serve: Any) -> None:
