@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ros2 import LATCHED, RosQos
+from bridges.ros2 import LATCHED, Robot, RosQos
+from mesh.network import Endpoints, Network
 from tests.bridges.ros2.definitions import ros_types
 from tests.bridges.ros2.peers import RosPeer, hiroz, sdk
+from tests.support.routers import Zenohd
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from contextlib import AbstractAsyncContextManager
 
-    from bridges.ros2 import Robot
     from tests.support.routers import EmbeddedRouter
 
     OurRobot = Callable[..., AbstractAsyncContextManager[Robot]]
@@ -53,6 +54,32 @@ async def test_a_peer_hears_our_messages(
             robot.publish("/chatter", STRING, {"data": f"ours {number}"})
         assert [await listener.line("heard") for _ in range(50)] == [f"ours {number}" for number in range(50)]
         assert listener.is_alive
+
+
+async def test_peers_that_link_directly_are_heard_and_hear_through_their_router() -> None:
+    # As processes of ROS 2 do by default: its router tells them of each other, and passes on what is for clients.
+    scouting = {"multicast": {"enabled": False}, "gossip": {"enabled": True}, "delay": 0}
+    async with Zenohd(
+        config={"scouting": scouting, "routing": {"router": {"peers_failover_brokering": True}}}
+    ) as router:
+        talker = hiroz("talker", router.endpoint, mode="peer", topic="/theirs")
+        listener = hiroz("listener", router.endpoint, mode="peer", topic="/ours", depth=100)
+        neighbour = hiroz("listener", router.endpoint, mode="peer", topic="/theirs", node="neighbour")
+        async with (
+            talker,
+            listener,
+            neighbour,
+            Network(Endpoints(connect=(router.endpoint,))) as network,
+            Robot(network.session, ros_types()) as robot,
+            robot.subscribe("/theirs") as messages,
+        ):
+            numbers = [(await anext(messages)).sequence for _ in range(20)]
+            assert numbers == list(range(numbers[0], numbers[0] + 20))
+            assert (await neighbour.line("heard")).startswith("Hello ")
+            await robot.ready("/ours")
+            for number in range(20):
+                robot.publish("/ours", STRING, {"data": f"{number}"})
+            assert [await listener.line("heard") for _ in range(20)] == [f"{number}" for number in range(20)]
 
 
 @pytest.mark.parametrize("distribution", ["jazzy", "humble"])

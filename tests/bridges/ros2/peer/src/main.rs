@@ -1,7 +1,8 @@
 //! A ROS 2 system without ROS for the tests: `ros2-peer ROLE key=value …`, on the crate hiroz.
 //!
-//! Every role takes `connect=ENDPOINT` and `node=NAME`, and may take `domain=N` and `namespace=/NS`. What it hears and
-//! does it prints as lines of JSON; the first says `{"ready":true}`. It runs until its input ends, or its work is done.
+//! Every role takes `connect=ENDPOINT` and `node=NAME`, and may take `domain=N`, `namespace=/NS` and `mode=peer` (else
+//! it is a client of the router). What it hears and does it prints as lines of JSON; the first says `{"ready":true}`.
+//! It runs until its input ends, or its work is done.
 
 use std::collections::HashMap;
 use std::io::Write;
@@ -85,7 +86,8 @@ async fn run() -> Result<()> {
             .collect(),
     );
     let context = ZContextBuilder::default()
-        .with_mode("client")
+        .with_mode(options.text("mode", "client"))
+        .with_listen_endpoints(["tcp/127.0.0.1:0"])
         .with_connect_endpoints([options.text("connect", "")])
         .with_domain_id(options.number("domain", 0) as usize)
         .build()?;
