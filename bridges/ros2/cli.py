@@ -97,13 +97,13 @@ async def _serve(
     from schemas.agent_keys import DeviceTopicKey
 
     allow = RosAllowed(publish=publish, subscribe=subscribe)
-    types = types_of(settings, allow, folder)
+    types, ros_at = types_of(settings, allow, folder), ros_endpoints(settings)
     log_key = str(DeviceTopicKey(agent, name, LOG))
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         await wait_for_files(settings)
         mesh = await _network(Endpoints.from_settings(settings), stack, "router", telemetry)
-        ros = await _network(ros_endpoints(settings), stack, "ros2-router", telemetry)
+        ros = await _network(ros_at, stack, "ros2-router", telemetry)
         check_apart(mesh.session, ros.session)
         bridge = await stack.enter_async_context(
             RosBridge(mesh.session, ros.session, types, allow, agent=agent, name=name, **options)

@@ -209,9 +209,12 @@ async def test_a_paid_job_drives_the_robot_and_others_open_its_recording(
         await until(lambda: len(answered) > job.position, what="the robot's answer", seconds=60)
 
     pack([Played("/cmd_vel", twist(n / 4).data, n, n, 0, twist(0).type) for n in range(3)], tmp_path / "drive.mcap")
-    command = ("bridge", "ros2", "--agent", place.address("robot"), "--connect", place.endpoint)
-    allowed = ("--ros2-connect", field.endpoint, "--publish", "/cmd_vel", "--subscribe", "/odom")
-    with Serving(*AIRA, *command, *allowed, says="bridge of 0x"):
+    places = ("--agent", place.address("robot"), "--connect", place.endpoint, "--ros2-connect", field.endpoint)
+    allowed = ("--publish", "/cmd_vel", "--subscribe", "/odom", "--subscribe", "/own/*")
+    definition = tmp_path / "own_msgs" / "msg" / "Level.msg"
+    definition.parent.mkdir(parents=True)
+    definition.write_text(OWN)
+    with Serving(*AIRA, "bridge", "ros2", *places, *allowed, "--types", tmp_path, says="bridge of 0x"):
         async with session_on(field) as there, Robot(there, types(), node="rover") as rover, Background() as tasks:
 
             async def drive() -> None:
@@ -219,11 +222,13 @@ async def test_a_paid_job_drives_the_robot_and_others_open_its_recording(
                     async for message in messages:
                         moved = rover.types.decode("geometry_msgs/Twist", message.payload.data)
                         driven.append(moved.linear.x)
+                        tank.put({"level": moved.linear.x, "place": "tank"})
                         odometer.put(message.payload)
 
+            tank = rover.advertise("/own/level", "own_msgs/Level")
             odometer = rover.advertise("/odom", "geometry_msgs/Twist")
             tasks.start(drive(), "rover")
-            await until(lambda: odometer.is_heard, what="the bridge")
+            await until(lambda: odometer.is_heard and tank.is_heard, what="the bridge")
             async with place.at_work(robot) as person:
                 selector = topic_selector(place.address("robot"), topic="/odom")
                 robot.parts.network.session.declare_subscriber(selector, answered.append)
@@ -233,13 +238,15 @@ async def test_a_paid_job_drives_the_robot_and_others_open_its_recording(
 
     assert driven == [0.0, 0.25, 0.5]
     ours = [(one.topic, one.payload) for one in open_objective(recording).messages()]
-    assert {topic for topic, _ in ours} == {"/cmd_vel", "/odom"}
+    assert [topic for topic, _ in ours].count("/own/level") == 3
     with AnyReader([recording]) as reader:
         assert [(each.topic, raw) for each, _, raw in reader.messages()] == ours
         values: list[Any] = [reader.deserialize(raw, each.msgtype) for each, _, raw in reader.messages()]
-        theirs = [value.linear.x for value in values]
     with recording.open("rb") as stream:
         found = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-        assert [(one.channel.topic, one.decoded_message.linear.x) for one in found] == [
-            (topic, x) for (topic, _), x in zip(ours, theirs, strict=True)
-        ]
+        decoded = [one.decoded_message for one in found]
+    for theirs, others in zip(values, decoded, strict=True):
+        if hasattr(theirs, "level"):
+            assert (theirs.level, theirs.place) == (others.level, others.place)
+        else:
+            assert theirs.linear.x == others.linear.x
