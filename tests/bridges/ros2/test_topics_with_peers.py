@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -201,6 +202,37 @@ async def test_a_message_that_a_peer_decodes_and_encodes_again_has_the_same_byte
                 answered = await anext(messages)
         assert answered.payload.data == sent.data
         assert echo.is_alive
+
+
+async def test_a_large_message_is_carried_whole(router: EmbeddedRouter, our_robot: OurRobot) -> None:
+    kind = "sensor_msgs/msg/Image"
+    async with hiroz("echo", router.endpoint, type=kind), our_robot() as robot:
+        await robot.ready("/in")
+        async with robot.subscribe("/out") as messages:
+            sent = robot.types.message(kind, height=1000, width=1500, step=4500, data=bytes(range(250)) * 18_000)
+            robot.publish("/in", sent)
+            async with asyncio.timeout(30):
+                assert (await anext(messages)).payload.data == sent.data
+
+
+async def test_a_subscription_goes_on_when_its_publisher_or_the_router_starts_again(
+    router: EmbeddedRouter, our_robot: OurRobot
+) -> None:
+    async with our_robot() as robot:
+        senders = []
+        async with hiroz("talker", router.endpoint), robot.subscribe("/chatter") as messages:
+            senders.append((await anext(messages)).gid)
+            await asyncio.to_thread(router.stop)
+            await asyncio.to_thread(router.start)
+            started = time.time_ns()
+            async with asyncio.timeout(30):
+                while (await anext(messages)).source_time_ns < started:
+                    pass
+        async with robot.subscribe("/chatter", STRING) as messages, hiroz("talker", router.endpoint):
+            async with asyncio.timeout(30):
+                senders.append((await anext(messages)).gid)
+            await until(lambda: len(robot.graph.find("/chatter", "publisher")) == 1, what="the new talker alone")
+        assert len(set(senders)) == 2
 
 
 async def _graph(peer: RosPeer, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
