@@ -52,17 +52,24 @@ class ShownTypes:
         self._defined: dict[tuple[str, str], PayloadType | None] = {}
         for kind in known:
             if kind.schema_data:
-                self._defined[kind.encoding, kind.schema_name] = kind
+                self._learn(kind)
 
     def shown(self, topic: str, payload: bytes, kind: PayloadType) -> Shown:
         """A message of a topic as Foxglove gets it."""
         if kind.encoding == "json":
             return self._object(topic, payload, kind)
         if kind == EMPTY or kind.schema_data:
+            self._learn(kind)
             return Shown(payload, kind)
         if (defined := self._definition(kind)) is not None:
             return Shown(payload, defined)
         return _image(payload) or _bytes(payload, kind)
+
+    def _learn(self, kind: PayloadType) -> None:
+        """Remember the definition of a type for messages that come without it."""
+        name = kind.encoding, kind.schema_name
+        if self._defined.get(name) is None and len(self._defined) < DEFINITIONS:
+            self._defined[name] = kind
 
     def _object(self, topic: str, payload: bytes, kind: PayloadType) -> Shown:
         """JSON with an object at its root: other data is the value of the property `value`."""

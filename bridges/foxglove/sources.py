@@ -26,6 +26,7 @@ from schemas.agent_keys import (
     RpcKey,
     parse_agent_key,
 )
+from schemas.definitions import defined_by
 from schemas.payloads import PayloadType, payload_type
 from schemas.selectors import device_selector, objective_selector, reading_selector, topic_selector
 
@@ -173,11 +174,19 @@ def received(sample: zenoh.Sample, name: Callable[[Any], str]) -> LiveMessage | 
                 facts = b'{"position":%d,"total":%d}' % (position.position, position.total)
                 return LiveMessage(PROGRESS, facts, PayloadType("json", "aira.Progress"), now)
             case ReadingKey() | DeviceTopicKey() | ObjectiveTopicKey() | LiabilityTopicKey():
-                return LiveMessage(name(key), payload, payload_type(str(sample.encoding)), now)
+                return LiveMessage(name(key), payload, _type_of(sample), now)
         event = read_event(text, payload)
         return None if event is None else LiveMessage(JOB, b"", PayloadType("json"), now, event)
     except AiraError:
         return None
+
+
+def _type_of(sample: zenoh.Sample) -> PayloadType:
+    """The type of a message; its definition may travel with the first one of a topic."""
+    kind = payload_type(str(sample.encoding))
+    if sample.attachment is None or kind.schema_data:
+        return kind
+    return defined_by(sample.attachment.to_bytes(), kind) or kind
 
 
 def _job_topic(key: Any) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from bridges.foxglove.server import CHANNELS, LARGEST, NEW_CHANNELS
 from mesh import foxglove
 from mesh.ros import RosTypes
@@ -68,6 +70,16 @@ async def test_an_own_type_is_shown_by_the_definition_of_the_job(serve: Any) -> 
         assert (value.a, value.b) == (1, 2)
 
 
+async def test_an_own_type_is_shown_by_the_definition_that_came_with_the_first_message(serve: Any) -> None:
+    own = PayloadType("cdr", "my_msgs/msg/Own", "ros2msg")
+    payload = b"\x00\x01\x00\x00\x01\x02"
+    async with serve() as server, viewing(server.front.url) as viewer:
+        server.publish("/first", payload, msgspec.structs.replace(own, schema_data=b"uint8 a\nuint8 b\n"))
+        server.publish("/second", payload, own)
+        (value,) = await viewer.until_seen("/second")
+        assert (value.a, value.b) == (1, 2)
+
+
 async def test_a_schema_that_widens_reaches_the_viewer(serve: Any) -> None:
     async with serve() as server, viewing(server.front.url) as viewer:
         server.publish("/x", b'{"a": 1}', JSON)
@@ -119,6 +131,19 @@ async def test_topics_are_bounded_and_those_of_one_sender(serve: Any) -> None:
                 server.publish(f"/{sender}/{number}", *encode_value("on"), sender=str(sender))
         server.publish("/last", *encode_value("on"), sender="another")
         assert len(server._channels) <= CHANNELS
+
+
+async def test_a_hostile_schema_hurts_no_other_topic(serve: Any) -> None:
+    strange = (b"\xff\xfe", b"\x00", "\udcff".encode(errors="surrogatepass"))
+    async with serve() as server:
+        for number, data in enumerate(strange):
+            for encoding in ("ros1", "cdr", "json", "protobuf"):
+                for schema in ("ros1msg", "jsonschema", "protobuf", ""):
+                    kind = PayloadType(encoding, f"hostile/{number}{encoding}{schema}", schema, data)
+                    server.publish(f"/hostile/{number}/{encoding}/{schema}", b"1", kind)
+        server.publish("/honest", *encode_value("on"))
+        async with viewing(server.front.url, "/honest") as viewer:
+            assert (await viewer.until_seen("/honest"))[0].data == "on"
 
 
 async def test_what_is_too_large_is_dropped(serve: Any) -> None:

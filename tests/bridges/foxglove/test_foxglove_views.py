@@ -17,6 +17,8 @@ from mesh.agent.components import watching
 from mesh.background import Background
 from mesh.cli.errors import NoRecording
 from schemas.agent_keys import DeviceTopicKey
+from schemas.definitions import with_definition
+from schemas.payloads import PayloadType
 from tests.bridges.foxglove.viewer import PLAY, viewing
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
@@ -90,6 +92,11 @@ async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, fron
         key = str(DeviceTopicKey(robot.address, "arm", "/angle"))
         robot.parts.network.session.put(key, b'{"degrees": 3}', encoding="application/json")
         assert await viewer.until_seen("/device/arm/angle") == [{"degrees": 3}]
+        own = PayloadType("ros1", "my_msgs/Own", "ros1msg", b"uint8 a\n")
+        key = str(DeviceTopicKey(robot.address, "arm", "/own"))
+        defined = with_definition(b"", own)
+        robot.parts.network.session.put(key, b"\x05", encoding=own.zenoh_encoding, attachment=defined)
+        assert [value.a for value in await viewer.until_seen("/device/arm/own")] == [5]
         contract = await person.demand(place.save(objective(("/blink", "on"))), model=MODEL, cost=COST)
         await contract.outcome()
         assert (await viewer.until_seen("/job/blinked"))[0].data == "on"
