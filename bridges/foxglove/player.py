@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Final
 
 from foxglove.websocket import PlaybackCommand, PlaybackState, PlaybackStatus
 
+from bridges.foxglove.moments import Moments
 from bridges.foxglove.server import PlaybackControl
 from mesh.background import call_in_loop
 from mesh.recording.playback import read_ahead
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from foxglove.websocket import PlaybackControlRequest
 
@@ -30,8 +31,6 @@ TICK: Final = 1 / 30
 """Seconds between two announcements of the playback's time."""
 UNPAUSED: Final = 64
 """Messages that are due after which the event loop gets its turn."""
-REPEATED: Final = 512
-"""Topics whose last message before a sought time is shown."""
 
 
 class PlaybackHead:
@@ -101,6 +100,7 @@ class RecordingPlayer:
     def __init__(self, recording: Objective) -> None:
         self._recording = recording
         self.head = PlaybackHead(recording.start_ns, recording.start_ns + recording.duration_ns)
+        self._moments = Moments(recording)
         self._types = _widest(recording)
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
@@ -121,18 +121,18 @@ class RecordingPlayer:
         server.announce((topic, kind) for (topic, _, _), kind in self._types.items())
         while True:
             seeks, at_ns = self.head.seeks, self.head.now_ns
-            index = await self._show_moment(server, at_ns)
+            index = await self._show_moment(server, at_ns) if seeks else 0
             self.head.go_on(seeks, at_ns)
             await self._play(server, index, seeks)
 
     async def _show_moment(self, server: FoxgloveServer, at_ns: int) -> int:
         """Show the last message of each topic up to a time; returns the number of the first message after it."""
-        index, last = await asyncio.to_thread(_moment, self._recording, at_ns)
+        moment = await asyncio.to_thread(self._moments.at, at_ns)
         server.forget()
-        for message in last:
+        for message in moment.last:
             self._show(server, message)
         server.broadcast_time(at_ns)
-        return index
+        return moment.number
 
     async def _play(self, server: FoxgloveServer, index: int, seeks: int) -> None:
         """Show the messages from a number on, each when it is due, until the position jumps."""
@@ -151,9 +151,12 @@ class RecordingPlayer:
                     if head.seeks != seeks:
                         return
         while head.seeks == seeks:
-            if (state := head.end(seeks)) is not None:
-                server.broadcast_state(state)
             self._changed.clear()
+            if (state := head.end(seeks)) is not None:
+                await asyncio.sleep(TICK)  # the answer to a client goes first
+                if head.seeks != seeks:
+                    return
+                server.broadcast_state(state)
             await self._changed.wait()
 
     async def _wait(self, server: FoxgloveServer, due_ns: int) -> None:
@@ -177,22 +180,3 @@ class RecordingPlayer:
 def _widest(recording: Objective) -> dict[tuple[str, str, str], PayloadType]:
     """The last type of each topic by encoding and name: a recorder widens the schemas of JSON."""
     return {(topic.name, topic.type.encoding, topic.type.schema_name): topic.type for topic in recording.topics}
-
-
-def _moment(recording: Objective, at_ns: int) -> tuple[int, list[Played]]:
-    """How many messages there are up to a time, and the last of each topic."""
-    last: dict[str, Played] = {}
-    index = 0
-    if at_ns > recording.start_ns:
-        for message in _until(recording, at_ns):
-            index += 1
-            if message.topic in last or len(last) < REPEATED:
-                last[message.topic] = message
-    return index, sorted(last.values(), key=lambda message: message.log_time_ns)
-
-
-def _until(recording: Objective, at_ns: int) -> Iterator[Played]:
-    for message in recording.messages():
-        if message.log_time_ns > at_ns:
-            return
-        yield message
