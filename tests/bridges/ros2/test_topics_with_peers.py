@@ -10,7 +10,7 @@ import pytest
 
 from bridges.ros2 import LATCHED, Robot, RosQos
 from mesh.network import Endpoints, Network
-from tests.bridges.ros2.definitions import ros_types
+from tests.bridges.ros2.definitions import ADD_TWO_INTS, FIBONACCI, ros_types
 from tests.bridges.ros2.peers import RosPeer, hiroz, sdk
 from tests.support.routers import Zenohd
 from tests.support.waiting import until
@@ -151,18 +151,28 @@ async def test_what_a_peer_has_is_in_our_graph_until_it_goes(router: EmbeddedRou
         assert robot.graph.actions() == {}
 
 
-async def test_a_peer_sees_our_node_and_its_topics_until_we_go(router: EmbeddedRouter, our_robot: OurRobot) -> None:
+async def test_a_peer_sees_our_node_and_what_it_has_until_we_go(router: EmbeddedRouter, our_robot: OurRobot) -> None:
+    async def refuse(_: object) -> None:
+        raise ValueError
+
     async with hiroz("graph", router.endpoint) as graph:
         async with our_robot(node="ours", namespace="/mesh") as robot:
             robot.advertise("/cmd_vel", "geometry_msgs/msg/Twist")
-            seen = await _graph(graph, lambda seen: ["/cmd_vel", "geometry_msgs::msg::dds_::Twist_"] in seen["topics"])
+            robot.serve("/add", ADD_TWO_INTS, refuse)
+            robot.serve_action("/count", FIBONACCI, refuse)
+            seen = await _graph(graph, lambda seen: "/count/_action/send_goal" in dict(seen["services"]))
             assert ["ours", "/mesh"] in seen["nodes"]
+            assert dict(seen["topics"])["/cmd_vel"] == "geometry_msgs::msg::dds_::Twist_"
+            assert dict(seen["services"])["/add"] == "example_interfaces::srv::dds_::AddTwoInts_"
+            assert "/count" in dict(seen["actions"])
         await _graph(graph, lambda seen: ["ours", "/mesh"] not in seen["nodes"])
     async with our_robot() as robot:
         robot.advertise("/cmd_vel", "geometry_msgs/msg/Twist")
+        robot.serve("/add", ADD_TWO_INTS, refuse)
         async with sdk("graph", router.endpoint) as graph:
             seen = await graph.next_line()
             assert seen["topics"]["/cmd_vel"] == ["geometry_msgs/msg/Twist"]
+            assert seen["services"]["/add"] == [ADD_TWO_INTS]
 
 
 MESSAGES: dict[str, dict[str, Any]] = {
