@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from schemas.payloads import PayloadType
 
-_LONGEST_DEFINITION: Final = 64 << 10
-"""Bytes of the longest definition that is read; reading a longer one takes too long."""
-_LONGEST_MESSAGE: Final = 1 << 20
-"""Bytes of the longest message that is decoded: as objects it takes up to fifty times as much. Images are longer."""
+_LONGEST_DEFINITION: Final = 32 << 10
+"""Bytes of the longest definition that is read, which takes up to a second."""
+_LONGEST_MESSAGE: Final = 16 << 10
+"""Bytes of the longest message that is decoded, which takes up to a fifth of a second. Images are longer."""
 
 _NO_FIELDS: Final = ("__msgtype__", "structure_needs_at_least_one_member")
 

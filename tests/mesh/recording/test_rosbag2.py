@@ -21,6 +21,7 @@ from mesh.recording import (
 )
 from mesh.recording.ros_values import ros_value
 from mesh.ros import RosTypes
+from schemas.payloads import PayloadType
 from tests.mesh.recording.files import SECOND, T0
 from tests.support.rosbag2 import database, rosbag2
 
@@ -201,6 +202,24 @@ def test_rows_of_any_kind_are_read_or_refused(tmp_path: Path, rows: list[tuple[o
         return
     stored = [(topic, time, data.encode() if isinstance(data, str) else data) for topic, time, data in rows]
     assert sorted(read) == sorted(stored)
+
+
+@pytest.mark.parametrize(
+    ("name", "definition"),
+    [
+        ("a/msg/B:\n    x=print()\nclass C", "int32 y\n"),
+        ("a/msg/B", f"int32 y\n{'=' * 80}\nMSG: a/C:\n    x=print()\nint32 z\n"),
+        ("a/msg/B", "B b\n"),
+        ("a/msg/B", "int32 y\n" * 5000),
+        ("a/msg/B", "$"),
+        ("", "int32 y\n"),
+        ("a/msg/B", f"C[2] c\n{'=' * 80}\nMSG: a/C\nB[2] b\n"),
+    ],
+)
+def test_a_stranger_s_definition_harms_nothing(capsys: pytest.CaptureFixture[str], name: str, definition: str) -> None:
+    payload = b"\0\1\0\0" + bytes(60)
+    assert ros_value(payload, PayloadType("cdr", name, "ros2msg", definition.encode())) == payload
+    assert capsys.readouterr().out == ""
 
 
 @settings(deadline=None, max_examples=300)
