@@ -87,7 +87,7 @@ class RosBridge(Role):
         self._agent = agent
         self._name = name
         self._jobs = JobTracker()
-        self._carried: dict[str, asyncio.Task[None]] = {}
+        self._carried: set[str] = set()
         self._defined: dict[tuple[str, str], float] = {}
         self._refused: set[str] = set()
         self._present: Any = None
@@ -132,12 +132,13 @@ class RosBridge(Role):
         while True:
             await self._robot.graph.wait_for(self._has_changed)
             self._show_presence()
-            for topic in self._offered() - self._carried.keys():
+            for topic in self._offered() - self._carried:
                 if len(self._carried) >= MOST_TOPICS:
                     self.drops.count("ros-topic")
                     self._refused.add(topic)
                     continue
-                self._carried[topic] = asyncio.create_task(self._carry(topic), name=f"carry {topic}")
+                self._carried.add(topic)
+                self._tasks.start(self._carry(topic), f"carry {topic}")
 
     @property
     def current_job(self) -> str:
@@ -150,7 +151,7 @@ class RosBridge(Role):
         return self._present is not None
 
     def _has_changed(self) -> bool:
-        return bool(self._offered() - self._carried.keys()) or self._is_there() != (self._present is not None)
+        return bool(self._offered() - self._carried) or self._is_there() != (self._present is not None)
 
     def _offered(self) -> set[str]:
         """The robot's topics that may be carried and have a publisher of its own."""
@@ -280,8 +281,6 @@ class RosBridge(Role):
         return str(DeviceTopicKey(self._agent, self._name, topic))
 
     def _undeclare(self, declared: list[Any]) -> None:
-        for task in self._carried.values():
-            task.cancel()
         if not self._session.is_closed():
             for each in declared:
                 each.undeclare()

@@ -130,6 +130,26 @@ async def test_in_a_job_they_are_those_of_the_job(mesh: zenoh.Session, field: Em
         assert not heard.on(f"aira/agent/{AGENT}/device/robot/odom")
 
 
+async def test_the_presence_of_the_robot_is_known_and_recorded(mesh: zenoh.Session, field: EmbeddedRouter) -> None:
+    heard = Heard(mesh)
+    async with (
+        session_on(field) as ros,
+        session_on(field) as there,
+        RosBridge(mesh, ros, types(), ALLOW, agent=AGENT) as bridge,
+        Background() as tasks,
+    ):
+        tasks.start(bridge.run(), "bridge of the test")
+        mesh.put(f"aira/agent/{AGENT}/liability/{JOB}/ready", b"{}")
+        await until(lambda: bridge.current_job == JOB, what="the job")
+        assert not bridge.is_present
+        async with Robot(there, types(), node="rover"):
+            await until(lambda: bridge.is_present, what="the robot")
+        await until(lambda: not bridge.is_present, what="its end")
+    said = heard.on(f"aira/agent/{AGENT}/liability/{JOB}/topic/aira/device/robot")
+    decoded: list[Any] = [types().decode("std_msgs/String", sample.payload.to_bytes()) for sample in said]
+    assert [message.data for message in decoded] == ["present", "absent"]
+
+
 @pytest.mark.parametrize(
     "key", ["device/robot/cmd_vel", f"liability/{JOB}/topic/cmd_vel", f"liability/{JOB}/objective/cmd_vel"]
 )
