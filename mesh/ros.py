@@ -46,7 +46,7 @@ class RosTypes:
             self._store = get_typestore(Stores[f"ROS{self._version}_{distribution.upper()}"])
         except KeyError:
             raise UnknownRosType(distribution, "no distribution of ROS that is known here") from None
-        self._distribution = distribution
+        self.distribution: Final = distribution
         self._described: dict[str, PayloadType] = {}
         self._hashes: dict[str, str] = {}
 
@@ -69,7 +69,7 @@ class RosTypes:
         It is `TypeHashNotSupported` in distributions before Iron. Raises `UnknownRosType`.
         """
         self.type(name)
-        if self._distribution in WITHOUT_HASHES:
+        if self.distribution in WITHOUT_HASHES:
             return NO_HASH
         if name not in self._hashes:
             try:
@@ -77,6 +77,15 @@ class RosTypes:
             except KeyError as error:
                 raise UnknownRosType(name, f"it contains {error}, of which there is no definition") from None
         return self._hashes[name]
+
+    @property
+    def is_ros2(self) -> bool:
+        """Whether these are types of ROS 2."""
+        return self._version == 2
+
+    def knows(self, name: str) -> bool:
+        """Whether there is a definition of a type."""
+        return full_ros_name(name) in self._store.types
 
     def type(self, name: str) -> Any:
         """The class of a type, whose instances are messages. Raises `UnknownRosType`."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from mesh.ros import UnknownRosType
+
 if TYPE_CHECKING:
     from mesh.ros import RosTypes
 
@@ -30,6 +32,9 @@ DEFINITIONS: Final = {
 
 
 def add_definitions(types: RosTypes) -> None:
-    """Add the services to `types`."""
+    """Add the services to `types`. Raises `UnknownRosType` if those are of ROS 1."""
+    if not types.is_ros2:
+        raise UnknownRosType(types.distribution, "it is no distribution of ROS 2")
     for name, definition in DEFINITIONS.items():
-        types.register(name, definition)
+        if not types.knows(name):
+            types.register(name, definition)

@@ -37,6 +37,8 @@ class RosGraph:
         self._drops = drops
         self._lock = threading.Lock()
         self._entities: dict[str, RosEntity] = {}
+        self._by_name: defaultdict[str, dict[str, RosEntity]] = defaultdict(dict)
+        """The same by the name of their topic or service, empty for nodes."""
         self._counts: Counter[str] = Counter()
         self._waiting: set[asyncio.Future[None]] = set()
         self._notified = False
@@ -59,8 +61,10 @@ class RosGraph:
 
     def find(self, name: str, *kinds: RosEntityKind) -> list[RosEntity]:
         """The endpoints of a topic, service or action (absolute name), of some kinds or of all."""
-        names = (name, f"{name}{ACTION}send_goal")
-        return [entity for entity in self.entities() if entity.name in names and (not kinds or entity.kind in kinds)]
+        with self._lock:
+            named = [*self._by_name.get(name, {}).values()]
+            named += self._by_name.get(f"{name}{ACTION}send_goal", {}).values()
+        return [entity for entity in named if not kinds or entity.kind in kinds]
 
     def nodes(self) -> list[str]:
         """The names of the nodes, with their namespaces."""
@@ -107,12 +111,7 @@ class RosGraph:
         if sample.kind == zenoh.SampleKind.PUT:
             self._add(token)
         else:
-            with self._lock:
-                gone = self._entities.pop(token, None)
-                if gone is not None:
-                    self._counts[gone.session] -= 1
-                    if not self._counts[gone.session]:
-                        del self._counts[gone.session]
+            self._remove(token)
         if not self._notified:
             self._notified = True
             call_in_loop(self._loop, self._notify)
@@ -127,10 +126,22 @@ class RosGraph:
             if token in self._entities:
                 return
             if len(self._entities) < ENTITIES and self._counts[entity.session] < PER_SESSION:
-                self._entities[token] = entity
+                self._entities[token] = self._by_name[entity.name][token] = entity
                 self._counts[entity.session] += 1
                 return
         self._drops.count("token", entity.session)
+
+    def _remove(self, token: str) -> None:
+        with self._lock:
+            gone = self._entities.pop(token, None)
+            if gone is None:
+                return
+            self._counts[gone.session] -= 1
+            if not self._counts[gone.session]:
+                del self._counts[gone.session]
+            del self._by_name[gone.name][token]
+            if not self._by_name[gone.name]:
+                del self._by_name[gone.name]
 
     def _notify(self) -> None:
         self._notified = False

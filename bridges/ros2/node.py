@@ -133,15 +133,18 @@ class RosNode:
     def encoded(self, type_name: str, message: object) -> Payload:
         """A message as a payload of a type: a dict of its fields, an instance of its class, or a payload that fits.
 
-        Raises `InvalidPayload`, `UnknownRosType`. What does not decode would stop a process of ROS 2.
+        Raises `InvalidPayload`, `UnknownRosType`. What does not decode would stop a process of ROS 2, and so would a
+        bool that is neither 0 nor 1: a payload is decoded, and encoded again.
         """
         match message:
             case Payload():
-                return Payload(self._checked(type_name, message), self.types.payload_type(type_name))
+                self._check(type_name, message.type)
+                return self.types.encode(self.types.decode(type_name, message.data))
             case None | dict():
                 return self.types.message(type_name, **(message or {}))
         payload = self.types.encode(message)
-        return Payload(self._checked(type_name, payload), payload.type)
+        self._check(type_name, payload.type)
+        return payload
 
     def payload_type(self, type_name: str) -> PayloadType:
         """The type of payloads, with the definition if it is known."""
@@ -154,12 +157,10 @@ class RosNode:
         """Bytes of a type."""
         return Payload(data, self.payload_type(type_name))
 
-    def _checked(self, type_name: str, payload: Payload) -> bytes:
-        found = payload.type.schema_name
-        if payload.type.encoding != "cdr" or full_type(found) != full_type(type_name):
-            raise InvalidPayload(type_name, f"it is a {found} in {payload.type.encoding}")
-        self.types.decode(type_name, payload.data)
-        return payload.data
+    def _check(self, type_name: str, given: PayloadType) -> None:
+        """Raise `InvalidPayload` unless a payload is of a type."""
+        if given.encoding != "cdr" or full_type(given.schema_name) != full_type(type_name):
+            raise InvalidPayload(type_name, f"it is a {given.schema_name} in {given.encoding}")
 
     def _entity(self, kind: RosEntityKind, identity: int, **facts: Any) -> RosEntity:
         domain = self.flavour.domain

@@ -151,9 +151,12 @@ class RosServer:
 
     def _receive(self, query: zenoh.Query) -> None:
         """Take a request on Zenoh's thread, which refuses what is too much or malformed."""
-        data = b"" if query.payload is None else query.payload.to_bytes()
+        if query.payload is None or not 4 <= len(query.payload) <= LARGEST_PAYLOAD:
+            self._refuse(query, "bad-request")
+            return
+        data = query.payload.to_bytes()
         attached = None if query.attachment is None else parse_attachment(query.attachment.to_bytes())
-        malformed = data[:2] not in CDR_HEADERS or len(data) < 4 or len(data) > LARGEST_PAYLOAD
+        malformed = data[:2] not in CDR_HEADERS
         if malformed or (attached is None and self._node.flavour.has_attachments):
             self._refuse(query, "bad-request")
         elif not self._places.acquire(blocking=False):

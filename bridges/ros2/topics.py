@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 HEARTBEAT: Final = 0.5
 """Seconds after which a transient-local publisher says which message was its last, so that lost ones are noticed."""
-WAITING_BYTES: Final = 128 * 1024 * 1024
-"""Bytes of messages of one subscription that wait for the consumer, at most."""
+WAITING_BYTES: Final = 32 * 1024 * 1024
+"""Bytes of messages of one subscription that wait, at most: in its ring, and as much in each batch on its way."""
 
 
 @dataclass(frozen=True, slots=True)

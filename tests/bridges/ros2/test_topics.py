@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from tests.support.routers import EmbeddedRouter
+
 STRING_TYPE: Final = "std_msgs/msg/String"
 
 _domains: Final = itertools.count(1)
@@ -272,3 +274,43 @@ async def test_publishers_and_tokens_are_bounded(
         for token in tokens:
             token.undeclare()  # type: ignore[no-untyped-call]
         await until(lambda: ours.graph.nodes() == ["/aira"])
+
+
+async def test_a_payload_is_published_as_ros_2_writes_it(here: zenoh.Session, domain: int) -> None:
+    ros = RosTypes("jazzy")
+    async with Robot(here, ros, domain=domain) as ours:
+        publisher = ours.advertise("/flag", "std_msgs/Bool")
+        kind = ros.payload_type("std_msgs/Bool")
+        written = [
+            publisher.put(Payload(data, kind)).data for data in (b"\0\1\0\0\7", b"\0\0\0\0\1", b"\0\1\0\0\0\0\0\0")
+        ]
+
+    assert written == [b"\0\1\0\0\1", b"\0\1\0\0\1", b"\0\1\0\0\0"]
+
+
+def test_types_of_ros_1_are_refused(here: zenoh.Session) -> None:
+    with pytest.raises(UnknownRosType):
+        Robot(here, RosTypes("noetic"))
+
+
+async def test_a_router_that_returns_brings_everything_back(
+    router: EmbeddedRouter, here: zenoh.Session, there: zenoh.Session, domain: int
+) -> None:
+    async with (
+        Robot(here, RosTypes("jazzy"), domain=domain) as ours,
+        Robot(there, RosTypes("jazzy"), domain=domain, node="talker") as talker,
+    ):
+        publisher = talker.advertise("/chatter", "std_msgs/String")
+        async with ours.subscribe("/chatter") as messages:
+            await talker.ready("/chatter")
+            await asyncio.to_thread(router.stop)
+            try:
+                await until(lambda: "/talker" not in ours.graph.nodes())
+            finally:
+                await asyncio.to_thread(router.start)
+            await ours.ready("/chatter", timeout=20)
+            await until(lambda: publisher.is_heard)
+            publisher.put({"data": "again"})
+            (message,) = await heard(messages, 1)
+
+    assert text(message) == "again"
