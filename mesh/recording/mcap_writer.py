@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
+from io import SEEK_END
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 import zstandard
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 CHUNK_SIZE: Final = 128 << 10
 """Bytes of a chunk. With the package's default of 1 MiB, writing one stalls for 13 ms, and a crash loses more."""
-ROS2_SCHEMAS: Final = ("ros2msg", "ros2idl")
+_ROS2_SCHEMAS: Final = ("ros2msg", "ros2idl")
 MAX_CHANNELS: Final = 0xFFFF
 MAX_TIME: Final = (1 << 64) - 1
 
@@ -170,10 +171,9 @@ class McapWriter:
         """
         self._close_chunk()
         if not self._profile and self._channels and all(map(self._is_ros2, self._channels)):
-            end = self._stream.tell()
             self._stream.seek(len(MAGIC))
             self._stream.write(header_of("ros2"))
-            self._stream.seek(end)
+            self._stream.seek(0, SEEK_END)
         self._stream.write(bytes_of(records.DataEnd(0)))
         start = self._stream.tell()
         summary, offsets = self._summary(start)
@@ -184,8 +184,8 @@ class McapWriter:
         self._stream.write(summary + bytes_of(footer) + MAGIC)
 
     def _is_ros2(self, channel: records.Channel) -> bool:
-        has_schema = channel.schema_id and self._schemas[channel.schema_id - 1].encoding in ROS2_SCHEMAS
-        return bool(has_schema) and channel.message_encoding == "cdr"
+        encoding = self._schemas[channel.schema_id - 1].encoding if channel.schema_id else ""
+        return channel.message_encoding == "cdr" and encoding in _ROS2_SCHEMAS
 
     def _schema(self, type: PayloadType) -> int:
         """The number of a type's schema; 0, which means none, for bytes of no known type."""

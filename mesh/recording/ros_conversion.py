@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.extras import PackageMissing, needs_extra
 from mesh.ros import RosTypes, UnknownRosType, full_ros_name
+from mesh.ros_interfaces import described as definition_of
+from mesh.ros_interfaces import type_hash
 from schemas.payloads import PayloadType
 
 if TYPE_CHECKING:
@@ -56,6 +59,8 @@ class RosConverter:
             return RosConversion(type, why=f"its type {type.schema_name} has no definition")
         if type.schema_encoding == "ros2idl":
             return RosConversion(type, why=f"its type {type.schema_name} is defined in IDL")
+        if self._version == 1 and "/msg/" not in full_ros_name(type.schema_name):
+            return RosConversion(type, why=f"{type.schema_name} is no type in ROS 1")
         try:
             return self._conversion(type, version)
         except Exception as error:  # of a stranger's definition
@@ -64,9 +69,10 @@ class RosConverter:
     def _conversion(self, type: PayloadType, version: int) -> RosConversion:
         name = full_ros_name(type.schema_name)
         described, store = _store(type, name, version=self._version), _store(type, name, version=2)
-        text, digest = described.generate_msgdef(name, ros_version=self._version)
         if self._version == 2:
-            digest = described.hash_rihs01(name)
+            text, digest = definition_of(described, name, 2), type_hash(described, name)
+        else:
+            text, digest = described.generate_msgdef(name, ros_version=1)
         if version == self._version:
             return RosConversion(type, digest=digest)
         if self._version == 2:
@@ -101,6 +107,8 @@ def _store(type: PayloadType, name: str, *, version: int) -> Any:
 
     header = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_JAZZY).fielddefs[_HEADER]
     store = get_typestore(Stores.EMPTY)
-    found = get_types_from_msg(type.schema_data.decode(), name) | {_HEADER: header}
+    of_message = re.sub("/(srv|action)/", "/msg/", name)  # rosbags knows no others
+    found = get_types_from_msg(type.schema_data.decode(), of_message) | {_HEADER: header}
+    found[name] = found[of_message]
     store.register({each: defined for each, defined in found.items() if each not in store.fielddefs})
     return store

@@ -5,6 +5,7 @@ Definitions and payloads may come from strangers: both are bounded, and what can
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
@@ -46,7 +47,9 @@ def _store(kind: PayloadType) -> Any:
 
         store = get_typestore(Stores.EMPTY)
         store.max_sequence_length = _LONGEST_MESSAGE
-        found = get_types_from_msg(kind.schema_data.decode(), kind.schema_name)
+        of_message = re.sub("/(srv|action)/", "/msg/", kind.schema_name)  # rosbags knows no others
+        found = get_types_from_msg(kind.schema_data.decode(), of_message)
+        found[kind.schema_name] = found[of_message]
         store.register({name: defined for name, defined in found.items() if name not in store.fielddefs})
         store.get_msgdef(kind.schema_name)
     except Exception:  # of a stranger's text

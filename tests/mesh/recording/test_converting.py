@@ -151,6 +151,18 @@ def test_what_can_not_be_converted_is_named_and_nothing_is_written(tmp_path: Pat
     assert convert(path, tmp_path / "said.bag", to="bag", topics=["/s*"]).left_out == {}
 
 
+def test_what_services_and_actions_say_is_converted_to_rosbag2_and_named_for_a_bag(tmp_path: Path) -> None:
+    ros = RosTypes("jazzy")
+    ros.register("my_robot/srv/Turn", "float32 angle\n---\nbool done")
+    asked = ros.message("my_robot/srv/Turn_Request", angle=1.5)
+    pack([Played("/turn/_request", asked.data, T0, T0, 0, asked.type)], tmp_path / "it.mcap")
+    done = convert(tmp_path / "it.mcap", tmp_path / "it", to="rosbag2-sqlite3")
+    assert [one.value for one in open_objective(done.path).messages()] == [{"angle": 1.5}]
+    with pytest.raises(Unconvertible) as refused:
+        convert(tmp_path / "it.mcap", tmp_path / "it.bag", to="bag")
+    assert "/turn/_request" in refused.value.topics
+
+
 def test_a_message_that_is_not_of_its_type_is_named(tmp_path: Path) -> None:
     said = messages("jazzy")[-1][2]
     pack([Played("/said", b"\0\1\0\0\xff\xff\0\0", T0, T0, 0, said.type)], tmp_path / "it.mcap")
