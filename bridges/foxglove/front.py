@@ -60,6 +60,7 @@ class FoxgloveFront(Lifecycle):
         self._limiter = RateLimiter(per_sender=CONNECTIONS)
         self._clients: set[asyncio.Task[None]] = set()
         self._admitted = 0
+        self._opening = asyncio.Lock()
         self.inner: tuple[str, int] | None = None
         self.url = ""
 
@@ -118,10 +119,15 @@ class FoxgloveFront(Lifecycle):
                 raise ClientRefused("503 Service Unavailable", "nothing is shown yet")
             if self._admitted >= CLIENTS:
                 raise ClientRefused("503 Service Unavailable", f"there are {CLIENTS} clients already")
-            server_reader, server_writer = await asyncio.open_connection(*self.inner)
+            inner = self.inner
+            server_reader, server_writer = await asyncio.open_connection(*inner)
         self._admitted += 1
         try:
-            server_writer.write(request.carried("{}:{}".format(*self.inner)))
+            # The SDK numbers clients and their sinks apart; the numbers are equal if clients come one after another.
+            async with self._opening, asyncio.timeout(REQUEST_TIMEOUT):
+                server_writer.write(request.carried("{}:{}".format(*inner)))
+                greeting = await server_reader.readuntil(b"\r\n\r\n") + await server_reader.read(PART)
+            writer.write(greeting)
             async with Background() as tasks:
                 tasks.start(_send(reader, server_writer), "foxglove client sends")
                 await _receive(server_reader, writer)

@@ -234,6 +234,7 @@ class FoxgloveServer(Lifecycle):
         if current is opened:
             for one, at in shown:
                 if one.type.schema_name == opened.shown.schema_name:
+                    # A client's number is that of its sink, as long as nothing else in this process is one.
                     opened.channel.log(one.payload, log_time=at, sink_id=client)
         elif current is not None:  # with another schema: the client subscribes to the new one
             current.last, current.size = opened.last, opened.size

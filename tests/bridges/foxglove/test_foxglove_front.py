@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import websockets
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridges.foxglove import front as front_module
@@ -149,7 +149,8 @@ async def test_a_client_that_does_not_read_is_disconnected(serve: Any, monkeypat
         await until(lambda: "/y" in viewer.topics)
 
 
-@given(st.lists(st.integers(0, 70_000), max_size=5), st.integers(1, 5000), st.booleans())
+@settings(deadline=None)
+@given(st.lists(st.sampled_from([0, 1, 125, 126, 65_535, 65_536]), max_size=3), st.integers(7, 5000), st.booleans())
 def test_the_guard_follows_the_frames_of_a_client(sizes: list[int], step: int, masked: bool) -> None:
     data = b"".join(frame(size, masked=masked) for size in sizes)
     guard = FrameGuard()
@@ -173,9 +174,22 @@ def frame(size: int, *, masked: bool) -> bytes:
     return head + bytes(4 if masked else 0) + bytes(size)
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=300))
 def test_no_request_breaks_the_front(head: bytes) -> None:
     for data in (head, b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n" + head + b"\r\n\r\n"):
         with pytest.raises(ClientRefused) as caught:
             Upgrade.parse(data).check(FoxgloveOptions(token=TOKEN))
         assert caught.value.response().startswith(b"HTTP/1.1 4")
+
+
+async def test_viewers_that_come_at_once_get_the_last_messages_each(serve: Any) -> None:
+    async with serve() as server:
+        for number in range(CLIENTS):
+            server.publish(f"/{number}", *encode_value(float(number)))
+
+        async def see(number: int) -> None:
+            async with viewing(server.front.url, f"/{number}") as viewer:
+                assert [one.data for one in await viewer.until_seen(f"/{number}")] == [number]
+
+        await asyncio.gather(*[see(number) for number in range(CLIENTS)])

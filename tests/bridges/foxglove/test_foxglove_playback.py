@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from foxglove.websocket import PlaybackCommand, PlaybackStatus
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridges.foxglove.player import FASTEST, SLOWEST, PlaybackHead, RecordingPlayer
@@ -130,6 +130,7 @@ requests = st.builds(
 )
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(requests, st.integers(0, 100 * SECOND)), max_size=20))
 def test_whatever_is_requested_the_playback_stays_in_the_recording(steps: list[tuple[Any, int]]) -> None:
     now = 0
