@@ -108,7 +108,8 @@ async def test_a_reply_to_another_request_is_not_taken(
     here: zenoh.Session, there: zenoh.Session, domain: int, ros: RosTypes
 ) -> None:
     drops = Drops()
-    wrong = iter([None, b"\0" * 33, RosAttachment(99, 1, b"g" * 16).encode()])
+    others = [RosAttachment(99, 1, b"g" * 16).encode(), RosAttachment(4, 1, b"g" * 16).encode()]
+    wrong = iter([None, b"\0" * 33, *others])
 
     def answer(query: zenoh.Query) -> None:
         with query:
@@ -122,11 +123,11 @@ async def test_a_reply_to_another_request_is_not_taken(
         there.declare_queryable(key, answer, complete=True),
     ):
         async with Robot(here, ros, domain=domain, drops=drops) as ours:
-            for _ in range(3):
+            for _ in range(4):
                 with pytest.raises(RosCallFailed):
                     await ours.call("/add", ADD, {}, timeout=5)
 
-    assert drops.totals() == {"bad-reply": 3}
+    assert drops.totals() == {"bad-reply": 4}
 
 
 async def test_a_missing_server_a_silent_one_and_a_failing_one(
