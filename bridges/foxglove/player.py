@@ -43,6 +43,7 @@ class PlaybackHead:
         self._lock = threading.Lock()
         self._at = start_ns
         self._since = clock()
+        self._jump = start_ns
         self.speed = 1.0
         self.status = PlaybackStatus.Paused
         self.seeks = 0
@@ -64,12 +65,18 @@ class PlaybackHead:
             self._at, self._since = self._now(), self._clock()
             if to is not None:
                 self._at = min(max(to, self.start_ns), self.end_ns)
+                self._jump = self._at
                 self.seeks += 1
             speed = request.playback_speed
             self.speed = 1.0 if math.isnan(speed) else min(max(speed, SLOWEST), FASTEST)
             if to is not None or self.status != PlaybackStatus.Ended:
                 self.status = PlaybackStatus.Playing if plays else PlaybackStatus.Paused
             return self._state(did_seek=to is not None, request=request.request_id)
+
+    def jump(self) -> tuple[int, int]:
+        """How often the position jumped, and where to."""
+        with self._lock:
+            return self.seeks, self._jump
 
     def go_on(self, seeks: int, at_ns: int) -> None:
         """Reading up to there took time that does not count, unless the position has jumped again."""
@@ -120,7 +127,7 @@ class RecordingPlayer:
         """Play until cancelled. Raises `CorruptRecording` if the file has changed."""
         server.announce((topic, kind) for (topic, _, _), kind in self._types.items())
         while True:
-            seeks, at_ns = self.head.seeks, self.head.now_ns
+            seeks, at_ns = self.head.jump()
             index = await self._show_moment(server, at_ns) if seeks else 0
             self.head.go_on(seeks, at_ns)
             await self._play(server, index, seeks)
