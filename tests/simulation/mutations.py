@@ -202,10 +202,11 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "open orders lose their allowance in a reorganisation",
-        "mesh.agent.trade:Trader.reorganised",
-        "self._send_when_covered(",
-        "list(",
+        "mesh.agent.trade:Trader._cover_and_send",
+        "await self._chain.retrying(ensure, outages=self._parts.outages)",
+        "pass",
         "reorganise_after,forget",
+        seeds=60,
     ),
     Mutation(
         "each transaction is sent twice",
@@ -264,13 +265,6 @@ CANDIDATES: Final = (
         "mesh.market.liability_events:LiabilityEvents._revert",
         "created = [",
         "return []\n    created = [",
-        REORGANISATIONS,
-    ),
-    Mutation(
-        "an allowance that a reorganisation took is not approved again",
-        "mesh.agent.trade:Trader.liability_reverted",
-        "self._send_when_covered(again)",
-        "again = []",
         REORGANISATIONS,
     ),
     Mutation(
