@@ -136,6 +136,7 @@ class MinedTransaction(_Answer, frozen=True):
     """The receipt of a transaction. `status` is 1 if it succeeded; `contract_address` is what it deployed."""
 
     block_number: Count
+    block_hash: Word
     gas_used: Count
     effective_gas_price: Quantity
     status: Count

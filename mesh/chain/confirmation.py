@@ -121,6 +121,8 @@ class Confirmation:
         self._backoff = Backoff(node.timing.outage_retry)
         self._was_refused = False
         self._was_mined = False
+        self._was_missed = False
+        """Whether a new block was looked at that may have had it, and had it not: rarely is its nonce lost by then."""
         self._nonce_used = 0
         """Checks in a row that found the nonce used by another transaction."""
 
@@ -139,7 +141,9 @@ class Confirmation:
                     await self._news()
                     found = await self._find_confirmed()
                     if found is None and not self._was_mined:
-                        await self._check_nonce()
+                        if self._was_missed:
+                            await self._check_nonce()
+                        self._was_missed = True
                         if loop.time() >= self._replace_at:
                             await self._unblock()
                             self._replace_at = loop.time() + timing.replace_after

@@ -6,7 +6,7 @@ import asyncio
 import time
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from mesh.chain.accounts import SignedTransaction
 from mesh.flood import BoundedDict
@@ -14,6 +14,7 @@ from mesh.flood import BoundedDict
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
+    from mesh.chain.answers import BlockHeader, MinedTransaction
     from mesh.chain.transaction_store import LockedEntry, TransactionStore
 
 T = TypeVar("T")
@@ -79,6 +80,14 @@ def effect_of(fields: dict[str, Any]) -> Effect:
     return fields["to"] or "", fields["data"], fields["value"]
 
 
+class _Count(NamedTuple):
+    """How many transactions an account had sent as of a block."""
+
+    block: int
+    block_hash: bytes
+    transactions: int
+
+
 class PendingTransactions:
     """The pending transactions of one account at one node, shared by all its senders, which take turns by `lock`.
 
@@ -92,6 +101,22 @@ class PendingTransactions:
         self._entries: dict[int, PendingTransaction] = {}
         self._elsewhere: frozenset[int] = frozenset()
         self._mined: BoundedDict[int, PendingTransaction] = BoundedDict(MINED_KEPT)
+        self._counted: _Count | None = None
+
+    def counted(self, head: BlockHeader | None) -> int | None:
+        """How many transactions the account has sent, if that was counted at block `head` or at its parent.
+
+        None says to ask the node: blocks may have been replaced since.
+        """
+        if head is None or self._counted is None or self._counted.block_hash not in (head.hash, head.parent_hash):
+            return None
+        return self._counted.transactions
+
+    def count(self, head: BlockHeader | None, transactions: int | None) -> None:
+        """Note how many transactions the account has sent as of block `head`; None if that is not certain."""
+        self._counted = None
+        if head is not None and transactions is not None:
+            self._counted = _Count(head.number, head.hash, transactions)
 
     async def refresh(self) -> None:
         """See what other processes did to the store."""
@@ -159,10 +184,12 @@ class PendingTransactions:
             entry.locked.release()
             entry.locked = None
 
-    async def settle(self, entry: PendingTransaction) -> None:
+    async def settle(self, entry: PendingTransaction, receipt: MinedTransaction) -> None:
         """Drop a transaction that is mined and confirmed."""
         await self.forget(entry)
         self._mined[entry.nonce] = entry
+        if self._counted is not None and self._counted.block <= receipt.block_number:
+            self._counted = _Count(receipt.block_number, receipt.block_hash, self._counted.transactions)
 
     async def forget(self, entry: PendingTransaction) -> None:
         """Drop a transaction that can't be mined any more, or that the node never accepted."""

@@ -97,7 +97,7 @@ class TransactionSender:
             confirmation = Confirmation(self._node, self.account, pending, entry, since=since)
             try:
                 signed, receipt = await confirmation.wait()
-                await pending.settle(entry)
+                await pending.settle(entry, receipt)
             except NonceLost:
                 log.info(
                     "nonce %d was used by another transaction; sending with the next",
@@ -149,10 +149,12 @@ class TransactionSender:
         backoff = Backoff(NONCE_RETRY)
         failure: ChainError = NodeUnreachable(self._node.endpoint, "other clients of the account take all its nonces")
         while True:
+            head = self._node.heads.latest
             nonce = await self._next_nonce(pending, refused_nonces)
             signed = self.account.sign_transaction(fields | {"nonce": nonce})
             entry = PendingTransaction(nonce=nonce, fields=fields, versions=[signed])
             if await pending.add(entry):
+                pending.count(None, None)  # what becomes of this one is not known yet
                 try:
                     await submit(self._node, signed)
                 except RequestRefused as refused:
@@ -167,6 +169,7 @@ class TransactionSender:
                     pending.abandon(entry)  # the node may have it
                     raise
                 else:
+                    pending.count(head, nonce + 1)
                     self._node.metrics.count(TransactionOutcome.SENT)
                     return entry
             log.debug("%s: nonce %d was taken; trying the next", self.account.address, nonce)
@@ -176,7 +179,9 @@ class TransactionSender:
     async def _next_nonce(self, pending: PendingTransactions, refused: set[int]) -> int:
         """The first nonce that no transaction has, neither of those that the node knows nor of those we sent."""
         await pending.refresh()
-        counted = await self._node.transaction_count(self.account.address, pending=True)
+        counted = pending.counted(self._node.heads.latest)
+        if counted is None or pending.abandoned:
+            counted = await self._node.transaction_count(self.account.address, pending=True)
         # A node behind a load balancer may not know what was just sent through another.
         waiting = [
             entry.nonce
