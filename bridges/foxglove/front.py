@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import ssl
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +18,7 @@ from bridges.foxglove.errors import ClientRefused
 from bridges.foxglove.handshake import LONGEST_FRAME, FrameGuard, Upgrade
 from bridges.web.options import is_loopback
 from mesh.background import Background
+from mesh.devchain.errors import PortUnavailable
 from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
 from mesh.role import Lifecycle
@@ -68,9 +70,13 @@ class FoxgloveFront(Lifecycle):
         options = self._options
         tls = await asyncio.to_thread(_tls, options)
         timeout = None if tls is None else REQUEST_TIMEOUT
-        server = await asyncio.start_server(
-            self._accept, options.host, options.port, ssl=tls, ssl_handshake_timeout=timeout, limit=LONGEST_HEAD
-        )
+        try:
+            server = await asyncio.start_server(
+                self._accept, options.host, options.port, ssl=tls, ssl_handshake_timeout=timeout, limit=LONGEST_HEAD
+            )
+        except OSError as error:
+            why = os.strerror(error.errno) if error.errno else str(error)
+            raise PortUnavailable(options.host, options.port, why, option="--listen HOST:PORT") from None
         stack.push_async_callback(self._end, server)
         host = f"[{options.host}]" if ":" in options.host else options.host
         self.url = f"{'ws' if tls is None else 'wss'}://{host}:{server.sockets[0].getsockname()[1]}"

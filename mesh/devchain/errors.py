@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 
 
 class PortUnavailable(ConfigurationError, code="port-unavailable"):
-    """The node can't listen on its port: it is taken, or this user may not have it."""
+    """A server can't listen on its port: it is taken, or this user may not have it."""
 
-    def __init__(self, host: str, port: int, why: str) -> None:
+    def __init__(self, host: str, port: int, why: str, *, option: str = "--port") -> None:
         super().__init__(
             f"can't listen on {host}:{port}: {why}",
-            hint="is another node running there? choose another with --port; 0 selects a free one",
+            hint=f"is another one running there? choose another with {option}; 0 selects a free one",
         )
         self.host = host
         self.port = port

@@ -129,8 +129,7 @@ class Settlement:
     def set_aside(self, order: Verified[Order], reason: str) -> None:
         """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
         if self._refusal(order) is None and order_id(order) not in self._book and self._unfunded.add(order):
-            why = "its maker does not have, or does not allow the factory to take, what it costs"
-            self.rejections.reject(order, reason, why)
+            self.rejections.reject(order, reason, "its maker lacks the money, or the factory may not take it")
         self._forget(order, after=self._pause)
 
     def _settle_again(self, message: Verified[Any]) -> None:
@@ -151,7 +150,8 @@ class Settlement:
     def withdraw(self, withdrawal: Verified[Withdrawal]) -> None:
         """Honour a withdrawal: its order leaves the book, and is refused until its deadline.
 
-        A transaction that was sent already can't be stopped. If it was not, or fails, the order is refused then.
+        A transaction that was sent already can't be stopped. If it was not, or fails, the order is refused then. The
+        maker is told once the withdrawal outlasts a restart.
         """
         identity = withdrawn_id(withdrawal)
         if not self._withdrawals.add(withdrawal, is_open=identity in self._book):
@@ -160,7 +160,9 @@ class Settlement:
             self._forget(withdrawal)
             return
         self._book.remove(identity)
-        if self.events.unconfirmed.get(identity) is None:
+        if not self._withdrawals.is_kept(identity):
+            self._forget(withdrawal, after=self._pause)
+        elif self.events.unconfirmed.get(identity) is None:
             self.rejections.honour(withdrawal)
 
     def block(self, signers: frozenset[str]) -> None:

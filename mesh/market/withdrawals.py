@@ -74,6 +74,8 @@ class Withdrawals:
         self._due: list[tuple[int, bytes]] = []
         """Deadline and order of each, the earliest first."""
         self._by_signer: Counter[str] = Counter()
+        self._unwritten: set[bytes] = set()
+        """Orders whose withdrawal could not be written."""
         self._outage = OutageLog(log, "withdrawals")
         self._database: sqlite3.Connection | None = None
 
@@ -106,18 +108,29 @@ class Withdrawals:
     def add(self, withdrawal: Verified[Withdrawal], *, is_open: bool = False) -> bool:
         """Know a withdrawal until its deadline; False if there is no room for it, or it is one too many for now.
 
-        The latter not if its order `is_open`. One per order is kept.
+        The latter not if its order `is_open`. One per order is kept. One that could not be written is written when it
+        is added again.
         """
         identity = withdrawn_id(withdrawal)
-        if identity in self._known:
+        is_known = identity in self._known
+        if is_known and identity not in self._unwritten:
             return True
-        if not (is_open or self._rate.allow(withdrawal.signer)) or not self._take(identity, withdrawal):
+        if not is_known and not (is_open or self._rate.allow(withdrawal.signer)):
+            return False
+        if not is_known and not self._take(identity, withdrawal):
             return False
         row = identity, withdrawal.signer, encode(withdrawal.message)
-        self._write("INSERT OR REPLACE INTO withdrawals VALUES (?, ?, ?)", [row])
+        if self._write("INSERT OR REPLACE INTO withdrawals VALUES (?, ?, ?)", [row]):
+            self._unwritten.discard(identity)
+        else:
+            self._unwritten.add(identity)
         if len(self._known) > self._limit:
             self._forget([self._due.pop()])
         return identity in self._known
+
+    def is_kept(self, order: bytes) -> bool:
+        """Whether the withdrawal of the order with this identity is known, and still will be after a restart."""
+        return order in self._known and order not in self._unwritten
 
     def expire(self, head: int) -> None:
         """Forget the withdrawals whose deadline is not after block `head`: their orders have expired, too."""
@@ -137,6 +150,7 @@ class Withdrawals:
     def _forget(self, due: list[tuple[int, bytes]]) -> None:
         for _, identity in due:
             signer = self._known.pop(identity).signer
+            self._unwritten.discard(identity)
             self._by_signer[signer] -= 1
             if not self._by_signer[signer]:
                 del self._by_signer[signer]
@@ -154,9 +168,9 @@ class Withdrawals:
         except (sqlite3.Error, InvalidMessage) as error:
             self._failed(error)
 
-    def _write(self, statement: str, rows: list[tuple[object, ...]]) -> None:
+    def _write(self, statement: str, rows: list[tuple[object, ...]]) -> bool:
         if self._database is None:
-            return
+            return self._path is None
         try:
             self._database.execute("BEGIN")
             self._database.executemany(statement, rows)
@@ -165,8 +179,9 @@ class Withdrawals:
             if self._database.in_transaction:
                 self._database.execute("ROLLBACK")
             self._failed(error)
-        else:
-            self._outage.recovered("withdrawals are kept on disk again")
+            return False
+        self._outage.recovered("withdrawals are kept on disk again")
+        return True
 
     def _failed(self, error: Exception) -> None:
         assert self._path is not None

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 CHUNK_SIZE: Final = 128 << 10
 """Bytes of a chunk. With the package's default of 1 MiB, writing one stalls for 13 ms, and a crash loses more."""
-_ROS2_SCHEMAS: Final = ("ros2msg", "ros2idl")
 MAX_CHANNELS: Final = 0xFFFF
 MAX_TIME: Final = (1 << 64) - 1
 
@@ -106,9 +105,7 @@ class McapWriter:
         size, offset, channel_id = len(payload), self._size, channel.id
         number = (channel.sequence if sequence is None else sequence) & 0xFFFFFFFF
         head = _MESSAGE.pack(Opcode.MESSAGE, _MESSAGE_FIELDS + size, channel_id, number, log_time_ns, publish_time_ns)
-        try:
-            index = self._indexes[channel_id]
-        except KeyError:
+        if (index := self._indexes.get(channel_id)) is None:
             index = self._indexes[channel_id] = []
         index += (log_time_ns, offset)
         self._parts += (head, payload)
@@ -121,8 +118,7 @@ class McapWriter:
     def channel(self, topic: str, type: PayloadType, metadata: Mapping[str, str]) -> WriterChannel:
         """The channel of a topic, type and metadata, created on first use. Raises `Unrecordable`."""
         key = (topic, type, *metadata.items())
-        known = self._known_channels.get(key)
-        if known is not None:
+        if (known := self._known_channels.get(key)) is not None:
             return known
         if len(self._channels) >= MAX_CHANNELS:
             raise Unrecordable(f"a recording can't hold more than {MAX_CHANNELS} channels")
@@ -185,7 +181,7 @@ class McapWriter:
 
     def _is_ros2(self, channel: records.Channel) -> bool:
         encoding = self._schemas[channel.schema_id - 1].encoding if channel.schema_id else ""
-        return channel.message_encoding == "cdr" and encoding in _ROS2_SCHEMAS
+        return channel.message_encoding == "cdr" and encoding in ("ros2msg", "ros2idl")
 
     def _schema(self, type: PayloadType) -> int:
         """The number of a type's schema; 0, which means none, for bytes of no known type."""

@@ -11,6 +11,7 @@ from mesh.agent import Agent, JobFailed
 from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
 from mesh.agent.orders import OrderState
 from mesh.chain import XRT, Chain
+from mesh.composition import withdrawals_of
 from mesh.errors import AiraError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
@@ -180,7 +181,10 @@ class ProviderRole(Role):
         """Match and settle."""
         async with Network(Endpoints(connect=(ENDPOINT,), timeout=-1)) as network, self.chain() as chain:
             await chain.lighthouses.become_provider(self.lighthouse, STAKE)
-            async with Provider(network.session, chain, self.lighthouse, matched=self._matched) as self.provider:
+            kept = withdrawals_of(self.settings(), self.account, self.lighthouse)
+            async with Provider(
+                network.session, chain, self.lighthouse, matched=self._matched, withdrawals=kept
+            ) as self.provider:
                 await self.provider.run()
 
     def _matched(self, match: Match) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,6 +12,7 @@ from bridges.foxglove import sources
 from bridges.foxglove.cli import LAYOUTS
 from bridges.web.errors import NotOpenToOthers
 from mesh.cli.errors import FileExists, InvalidOptions
+from mesh.devchain.errors import PortUnavailable
 from mesh.errors import NetworkUnavailable
 from schemas.agent_keys import ReadingKey
 from tests.bridges.foxglove.viewer import viewing
@@ -47,6 +49,13 @@ async def test_the_command_shows_what_an_agent_publishes(router: EmbeddedRouter)
 def test_other_machines_are_refused_without_tls_and_token() -> None:
     done = invoke("foxglove", "market", "--listen", "0.0.0.0:0")
     assert "--token-file" in refused(done, NotOpenToOthers, "0.0.0.0")
+
+
+def test_a_port_that_is_taken_is_an_error() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = invoke("foxglove", "market", "--listen", f"127.0.0.1:{port}")
+    assert "--listen" in refused(done, PortUnavailable, str(port))
 
 
 def test_a_short_token_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import sqlite3
 import stat
 from typing import TYPE_CHECKING
 
@@ -88,7 +89,23 @@ def test_withdrawals_are_known_without_a_disk(tmp_path: Path, caplog: pytest.Log
     with Withdrawals(path) as withdrawals:
         assert withdrawals.add(one := withdrawal())
         assert withdrawn_id(one) in withdrawals
+        assert not withdrawals.is_kept(withdrawn_id(one))
         withdrawals.expire(100)
         assert len(withdrawals) == 0
     (outage,) = logged_facts(caplog, "withdrawals-outage")
     assert outage["code"] == "withdrawals-not-kept"
+
+
+def test_a_withdrawal_that_could_not_be_written_is_written_with_its_next_copy(tmp_path: Path) -> None:
+    path, one = tmp_path / "withdrawals.sqlite", withdrawal()
+    with Withdrawals(path) as withdrawals:
+        with sqlite3.connect(path, isolation_level=None) as other:
+            other.execute("BEGIN IMMEDIATE")  # nobody else can write
+            assert withdrawals.add(one)
+            assert not withdrawals.is_kept(withdrawn_id(one))
+            other.execute("ROLLBACK")
+        other.close()
+        assert withdrawals.add(one)
+        assert withdrawals.is_kept(withdrawn_id(one))
+    with Withdrawals(path) as again:
+        assert again.is_kept(withdrawn_id(one))
