@@ -215,22 +215,13 @@ MUTATIONS: Final = (
         "entry = before or (await self._send_new(pending, fields), await self._send_new(pending, fields))[0]",
         "late",
     ),
-)
-
-CANDIDATES: Final = (
-    Mutation(
-        "the listener's cursor runs ahead of what it has handled",
-        "mesh.agent.listener:ChainListener._follow",
-        "block.block_number - 1, history",
-        "block.block_number, history",
-        CRASHES,
-    ),
     Mutation(
         "the provider ignores withdrawals",
         "mesh.market.settlement:Settlement._refusal",
         "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
         "return None",
         "repeat_every,delay",
+        seeds=60,
     ),
     Mutation(
         "the ledger's position runs ahead of the recording",
@@ -245,6 +236,32 @@ CANDIDATES: Final = (
         "self._epoch + self._clock.monotonic_ns()",
         "self._clock.time_ns()",
         "clock_every",
+        seeds=60,
+    ),
+    Mutation(
+        "the provider does not see a reorganisation",
+        "mesh.market.liability_events:LiabilityEvents._revert",
+        "created = [",
+        "return []\n    created = [",
+        REORGANISATIONS,
+        seeds=60,
+    ),
+    Mutation(
+        "a count that a node states is believed, whatever it is",
+        "mesh.chain.answers:_decode_value",
+        "if kind is Count and number >> 63:",
+        "if False:",
+        "spoilt",
+    ),
+)
+
+CANDIDATES: Final = (
+    Mutation(
+        "the listener's cursor runs ahead of what it has handled",
+        "mesh.agent.listener:ChainListener._follow",
+        "block.block_number - 1, history",
+        "block.block_number, history",
+        CRASHES,
     ),
     Mutation(
         "a job that was set aside is never taken up again",
@@ -259,20 +276,6 @@ CANDIDATES: Final = (
         "missing < MISSING_CHECKS",
         "True",
         REORGANISATIONS,
-    ),
-    Mutation(
-        "the provider does not see a reorganisation",
-        "mesh.market.liability_events:LiabilityEvents._revert",
-        "created = [",
-        "return []\n    created = [",
-        REORGANISATIONS,
-    ),
-    Mutation(
-        "a count that a node states is believed, whatever it is",
-        "mesh.chain.answers:_decode_value",
-        "if kind is Count and number >> 63:",
-        "if False:",
-        "spoilt",
     ),
     Mutation(
         "the provider forgets withdrawals when it is restarted",
