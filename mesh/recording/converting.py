@@ -178,7 +178,7 @@ def _messages(
 def _mcap_file(target: Path, sources: Sequence[RecordingSource], cid: str) -> Iterator[tuple[Path, OnRecord]]:
     is_ros1 = all(channel.type.encoding == "ros1" for each in sources for channel in each.channels.values())
     with atomic_file(target) as stream:
-        writer = McapWriter(stream, profile="ros1" if is_ros1 else "")
+        writer = McapWriter(stream, profile="ros1" if is_ros1 else None)
         writer.add_metadata("aira", {"source": cid, "source_format": sources[0].format})
 
         def add(channel: RecordingChannel, conversion: RosConversion, message: RecordedMessage) -> None:

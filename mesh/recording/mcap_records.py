@@ -35,7 +35,6 @@ _CHUNK_HEAD: Final = 40
 _LONGEST_COMPRESSION: Final = 32
 _ATTACHMENT_HEAD: Final = 64 << 10
 """Bytes at the start of an attachment that must contain its names and times."""
-_LONGEST_PROFILE: Final = 4
 _PIECE: Final = 1 << 20
 
 
@@ -208,9 +207,9 @@ def check_range_crc(path: Path, file: BinaryIO, *, start: int, end: int, crc: in
         raise CorruptRecording(path, "a checksum is wrong")
 
 
-def header_of(profile: str) -> bytes:
-    """The header record, whose length is the same for each profile: readers skip what follows its fields."""
-    header = bytes_of(records.Header(profile, LIBRARY)) + bytes(_LONGEST_PROFILE - len(profile))
+def header_of(profile: str, *, room: int = 0) -> bytes:
+    """The header record, with room for a profile of so many characters: readers skip what follows its fields."""
+    header = bytes_of(records.Header(profile, LIBRARY)) + bytes(max(room - len(profile), 0))
     return _PREFIX.pack(Opcode.HEADER, len(header) - _PREFIX.size) + header[_PREFIX.size :]
 
 

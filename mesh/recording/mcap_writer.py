@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 CHUNK_SIZE: Final = 128 << 10
 """Bytes of a chunk. With the package's default of 1 MiB, writing one stalls for 13 ms, and a crash loses more."""
 MAX_CHANNELS: Final = 0xFFFF
+ROS2: Final = "ros2"
+"""The profile without which readers of rosbag2 refuse a file."""
 MAX_TIME: Final = (1 << 64) - 1
 
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
@@ -49,11 +51,11 @@ class WriterChannel:
 class McapWriter:
     """An MCAP file that is written to `stream`, in zstd chunks of about `chunk_size` bytes. For one thread.
 
-    Without `finish` the file has no index and no end; closing the stream is left to the caller. All methods that write
-    raise `OSError`.
+    Without `finish` the file has no index and no end; closing the stream is left to the caller. With the `profile` None
+    a file of ROS 2 messages only gets the profile of ROS 2 at the end. All methods that write raise `OSError`.
     """
 
-    def __init__(self, stream: BinaryIO, *, profile: str = "", chunk_size: int = CHUNK_SIZE) -> None:
+    def __init__(self, stream: BinaryIO, *, profile: str | None = "", chunk_size: int = CHUNK_SIZE) -> None:
         self._stream = stream
         self._chunk_size = chunk_size
         self._zstd = zstandard.ZstdCompressor()
@@ -72,7 +74,7 @@ class McapWriter:
         """For each channel of the open chunk: log time and offset of one message after the other."""
         self.messages = 0
         self._profile = profile
-        stream.write(MAGIC + header_of(profile))
+        stream.write(MAGIC + (header_of("", room=len(ROS2)) if profile is None else header_of(profile)))
 
     def add(
         self,
@@ -161,14 +163,11 @@ class McapWriter:
         self._stream.flush()
 
     def finish(self) -> None:
-        """Write the index and the end of the file; the stream stays open.
-
-        If all channels are of ROS 2, so is the file's profile, without which readers of rosbag2 refuse it.
-        """
+        """Write the index and the end of the file; the stream stays open."""
         self._close_chunk()
-        if not self._profile and self._channels and all(map(self._is_ros2, self._channels)):
+        if self._profile is None and self._channels and all(map(self._is_ros2, self._channels)):
             self._stream.seek(len(MAGIC))
-            self._stream.write(header_of("ros2"))
+            self._stream.write(header_of(ROS2))
             self._stream.seek(0, SEEK_END)
         self._stream.write(bytes_of(records.DataEnd(0)))
         start = self._stream.tell()

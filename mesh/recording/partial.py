@@ -83,7 +83,7 @@ class PartialFile:
         make_missing_folders(final.parent)
         _set_aside(final, self._part, self._cut)
         self._stream = _locked(self._part)
-        self._writer = McapWriter(self._stream)
+        self._writer = McapWriter(self._stream, profile=None)
         self._channels: dict[str, tuple[PayloadType, MessageRole, WriterChannel]] = {}
         self._schemas = JsonSchemas()
         """The channel of the last message on each topic: the next one most likely has the same type and role."""

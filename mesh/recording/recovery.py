@@ -59,7 +59,7 @@ def recover(path: Path, target: Path | None = None) -> RecoverySummary:
         raise RecordingExists(final)
     source, why = readable_part(path)
     with atomic_file(final, private=True) as stream:
-        writer = McapWriter(stream)
+        writer = McapWriter(stream, profile=None)
         for name, values in source.metadata.items():
             writer.add_metadata(name, values)
         copy_content(source, writer)
