@@ -221,7 +221,7 @@ MUTATIONS: Final = (
         "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
         "return None",
         "repeat_every,delay",
-        seeds=60,
+        seeds=120,
     ),
     Mutation(
         "the ledger's position runs ahead of the recording",
@@ -229,14 +229,6 @@ MUTATIONS: Final = (
         "synced.position, recorded=synced.messages",
         "run.position + 1, recorded=0",
         CRASHES,
-    ),
-    Mutation(
-        "messages are recorded with the time of day",
-        "mesh.recording.recorder:Recorder.record",
-        "self._epoch + self._clock.monotonic_ns()",
-        "self._clock.time_ns()",
-        "clock_every",
-        seeds=60,
     ),
     Mutation(
         "the provider does not see a reorganisation",
@@ -256,6 +248,13 @@ MUTATIONS: Final = (
 )
 
 CANDIDATES: Final = (
+    Mutation(
+        "messages are recorded with the time of day",
+        "mesh.recording.recorder:Recorder.record",
+        "self._epoch + self._clock.monotonic_ns()",
+        "self._clock.time_ns()",
+        "clock_every",
+    ),
     Mutation(
         "the listener's cursor runs ahead of what it has handled",
         "mesh.agent.listener:ChainListener._follow",
