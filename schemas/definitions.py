@@ -10,8 +10,11 @@ from typing import Final
 
 from schemas.payloads import PayloadType
 
+REPEAT_SECONDS: Final = 5.0
+"""Seconds after which a definition travels again: what carried it may be lost, and listeners come later."""
 LONGEST_DEFINITION: Final = 64 << 10
 """Bytes of the longest definition that travels."""
+REMEMBERED_TOPICS: Final = 4096
 _SCHEMA_ENCODINGS: Final = frozenset({"ros1msg", "ros2msg", "ros2idl", "jsonschema", "protobuf"})
 
 
@@ -32,3 +35,19 @@ def defined_by(attachment: bytes, type: PayloadType) -> PayloadType | None:
     if schema_encoding not in _SCHEMA_ENCODINGS:
         return None
     return PayloadType(type.encoding, type.schema_name, schema_encoding, definition)
+
+
+class SentDefinitions:
+    """When the definition of a topic's type was sent last: it goes with the first message, and then now and again."""
+
+    def __init__(self) -> None:
+        self._sent: dict[str, float] = {}
+
+    def attachment(self, mark: bytes, key: str, type: PayloadType, now: float) -> bytes:
+        """The attachment of a message on a key, at `now` (seconds on a monotonic clock): with the definition or not."""
+        if now - self._sent.get(key, -REPEAT_SECONDS) < REPEAT_SECONDS:
+            return mark
+        if len(self._sent) >= REMEMBERED_TOPICS:
+            self._sent.clear()
+        self._sent[key] = now
+        return with_definition(mark, type)

@@ -31,7 +31,7 @@ from mesh.network import sending
 from mesh.network.pump import Pump
 from mesh.role import Role
 from schemas.agent_keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, parse_agent_key, topic_chunks
-from schemas.definitions import with_definition
+from schemas.definitions import SentDefinitions
 from schemas.errors import InvalidPayload
 from schemas.payloads import Payload, PayloadType, String, decode_value, payload_type
 from schemas.selectors import device_selector, event_selector, objective_selector, topic_selector
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-DEFINITION_SECONDS: Final = 5.0
-"""Seconds after which the definition of a topic's type travels again: what carried it may be lost."""
 RETRY_SECONDS: Final = 5.0
 """Seconds after which a topic is tried again that could not be subscribed to."""
 MOST_TOPICS: Final = 256
@@ -88,7 +86,7 @@ class RosBridge(Role):
         self._name = name
         self._jobs = JobTracker()
         self._carried: set[str] = set()
-        self._defined: dict[tuple[str, str], float] = {}
+        self._definitions = SentDefinitions()
         self._refused: set[str] = set()
         self._present: Any = None
         self.published = self.received = 0
@@ -203,13 +201,8 @@ class RosBridge(Role):
 
     def _put(self, job: str, topic: str, payload: bytes, kind: PayloadType) -> None:
         """Put a message of the robot on its topic of the current job, or of the device."""
-        mark, now = said_by(self._name), time.monotonic()
         key = str(LiabilityTopicKey(self._agent, job, topic)) if job else self._key(topic)
-        if now - self._defined.get((job, topic), -DEFINITION_SECONDS) >= DEFINITION_SECONDS:
-            if (job, topic) not in self._defined:
-                self._defined = {known: at for known, at in self._defined.items() if known[0] == job}
-            self._defined[job, topic] = now
-            mark = with_definition(mark, kind)
+        mark = self._definitions.attachment(said_by(self._name), key, kind, time.monotonic())
         sending.put(self._session, key, payload, encoding=kind.zenoh_encoding, attachment=mark)
 
     def _taken(self, sample: zenoh.Sample) -> tuple[str, bytes, str] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import weakref
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from mesh.network import sending
 from mesh.recording import encode_described
 from mesh.work.listening import JobMessages
 from schemas.agent_keys import LiabilityTopicKey, topic_chunks
+from schemas.definitions import SentDefinitions
 from schemas.payloads import PayloadType, payload_type
 
 if TYPE_CHECKING:
@@ -34,6 +36,7 @@ class Job:
         self._session = session
         self._agent = agent
         self._types: dict[tuple[str, str], PayloadType] = {}
+        self._definitions = SentDefinitions()
         self._subscriber: Any = None
         self._listening: tuple[weakref.ref[JobMessages], ...] = ()
         self.liability = liability
@@ -58,9 +61,11 @@ class Job:
         self._check_running()
         payload, kind = encode_described(message)
         key = str(LiabilityTopicKey(self._agent, self.liability.address, topic))
-        if payload_type(kind.zenoh_encoding) != kind:  # only its name travels
+        attachment = None
+        if payload_type(kind.zenoh_encoding) != kind:  # the name alone does not say what it is
             self._types[topic, kind.zenoh_encoding] = kind
-        self._put(key, payload, kind)
+            attachment = self._definitions.attachment(b"", key, kind, time.monotonic()) or None
+        self._put(key, payload, kind, attachment)
 
     def listen(self, topic: str) -> JobMessages:
         """What is published on a topic of the job from now on: `async for message in job.listen("/measurements")`.
@@ -88,5 +93,5 @@ class Job:
         if self._subscriber is None:
             raise ClosedError(f"the job {self.liability.address} is not running")
 
-    def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
-        sending.put(self._session, key, payload, encoding=kind.zenoh_encoding)
+    def _put(self, key: str, payload: bytes, kind: PayloadType, attachment: bytes | None = None) -> None:
+        sending.put(self._session, key, payload, encoding=kind.zenoh_encoding, attachment=attachment)

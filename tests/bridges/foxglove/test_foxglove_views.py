@@ -18,7 +18,7 @@ from mesh.background import Background
 from mesh.cli.errors import NoRecording
 from schemas.agent_keys import DeviceTopicKey
 from schemas.definitions import with_definition
-from schemas.payloads import PayloadType
+from schemas.payloads import Payload, PayloadType
 from tests.bridges.foxglove.viewer import PLAY, viewing
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
@@ -30,15 +30,18 @@ if TYPE_CHECKING:
     from tests.support.market import Place
 
 COST = 100
+OWN = PayloadType("ros1", "my_msgs/Own", "ros1msg", b"uint8 a\n")
+SAID = PayloadType("ros1", "my_msgs/Said", "ros1msg", b"uint8 a\n")
 
 
 def blinking(place: Place) -> Any:
-    """A robot that says on `/blinked` what it plays."""
+    """A robot that says on `/blinked` what it plays, and on `/own` something of a type of its own."""
     robot = offering(place.agent("robot"))
 
     @robot.on("/blink")
     async def blink(job: Job, message: String) -> None:
         job.publish("/blinked", message.data)
+        job.publish("/own", Payload(b"\x07", SAID))
 
     return robot
 
@@ -92,14 +95,14 @@ async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, fron
         key = str(DeviceTopicKey(robot.address, "arm", "/angle"))
         robot.parts.network.session.put(key, b'{"degrees": 3}', encoding="application/json")
         assert await viewer.until_seen("/device/arm/angle") == [{"degrees": 3}]
-        own = PayloadType("ros1", "my_msgs/Own", "ros1msg", b"uint8 a\n")
         key = str(DeviceTopicKey(robot.address, "arm", "/own"))
-        defined = with_definition(b"", own)
-        robot.parts.network.session.put(key, b"\x05", encoding=own.zenoh_encoding, attachment=defined)
+        defined = with_definition(b"", OWN)
+        robot.parts.network.session.put(key, b"\x05", encoding=OWN.zenoh_encoding, attachment=defined)
         assert [value.a for value in await viewer.until_seen("/device/arm/own")] == [5]
         contract = await person.demand(place.save(objective(("/blink", "on"))), model=MODEL, cost=COST)
         await contract.outcome()
         assert (await viewer.until_seen("/job/blinked"))[0].data == "on"
+        assert [value.a for value in await viewer.until_seen("/job/own")] == [7]
         await until(lambda: "complete" in {job["event"] for job in viewer.values("/aira/job")})
         await until(lambda: viewer.values("/aira/log"))
 
