@@ -12,6 +12,7 @@ from bridges.ros2.definitions import add_definitions
 from bridges.ros2.errors import RosTypeMismatch, TooManyRosEndpoints
 from bridges.ros2.names import ACTION, SEND_GOAL, full_type
 from bridges.ros2.node import RosNode
+from bridges.ros2.own_parameters import RosOwnParameters
 from bridges.ros2.parameters import RosParameters
 from bridges.ros2.qos import DEFAULT_QOS
 from bridges.ros2.services import REQUESTS, RosClient, RosServer
@@ -206,6 +207,19 @@ class Robot(Lifecycle):
         server = RosServer(self._node, name, full_type(type_name, "srv"), handler, limit=limit)
         self._servers.append(server)
         return server
+
+    def declare_parameters(
+        self, values: Mapping[str, Any], *, refusal: Callable[[str, Any], str] = lambda name, value: ""
+    ) -> dict[str, Any]:
+        """Offer parameters of our node, once; returns their values, which change when other nodes set them.
+
+        A value is as in `RosParameters`. `refusal` is asked about each new value, and says why it is refused; with an
+        empty text it is taken. Raises `InvalidPayload` for a value that no parameter has, and what `serve` raises.
+        """
+        own = RosOwnParameters(values, refusal)
+        for service, (kind, handler) in own.services().items():
+            self.serve(f"~/{service}", f"rcl_interfaces/srv/{kind}", handler)
+        return own.values
 
     def serve_action(
         self, name: str, type_name: str, handler: Callable[[RosGoal], Awaitable[object]]

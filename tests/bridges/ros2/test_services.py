@@ -203,6 +203,41 @@ VALUES: Final[dict[str, Any]] = {
 }
 
 
+async def test_our_own_parameters_keep_their_types_and_may_be_refused(
+    here: zenoh.Session, there: zenoh.Session, domain: int, ros: RosTypes
+) -> None:
+    def refusal(name: str, value: Any) -> str:
+        return "too fast" if name == "rate" and value > 50 else ""
+
+    async with (
+        Robot(there, RosTypes("jazzy"), domain=domain, node="lamp", namespace="/room") as theirs,
+        Robot(here, ros, domain=domain) as ours,
+    ):
+        held = theirs.declare_parameters({"rate": 10, "camera.gain": 0.5, "camera.name": "front"}, refusal=refusal)
+        parameters = ours.parameters("/room/lamp")
+        assert await parameters.list() == ("rate", "camera.gain", "camera.name")
+        assert await parameters.get_all("rate", "camera.name") == {"rate": 10, "camera.name": "front"}
+        assert await parameters.get("missing") is None
+        await parameters.set(rate=20, **{"camera.gain": 1.5})
+        for wrong, why in (({"rate": 51}, "too fast"), ({"rate": 0.5}, "type"), ({"missing": 1}, "no parameter")):
+            with pytest.raises(RosCallFailed, match=why):
+                await parameters.set(**wrong)
+        assert held == {"rate": 20, "camera.gain": 1.5, "camera.name": "front"}
+        kind = "rcl_interfaces/SetParametersAtomically"
+        changes = [{"name": name, "value": to_value(value)} for name, value in (("rate", 30), ("camera.gain", "no"))]
+        reply = await ours.call("/room/lamp/set_parameters_atomically", kind, {"parameters": changes})
+        assert not reply.result.successful
+        assert held["rate"] == 20
+        found = await ours.call(
+            "/room/lamp/describe_parameters", "rcl_interfaces/DescribeParameters", {"names": ["rate"]}
+        )
+        assert [(one.name, one.type) for one in found.descriptors] == [("rate", 2)]
+        listed = await ours.call(
+            "/room/lamp/list_parameters", "rcl_interfaces/ListParameters", {"prefixes": ["camera"]}
+        )
+        assert (listed.result.names, listed.result.prefixes) == (["camera.gain", "camera.name"], ["camera"])
+
+
 async def test_parameters_are_listed_read_and_set(
     here: zenoh.Session, there: zenoh.Session, domain: int, ros: RosTypes
 ) -> None:

@@ -112,6 +112,17 @@ async def test_parameters_of_a_peer_are_listed_read_and_set(router: EmbeddedRout
         assert await parameters.get("rate") == 25
 
 
+async def test_a_peer_lists_reads_and_sets_parameters_of_ours(router: EmbeddedRouter, our_robot: OurRobot) -> None:
+    async with our_robot() as robot:
+        values = robot.declare_parameters({"rate": 10, "frame": "map"})
+        async with hiroz("parameter-client", router.endpoint, target="/aira", value=20) as peer:
+            assert sorted(await peer.line("names")) == ["frame", "rate"]
+            assert "10" in await peer.line("value")
+            assert await peer.line("successful") is True
+            assert "20" in await peer.line("value")
+        assert values == {"rate": 20, "frame": "map"}
+
+
 async def test_a_peers_change_of_a_parameter_is_heard(router: EmbeddedRouter, our_robot: OurRobot) -> None:
     async with hiroz("parameters", router.endpoint, node="configured"), our_robot() as robot:
         kind = "rcl_interfaces/msg/ParameterEvent"
