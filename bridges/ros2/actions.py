@@ -92,12 +92,12 @@ class RosActionClient:
         return answer.result
 
     async def _achieve(self, goal: object) -> Any:
-        """Have the goal accepted, and wait for the result."""
+        """Have the goal accepted, and wait for the result. Otherwise cancel it: the robot may have begun."""
         sending = self._service("send_goal", SEND_GOAL)
-        reply = await sending.call({"goal_id": self._id, "goal": goal}, timeout=None, job=self._job)
-        if not reply.accepted:
-            raise RosGoalFailed(self.name, "rejected")
         try:
+            reply = await sending.call({"goal_id": self._id, "goal": goal}, timeout=None, job=self._job)
+            if not reply.accepted:
+                raise RosGoalFailed(self.name, "rejected")
             result = self._service("get_result", "_GetResult")
             return await result.call({"goal_id": self._id}, timeout=None, job=self._job)
         except (asyncio.CancelledError, RosCallFailed):

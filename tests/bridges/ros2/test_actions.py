@@ -178,3 +178,28 @@ async def test_a_goal_of_the_robot_becomes_a_payload_with_its_definition(ros: Ro
 
     assert sent.type.schema_name == "example_interfaces/action/Fibonacci_FeedbackMessage"
     assert b"MSG: example_interfaces/Fibonacci_Feedback\nint32[] sequence\n" in sent.type.schema_data
+
+
+async def test_a_goal_whose_acceptance_is_not_known_yet_is_cancelled_too(
+    here: zenoh.Session, there: zenoh.Session, domain: int, ros: RosTypes
+) -> None:
+    name, sent, cancelled = f"/slow{domain}", asyncio.Event(), asyncio.Event()
+
+    async def accept(request: Any) -> dict[str, Any]:
+        sent.set()
+        await cancelled.wait()  # the robot has begun already
+        return {"accepted": True}
+
+    async def cancel(request: Any) -> dict[str, Any]:
+        cancelled.set()
+        return {}
+
+    async with Robot(here, ros, domain=domain) as ours, Robot(there, ros, domain=domain, node="server") as server:
+        server.serve(f"{name}/_action/send_goal", f"{FIBONACCI_FULL}_SendGoal", accept)
+        server.serve(f"{name}/_action/cancel_goal", "action_msgs/srv/CancelGoal", cancel)
+        goal = asyncio.create_task(ours.action(name, FIBONACCI, {"order": 1}))
+        await sent.wait()
+        goal.cancel()
+        await until(cancelled.is_set)
+        with suppress(asyncio.CancelledError):
+            await goal
