@@ -42,9 +42,9 @@ if TYPE_CHECKING:
         RemoteError,
     )
     from mesh.network import Reading
-    from mesh.recording import Objective, Played, Recorder, RecordingAbout, open_objective, pack
+    from mesh.recording import Objective, Played, Recorder, RecordingAbout, open_objective, pack, pack_values
     from mesh.ros import RosTypes, UnknownRosType
-    from mesh.running import fail, run_to_end
+    from mesh.running import fail, run_to_end, run_until_stopped
     from mesh.settings import Settings
     from mesh.work.ledger import WrongPhase
     from mesh.work.objectives import ObjectiveUnfit
@@ -83,9 +83,9 @@ _NAMES: Final = {
         "AiraError ChainError ClosedError ConfigurationError ContentError InputError NetworkUnavailable RemoteError"
     ),
     "mesh.network": "Reading",
-    "mesh.recording": "Objective Played Recorder RecordingAbout open_objective pack",
+    "mesh.recording": "Objective Played Recorder RecordingAbout open_objective pack pack_values",
     "mesh.ros": "RosTypes UnknownRosType",
-    "mesh.running": "fail run_to_end",
+    "mesh.running": "fail run_to_end run_until_stopped",
     "mesh.settings": "Settings",
     "mesh.work.job": "Job JobFailed",
     "mesh.work.ledger": "Phase WrongPhase",
@@ -178,5 +178,7 @@ __all__ = [
     "fail",
     "open_objective",
     "pack",
+    "pack_values",
     "run_to_end",
+    "run_until_stopped",
 ]

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from mesh.recording import pack_values
+from mesh import pack_values
 from patrol import GOAL, ros
 
 

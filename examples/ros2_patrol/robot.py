@@ -4,8 +4,7 @@ import asyncio
 from contextlib import suppress
 
 from bridges.ros2 import Robot, RosAllowed, RosGoalFailed, RosSubscription
-from mesh import Agent, Demand, Job, JobFailed, Verified, cid_of_file
-from mesh.running import run_until_stopped
+from mesh import Agent, Demand, Job, JobFailed, Verified, cid_of_file, run_until_stopped
 from patrol import ACTION, CAMERA, ENDPOINT, GOAL, NAVIGATE, ros, session
 
 agent = Agent(cid_of_file(__file__))  # this program is the behaviour
