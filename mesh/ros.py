@@ -64,7 +64,7 @@ class RosTypes:
             raise UnknownRosType(name, f"its definition can't be read: {error}") from None
 
     def type_hash(self, name: str) -> str:
-        """The hash of a message, service (`my_robot/srv/Turn`) or action's part by which ROS 2 tells definitions apart.
+        """The hash of a message, service (`my_robot/srv/Turn`) or action's part that differs if the definition does.
 
         It is `TypeHashNotSupported` in distributions before Iron. Raises `UnknownRosType`.
         """

@@ -150,7 +150,7 @@ class Settlement:
     def withdraw(self, withdrawal: Verified[Withdrawal]) -> None:
         """Honour a withdrawal: its order leaves the book, and is refused until its deadline.
 
-        A transaction that was sent already can't be stopped. The maker is told when a restart can't undo it any more.
+        A transaction that was sent already can't be stopped. The maker is told when it is on disk.
         """
         identity = withdrawn_id(withdrawal)
         if not self._withdrawals.add(withdrawal, is_open=identity in self._book):

@@ -10,7 +10,7 @@ from mesh.flood import RecentDict
 REMEMBERED: Final = 65_536
 """Items that the ring remembers, at most; half of them at least."""
 COPIES: Final = 4
-"""Copies of an item that the ring tells apart: later ones are like the last of these."""
+"""Copies of an item that the ring counts: later ones count as the last of these."""
 
 
 class _Lane(deque[tuple[Any, int]]):

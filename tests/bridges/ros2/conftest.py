@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 import pytest_asyncio
@@ -20,6 +21,14 @@ if TYPE_CHECKING:
 
     from mesh.ros import RosTypes
     from tests.support.routers import EmbeddedRouter
+
+DOMAINS: Final = itertools.count(1)
+
+
+@pytest.fixture
+def domain() -> int:
+    """A domain of the test's own."""
+    return next(DOMAINS)
 
 
 @pytest_asyncio.fixture

@@ -1,4 +1,4 @@
-"""Record what the peers send, as vectors: `python -m tests.bridges.ros2.record` writes `vectors/*.json` anew."""
+"""Record what the peers send, as vectors: `python -m tests.bridges.ros2.record` writes `vectors/*.json` again."""
 
 from __future__ import annotations
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,14 +20,6 @@ if TYPE_CHECKING:
 FIBONACCI: Final = "example_interfaces/Fibonacci"
 FIBONACCI_FULL: Final = "example_interfaces/action/Fibonacci"
 DEFINITION: Final = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"
-
-_domains: Final = itertools.count(151)
-
-
-@pytest.fixture
-def domain() -> int:
-    """A domain of the test's own."""
-    return next(_domains)
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
@@ -23,14 +22,6 @@ if TYPE_CHECKING:
 ADD: Final = "example_interfaces/AddTwoInts"
 ADD_FULL: Final = "example_interfaces/srv/AddTwoInts"
 DEFINITION: Final = "int64 a\nint64 b\n---\nint64 sum\n"
-
-_domains: Final = itertools.count(101)
-
-
-@pytest.fixture
-def domain() -> int:
-    """A domain of the test's own."""
-    return next(_domains)
 
 
 @pytest.fixture

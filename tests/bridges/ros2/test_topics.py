@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
@@ -36,14 +35,6 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 STRING_TYPE: Final = "std_msgs/msg/String"
-
-_domains: Final = itertools.count(1)
-
-
-@pytest.fixture
-def domain() -> int:
-    """A domain of the test's own."""
-    return next(_domains)
 
 
 async def heard(messages: Any, number: int) -> list[Any]:

@@ -58,7 +58,7 @@ async def test_a_peer_hears_our_messages(
 
 
 async def test_peers_that_link_directly_are_heard_and_hear_through_their_router() -> None:
-    # As processes of ROS 2 do by default: its router tells them of each other, and passes on what is for clients.
+    # As processes of ROS 2 do by default: they find each other through the router, which also serves the clients.
     scouting = {"multicast": {"enabled": False}, "gossip": {"enabled": True}, "delay": 0}
     async with Zenohd(
         config={"scouting": scouting, "routing": {"router": {"peers_failover_brokering": True}}}
