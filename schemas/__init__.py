@@ -47,7 +47,9 @@ if TYPE_CHECKING:
         PendingKey,
         PresenceKey,
         RejectKey,
+        ReportKey,
         ResultKey,
+        ValidatorKey,
         WithdrawalKey,
         parse_key,
     )
@@ -103,8 +105,8 @@ _NAMES: Final = {
         "AiraError InputError InvalidAddress InvalidCid InvalidKey InvalidMessage InvalidPayload InvalidRecord"
     ),
     "schemas.keys": (
-        "DeclineKey DemandKey FeedbackKey Key OfferKey PendingKey PresenceKey RejectKey ResultKey WithdrawalKey "
-        "parse_key"
+        "DeclineKey DemandKey FeedbackKey Key OfferKey PendingKey PresenceKey RejectKey ReportKey ResultKey "
+        "ValidatorKey WithdrawalKey parse_key"
     ),
     "schemas.message_fields": "MAX_UINT256",
     "schemas.messages": (

@@ -34,7 +34,9 @@ from schemas.errors import InvalidAddress, InvalidKey
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-MarketKind: TypeAlias = Literal["demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "decline"]
+MarketKind: TypeAlias = Literal[
+    "demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "decline", "report"
+]
 
 
 @lru_cache(maxsize=CACHED)
@@ -53,6 +55,7 @@ class _Key(BaseKey, frozen=True, gc=False):
         "lighthouse": lighthouse_chunk,
         "agent": address_chunk,
         "maker": address_chunk,
+        "validator": address_chunk,
         "model": cid_chunk,
         "role": name_chunk,
     }
@@ -118,6 +121,25 @@ class DeclineKey(_Key, frozen=True):
     maker: str
 
 
+class ReportKey(_Key, frozen=True):
+    """The validators' reports on results of liabilities of which `maker` is a party; put by validators.
+
+    A query for `…?liability=ADDRESS` asks them for earlier reports.
+    """
+
+    pattern: ClassVar = "aira/{lighthouse}/report/{maker}"
+    lighthouse: str
+    maker: str
+
+
+class ValidatorKey(_Key, frozen=True):
+    """The announcements of `validator`, one of each of its jurors; validators answer queries of it."""
+
+    pattern: ClassVar = "aira/{lighthouse}/validator/{validator}"
+    lighthouse: str
+    validator: str
+
+
 class PresenceKey(_Key, frozen=True):
     """The liveliness token of `agent` in its role (`provider`, `agent`, `edge`, …); no wildcard matches `@agent`."""
 
@@ -128,9 +150,9 @@ class PresenceKey(_Key, frozen=True):
 
 
 MarketKey: TypeAlias = (
-    DemandKey | OfferKey | WithdrawalKey | ResultKey | FeedbackKey | PendingKey | RejectKey | DeclineKey
+    DemandKey | OfferKey | WithdrawalKey | ResultKey | FeedbackKey | PendingKey | RejectKey | DeclineKey | ReportKey
 )
-Key: TypeAlias = MarketKey | AgentKey | PresenceKey
+Key: TypeAlias = MarketKey | AgentKey | ValidatorKey | PresenceKey
 
 
 def market_key(lighthouse: str, kind: MarketKind, model: str) -> str:
@@ -143,5 +165,5 @@ def market_kind(text: str) -> str:
     return text.split("/", 3)[2] if text.count("/") > 1 else ""
 
 
-parse_key: Final = KeyParser[Key](*get_args(MarketKey), PresenceKey, *AGENT_KEYS).parse
+parse_key: Final = KeyParser[Key](*get_args(MarketKey), ValidatorKey, PresenceKey, *AGENT_KEYS).parse
 """The key with a text. Raises `InvalidKey` if there is none, or if it is not in the canonical form."""

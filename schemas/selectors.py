@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 ORDER: Final = "order"
 """The parameter of a query for the withdrawals of one order."""
+LIABILITY: Final = "liability"
+"""The parameter of a query for the reports on one liability."""
 
 _SUBJECTS: Final[Mapping[str, Callable[[str], str] | None]] = MappingProxyType(
     {
@@ -31,6 +33,7 @@ _SUBJECTS: Final[Mapping[str, Callable[[str], str] | None]] = MappingProxyType(
         "pending": None,
         "reject": address_chunk,
         "decline": address_chunk,
+        "report": address_chunk,
     }
 )
 """The check of the chunk behind each kind of message; None where there is no such chunk."""
@@ -39,8 +42,8 @@ _SUBJECTS: Final[Mapping[str, Callable[[str], str] | None]] = MappingProxyType(
 def market_selector(lighthouse: str, kind: MarketKind, subject: str = "*") -> str:
     """All messages of a kind on a lighthouse, or those of one subject.
 
-    The subject is the model of a demand or offer, or the maker (an address) of what is rejected or
-    declined. Other kinds have none.
+    The subject is the model of a demand or offer, the maker (an address) of what is rejected or declined, or a party of
+    the liability that a report is on. Other kinds have none.
     """
     if kind not in _SUBJECTS:
         raise InvalidKey(kind, f"it is not one of the kinds {', '.join(_SUBJECTS)}")
@@ -57,6 +60,11 @@ def withdrawal_selector(lighthouse: str, order: str) -> str:
     if hex_digits(order, 32) != order:
         raise InvalidKey(order, "a hash is 64 hexadecimal digits in lower case, without 0x")
     return f"{market_selector(lighthouse, 'withdrawal')}?{ORDER}={order}"
+
+
+def report_selector(lighthouse: str, party: str, liability: str) -> str:
+    """For a query: the validators' reports on a liability, one of whose parties is `party`; both are addresses."""
+    return f"{market_selector(lighthouse, 'report', party)}?{LIABILITY}={address_chunk(liability)}"
 
 
 def lighthouse_selector(lighthouse: str) -> str:

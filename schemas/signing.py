@@ -1,4 +1,4 @@
-"""Signatures of messages, rejections and declines: ECDSA on secp256k1 over the hash as a personal message of Ethereum.
+"""Signatures of messages and of signed records: ECDSA on secp256k1 over the hash as a personal message of Ethereum.
 
 `verify` checks every received message once, where it enters the process. It costs one public-key recovery and little
 else; addresses and CIDs, which repeat between messages, are cached.
@@ -177,18 +177,14 @@ def verify_recovered(message: _M, digest: bytes, key: bytes) -> Verified[_M]:
     return Verified(message, digest, signer)
 
 
-class _Statement(Record, frozen=True, kw_only=True):
-    """What an account states about an order. Anybody may put one: check `is_signed`, and who its author is."""
+class SignedRecord(Record, frozen=True, kw_only=True):
+    """A record with its author's signature. Anybody may publish one: check `is_signed`, and who its author is."""
 
     domain: ClassVar[bytes]
     """The prefix of what the signature covers; no message of the market begins like this."""
     author: ClassVar[str]
     """The field with the author's EIP-55 address."""
 
-    order: str
-    """The order's hash: 64 hexadecimal digits."""
-    detail: str
-    """For people."""
     signature: str = ""
     """130 hexadecimal digits."""
 
@@ -213,6 +209,15 @@ class _Statement(Record, frozen=True, kw_only=True):
     def _hash(self) -> bytes:
         """The hash of the JSON without the signature, whose encoding is canonical."""
         return keccak256(self.domain + replace(self, signature="").encode())
+
+
+class _Statement(SignedRecord, frozen=True, kw_only=True):
+    """What an account states about an order."""
+
+    order: str
+    """The order's hash: 64 hexadecimal digits."""
+    detail: str
+    """For people."""
 
 
 class Rejection(_Statement, frozen=True, kw_only=True):

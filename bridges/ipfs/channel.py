@@ -287,9 +287,9 @@ class ChannelBridge(Role):
 
 
 def _convert(sample: zenoh.Sample) -> MeshMessage | None:
-    """Convert a sample on the pump's thread. The legacy channel has no rejections, declines and withdrawals."""
+    """Convert a sample on the pump's thread. The legacy channel has only orders, results and feedback."""
     key = str(sample.key_expr)
-    if sample.kind != zenoh.SampleKind.PUT or market_kind(key) in ("reject", "decline", "withdrawal"):
+    if sample.kind != zenoh.SampleKind.PUT or market_kind(key) in ("reject", "decline", "report", "withdrawal"):
         return None
     attachment = sample.attachment
     return MeshMessage(key, sample.payload.to_bytes(), attachment is not None and attachment.to_bytes() == BRIDGE_MARK)

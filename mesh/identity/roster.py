@@ -46,7 +46,7 @@ FINGERPRINT: Final = re.compile(r"[0-9a-f]{64}")
 
 Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
 
-Role: TypeAlias = Literal["agent", "person", "provider", "operator", "edge", "bridge", "watcher", "router"]
+Role: TypeAlias = Literal["agent", "person", "provider", "validator", "operator", "edge", "bridge", "watcher", "router"]
 
 
 class Right(Enum):
@@ -125,6 +125,16 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             # The provider serves its order book to late subscribers.
             _grant("serve", "aira/{market}/**"),
             _presence("provider"),
+        ),
+        "validator": (
+            _OWN_SPACE,
+            *_READ_MARKET,
+            _orders("result"),
+            # It announces how it judges, and answers late parties with its reports.
+            _grant("put serve", "aira/{market}/report/*"),
+            _grant("serve", "aira/{market}/validator/*"),
+            _presence("validator"),
+            _READ_CONTENT,
         ),
         "operator": (
             _OWN_SPACE,

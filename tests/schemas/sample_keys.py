@@ -19,8 +19,10 @@ from schemas import (
     ProgressKey,
     ReadingKey,
     RejectKey,
+    ReportKey,
     ResultKey,
     RpcKey,
+    ValidatorKey,
     WithdrawalKey,
 )
 from tests.schemas.samples import LIGHTHOUSE, MODEL, SENDER
@@ -49,4 +51,6 @@ KEYS: list[tuple[Key, str]] = [
     (RpcKey(SENDER, "eth/accounts"), f"aira/agent/{A}/rpc/eth/accounts"),
     (EthEventKey(SENDER, "transfer"), f"aira/agent/{A}/eth/event/transfer"),
     (CidKey(SENDER, MODEL), f"aira/agent/{A}/cid/{MODEL}"),
+    (ReportKey(NAME, SENDER), f"aira/{NAME}/report/{A}"),
+    (ValidatorKey(NAME, SENDER), f"aira/{NAME}/validator/{A}"),
 ]

@@ -90,7 +90,7 @@ def test_an_unknown_role_lists_the_roles() -> None:
     with pytest.raises(RosterError) as error:
         roster_from(member(roles='["king"]'), where="it")
 
-    assert error.value.hint == "roles are agent, person, provider, operator, edge, bridge, watcher, router"
+    assert error.value.hint == "roles are agent, person, provider, validator, operator, edge, bridge, watcher, router"
 
 
 def test_unreadable_files_are_named(tmp_path: Path) -> None:
