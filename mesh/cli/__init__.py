@@ -34,6 +34,7 @@ COMMANDS: Final = {
     "state": ("mesh.cli.state:command", "show, back up and restore the state of agents"),
     "status": ("mesh.cli.status:status", "show the status of agents, providers and bridges"),
     "up": ("mesh.cli.up:command", "run a router, a chain and a provider for development"),
+    "validator": ("mesh.cli.validator:command", "judge results before they are paid; deploy a validator contract"),
     "verify": ("mesh.cli.verify:command", "check a recording against its objective and its liability"),
     "watch": ("mesh.cli.watch:command", "print what happens on a market"),
     "xrt": ("mesh.cli.xrt:command", "show, approve and transfer XRT and other tokens"),

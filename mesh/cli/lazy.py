@@ -119,8 +119,9 @@ class LazyGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands. Imports only installed ones, whose help is not known otherwise."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, self._help_of(name)) for name in self.list_commands(ctx)])
+        if rows := [(name, self._help_of(name)) for name in self.list_commands(ctx)]:
+            with formatter.section("Commands"):
+                formatter.write_dl(rows)
 
     def _command(self, name: str) -> click.Command | None:
         """The command of that name. Raises `BrokenCommand`, `PackageMissing`."""

@@ -23,7 +23,17 @@ PORT: Final = click.IntRange(0, 65_535)
 BLOCK_TIME: Final = click.FloatRange(0.01, 86_400)
 """Seconds."""
 
-LISTS: Final = frozenset({"connect", "link", "listen", "ipfs_public_providers", "ipfs_swarm_connect", "ros2_connect"})
+LISTS: Final = frozenset(
+    {
+        "connect",
+        "link",
+        "listen",
+        "ipfs_public_providers",
+        "ipfs_swarm_connect",
+        "ros2_connect",
+        "validator_policies",
+    }
+)
 """The settings with several values, whose flags may be repeated."""
 CHAIN_SETTINGS: Final = (
     "web3_http_provider",

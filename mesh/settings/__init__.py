@@ -18,6 +18,7 @@ from mesh.settings.groups import (
     Settings,
     StorageSettings,
     TelemetrySettings,
+    ValidatorSettings,
     options_of,
 )
 from mesh.settings.loading import (

@@ -177,6 +177,21 @@ class MarketSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ValidatorSettings:
+    """How a validator judges."""
+
+    validator_contract: str = option(
+        "",
+        "ENS name or address of the contract that this juror judges for (empty: only its own account, in generation 3)",
+    )
+    validator_policies: tuple[str, ...] = option(
+        ("complete",), "policies to judge by: complete (always on), acknowledged, schema, rate"
+    )
+    validator_fee: str = option("0", "least fee for a verdict, in XRT (0.1) or wn (100wn); who pays less gets none")
+    validator_title: str = option("", "the validator's title in its announcement, for people")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ContentSettings:
     """Limits for files behind CIDs."""
 
@@ -258,6 +273,7 @@ class Settings(
     TelemetrySettings,
     Ros2Settings,
     IpfsSettings,
+    ValidatorSettings,
     ExecutionSettings,
     MarketSettings,
     AccountSettings,

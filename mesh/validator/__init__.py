@@ -1,0 +1,1 @@
+"""The validator: judges results before they are paid, and signs what counts."""
