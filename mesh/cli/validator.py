@@ -1,4 +1,4 @@
-"""`aira validator`: judges results before they are paid. Its subcommands deploy a contract, collect fees, check a file."""
+"""`aira validator`: judges results before they are paid; it also deploys contracts, collects fees, checks files."""
 
 from __future__ import annotations
 
