@@ -84,13 +84,14 @@ class LedgerTooNew(ConfigurationError, code="ledger-too-new"):
 
 
 class Database:
-    """The database in the file at `path`. Calls run in order, in a thread of their own.
+    """The database in the file at `path`, with the tables of `schema`. Calls run in order, in a thread of their own.
 
     Every call raises `LedgerUnusable`, and `ClosedError` before `open` and after `close`.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, schema: str = SCHEMA) -> None:
         self._path = path
+        self._schema = schema
         self._connection: aiosqlite.Connection | None = None
         self._using = asyncio.Lock()
         self._syncs: bool | None = None
@@ -155,8 +156,8 @@ class Database:
         version = (await self.rows("PRAGMA user_version"))[0][0]
         if version > VERSION:
             raise LedgerTooNew(self._path, found=version, known=VERSION)
-        await self._opened().executescript(SCHEMA)
-        if "recorded" not in [row[1] for row in await self.rows("PRAGMA table_info (jobs)")]:
+        await self._opened().executescript(self._schema)
+        if self._schema is SCHEMA and "recorded" not in [row[1] for row in await self.rows("PRAGMA table_info (jobs)")]:
             await self.run("ALTER TABLE jobs ADD COLUMN recorded INTEGER NOT NULL DEFAULT 0")
         await self.run(f"PRAGMA user_version = {VERSION}")
 

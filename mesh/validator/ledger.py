@@ -1,0 +1,189 @@
+"""The ledger of a validator: what it was asked to judge, what it signed, and how far it has read the chain.
+
+A juror signs one Result for each liability, and no other one ever: it signs here, and what it signs is on the disk
+before anybody sees it. Every write survives `kill -9` once the call has returned.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import msgspec
+
+from mesh.work.database import Database
+from schemas import Liability, Result, decode, encode
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from schemas import Signer
+
+VERDICTS: Final = "verdicts.sqlite"
+"""The name of the ledger in an account's folder for a chain."""
+SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS verdicts (
+    liability TEXT PRIMARY KEY,
+    record BLOB NOT NULL,
+    since INTEGER NOT NULL,
+    result BLOB NOT NULL DEFAULT x'',
+    recording TEXT NOT NULL DEFAULT '',
+    seen INTEGER NOT NULL DEFAULT 0,
+    signed BLOB NOT NULL DEFAULT x'',
+    report BLOB NOT NULL DEFAULT x'',
+    ended INTEGER NOT NULL DEFAULT 0,
+    aside INTEGER NOT NULL DEFAULT 0,
+    changed REAL NOT NULL
+);
+CREATE INDEX IF NOT EXISTS recordings ON verdicts (recording);
+CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL, history BLOB NOT NULL DEFAULT x'');
+"""
+COLUMNS: Final = "record, since, result, seen, signed, report, ended"
+STAGE: Final = (
+    "CASE WHEN ended THEN 'ended' WHEN signed != x'' THEN 'signed' WHEN report != x'' THEN 'refused'"
+    " WHEN result != x'' THEN 'judging' ELSE 'waiting' END"
+)
+STAGES: Final = ("waiting", "judging", "refused", "signed", "ended")
+"""Where a verdict is: it waits for the promisor's Result; the result is fetched and judged; the validator does not
+judge it; the verdict is signed; the chain has the end."""
+
+
+class StoredVerdict(msgspec.Struct, frozen=True, kw_only=True):
+    """What a juror knows of a liability that names its validator.
+
+    `since_ns` (Unix time) is when the liability was created, `seen_ns` when the Result of its promisor arrived, which
+    is empty until then. `signed` is the juror's own Result, `report` its encoded report; both are empty before.
+    """
+
+    liability: Liability
+    since_ns: int
+    result: bytes
+    seen_ns: int
+    signed: bytes
+    report: bytes
+    is_ended: bool
+
+
+class VerdictLedger:
+    """The ledger in the file at `path`, created if missing: `async with VerdictLedger(path, signer) as ledger`.
+
+    A file belongs to one juror, whose key `signer` has. Calls run in order, in a thread of their own. Every call raises
+    `LedgerUnusable`.
+    """
+
+    def __init__(self, path: Path, signer: Signer) -> None:
+        self._database = Database(path, SCHEMA)
+        self._signer = signer
+
+    async def __aenter__(self) -> Self:
+        await self._database.open()
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        await self._database.close()
+
+    async def open(self, liability: Liability, *, since_ns: int) -> StoredVerdict:
+        """Add a liability, or bring back one that was set aside; what is known of it."""
+        await self._database.run(
+            "INSERT INTO verdicts (liability, record, since, changed) VALUES (?, ?, ?, ?)"
+            " ON CONFLICT (liability) DO UPDATE SET aside = 0 WHERE aside",
+            (liability.address, liability.encode(), since_ns, time.time()),
+            sync=False,
+        )
+        found = await self.verdict(liability.address)
+        assert found is not None
+        return found
+
+    async def set_aside(self, liability: str) -> None:
+        """Hide a liability that a reorganisation reverted, until `open` shows it again. Its verdict stays signed."""
+        await self._database.run("UPDATE verdicts SET aside = 1 WHERE liability = ?", (liability,), sync=False)
+
+    async def take(self, liability: str, result: Result, *, seen_ns: int) -> bool:
+        """Keep the Result that the promisor has signed. False if there is one already: the first one counts."""
+        return await self._database.run(
+            "UPDATE verdicts SET result = ?, recording = ?, seen = ?, changed = ? WHERE liability = ? AND result = x''",
+            (encode(result), result.result, seen_ns, time.time(), liability),
+        )
+
+    async def sign(self, result: Result, *, report: bytes) -> StoredVerdict:
+        """Sign the Result as the juror judged it, and keep it with its encoded report; what is stored then.
+
+        If the juror has signed one for the liability already, that one stays, whatever `result` says.
+        """
+        signed = encode(self._signer.sign(result))
+        await self._database.run(
+            "UPDATE verdicts SET signed = ?, report = ?, changed = ? WHERE liability = ? AND signed = x''",
+            (signed, report, time.time(), result.liability),
+        )
+        found = await self.verdict(result.liability)
+        assert found is not None, "the liability was opened"
+        return found
+
+    async def refuse(self, liability: str, *, report: bytes) -> None:
+        """Keep the report on a liability that the juror does not judge. Nothing is signed."""
+        await self._database.run(
+            "UPDATE verdicts SET report = ?, changed = ? WHERE liability = ? AND report = x''",
+            (report, time.time(), liability),
+        )
+
+    async def end(self, liability: str, *, ended: bool = True) -> None:
+        """The chain has the end of a liability; or not any more, after a reorganisation."""
+        await self._database.run(
+            "UPDATE verdicts SET ended = ?, changed = ? WHERE liability = ?",
+            (ended, time.time(), liability),
+            sync=False,
+        )
+
+    async def verdict(self, liability: str) -> StoredVerdict | None:
+        """What is known of the liability at this EIP-55 address; None if it does not name this validator."""
+        statement = f"SELECT {COLUMNS} FROM verdicts WHERE liability = ? AND NOT aside"
+        rows = await self._database.rows(statement, (liability,))
+        return _stored(rows[0]) if rows else None
+
+    async def unended(self) -> list[StoredVerdict]:
+        """The liabilities whose end is not on the chain, oldest first."""
+        statement = f"SELECT {COLUMNS} FROM verdicts WHERE NOT ended AND NOT aside ORDER BY rowid"
+        return [_stored(row) for row in await self._database.rows(statement)]
+
+    async def owner_of(self, recording: str, *, other_than: str) -> str:
+        """The first liability for which this recording (CID) was judged, `other_than` one; empty if there is none."""
+        statement = (
+            "SELECT liability FROM verdicts WHERE recording = ? AND liability != ? AND signed != x''"
+            " ORDER BY rowid LIMIT 1"
+        )
+        rows = await self._database.rows(statement, (recording, other_than))
+        return str(rows[0][0]) if rows else ""
+
+    async def stages(self) -> dict[str, int]:
+        """The number of liabilities in each of `STAGES`."""
+        rows = await self._database.rows(f"SELECT {STAGE}, COUNT(*) FROM verdicts WHERE NOT aside GROUP BY 1")
+        return dict.fromkeys(STAGES, 0) | dict(rows)
+
+    async def cursor(self) -> tuple[int | None, bytes]:
+        """The last block that was handled (None: none was), and the encoded chain history."""
+        rows = await self._database.rows("SELECT block, history FROM cursors WHERE name = 'validator'")
+        return rows[0] if rows else (None, b"")
+
+    async def set_cursor(self, block: int, *, history: bytes = b"") -> None:
+        """Save that all of `block` was handled, with the encoded chain history."""
+        statement = "INSERT OR REPLACE INTO cursors (name, block, history) VALUES ('validator', ?, ?)"
+        await self._database.run(statement, (block, history), sync=False)
+
+
+def signed_result(stored: StoredVerdict) -> Result:
+    """The juror's own Result."""
+    result = decode(stored.signed)
+    assert isinstance(result, Result)
+    return result
+
+
+def _stored(row: Any) -> StoredVerdict:
+    return StoredVerdict(
+        liability=Liability.decode(row[0]),
+        since_ns=row[1],
+        result=row[2],
+        seen_ns=row[3],
+        signed=row[4],
+        report=row[5],
+        is_ended=bool(row[6]),
+    )
