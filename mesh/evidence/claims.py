@@ -21,7 +21,8 @@ class Finding(Struct, frozen=True):
     """The outcome of one check. `holds` is None if it can't be decided; `detail` is for people.
 
     `name` is machine-readable: `objective-file`, `result-file`, `finalized`, `signature`, `readable`, `statistics`,
-    `closed`, `sequence`, `times`, `liability`, `agent`, `lighthouse`, `objective`, `played`.
+    `closed`, `sequence`, `times`, `duplicates`, `roles`, `clock`, `period`, `liability`, `agent`, `lighthouse`,
+    `objective`, `played`.
     """
 
     name: str

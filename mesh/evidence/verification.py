@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Protocol
 
 import msgspec
 
 from mesh.evidence.claims import Finding, Verdict, check_about, check_end, check_signature, supplemented
+from mesh.evidence.clock_checks import ClockCheck, RecorderParts
 from mesh.evidence.playback import MessageDigest, check_played, digest_of
-from mesh.recording import ABOUT, CLOSED, GENEROUS, RECOVERED, RecordingError, open_objective
+from mesh.evidence.recorder_checks import SequenceCheck, check_completeness, chosen_topics
+from mesh.recording import GENEROUS, RecordingError, open_objective
 from schemas import cid_of_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
-    from typing import TypeAlias
 
     from mesh.content import Progress
     from mesh.evidence.claims import Claim
-    from mesh.recording import ChannelMessage, Objective
+    from mesh.recording import Limits, Objective, Played
 
-    Opener: TypeAlias = Callable[[Path], Objective]
 
-_MILLISECOND: Final = 10**6
+class RecordingObserver(Protocol):
+    """Looks at a recording while it is verified, so that the file is read once for all.
+
+    `open` is called first, `add` for each message in file order with the number of its part: a new part begins where
+    the agent crashed and continued. `open_objective` is called last, unless the objective is not readable.
+    """
+
+    def open(self, recording: Objective) -> None:
+        """Take the recording, whose messages follow."""
+
+    def add(self, message: Played, part: int) -> None:
+        """Take the next message."""
+
+    def open_objective(self, objective: Objective) -> None:
+        """Take the objective."""
 
 
 def verify(
@@ -34,40 +47,57 @@ def verify(
     message: bytes | None = None,
     objective_cid: str = "",
     result_cid: str = "",
+    period: tuple[int, int] | None = None,
+    limits: Limits = GENEROUS,
+    observer: RecordingObserver | None = None,
     progress: Progress | None = None,
 ) -> Verdict:
     """Check everything that can be checked: the files behind the two CIDs, the signature, the recording.
 
     `message` is the encoded Result, if at hand. Pass the CIDs of files that were fetched by them: a CID made with other
-    settings than ours can't be computed from the file. `progress` is called with the bytes of both files read, of all.
+    settings than ours can't be computed from the file. `period` is when the job was done, if that is known: from when
+    to when, in nanoseconds of Unix time. Files beyond the `limits` are not readable. `observer` sees the messages of
+    the recording. `progress` is called with the bytes of both files read, of all.
+
     Use a thread. Raises `OSError` if a file can't be read.
     """
+    files = _JobFiles(objective, result, limits, progress)
     cids = objective_cid or cid_of_file(objective), result_cid or cid_of_file(result)
-    open_next = _opener(result, objective, progress)
-    return Verdict(tuple(_check_all(claim, objective, result, message, *cids, open_next)))
+    return Verdict(tuple(_check_all(claim, files, message, *cids, period=period, observer=observer)))
 
 
-def _opener(first: Path, second: Path, progress: Progress | None) -> Opener:
-    """Opens two files one after the other, and calls `progress` for both together."""
-    sizes = first.stat().st_size, second.stat().st_size
-    before = iter((0, sizes[0]))
+class _JobFiles:
+    """Opens the two files, each once, and calls `progress` for both together."""
 
-    def open_next(path: Path) -> Objective:
-        start = next(before)
-        tell = None if progress is None else lambda done, _: progress(start + done, sum(sizes))
-        return open_objective(path, GENEROUS, progress=tell)
+    def __init__(self, objective: Path, result: Path, limits: Limits, progress: Progress | None) -> None:
+        self._objective, self._result = objective, result
+        self._limits = limits
+        self._progress = progress
+        self._sizes = result.stat().st_size, objective.stat().st_size
 
-    return open_next
+    def open_result(self) -> Objective:
+        """The recording, the first to be opened. Raises `RecordingError`."""
+        return self._open(self._result, before=0)
+
+    def open_objective(self) -> Objective:
+        """The objective, the second one. Raises `RecordingError`."""
+        return self._open(self._objective, before=self._sizes[0])
+
+    def _open(self, path: Path, *, before: int) -> Objective:
+        tell, total = self._progress, sum(self._sizes)
+        progress = None if tell is None else lambda done, _: tell(before + done, total)
+        return open_objective(path, self._limits, progress=progress)
 
 
 def _check_all(
     claim: Claim,
-    objective: Path,
-    result: Path,
+    files: _JobFiles,
     message: bytes | None,
     objective_cid: str,
     result_cid: str,
-    open_next: Opener,
+    *,
+    period: tuple[int, int] | None,
+    observer: RecordingObserver | None,
 ) -> Iterator[Finding]:
     yield check_end(claim)
     yield check_signature(claim, message, recording=result_cid)
@@ -78,46 +108,71 @@ def _check_all(
         # Without a contract, still check that the two files belong together.
         claim = msgspec.structs.replace(claim, objective=objective_cid)
     try:
-        recording = open_next(result)
+        recording = files.open_result()
     except RecordingError as error:
         yield Finding("readable", False, f"the recording is not readable: {error.why}")
         return
-    yield from _check_recording(claim, recording, objective, open_next)
-
-
-def _check_recording(claim: Claim, recording: Objective, path: Path, open_next: Opener) -> Iterator[Finding]:
-    sequence, played, seams = SequenceCheck(), list[MessageDigest](), list[int]()
-    breaks = _numbers(recording.metadata.get(RECOVERED, {}).get("seams", ""))
-    for number, written in enumerate(recording.in_file_order()):
-        if number in breaks:
-            seams.append(len(played))
-        sequence.add(written)
-        if written.message.role == "objective":
-            played.append(digest_of(written.message))
-    yield from check_completeness(recording, sequence)
-    yield from check_about(claim, recording.metadata)
+    played = _PlayedMessages()
+    yield from _check_recording(claim, recording, played, period=period, observer=observer)
     try:
-        objective = open_next(path)
+        objective = files.open_objective()
     except RecordingError as error:
         why = f"the objective is not a recording ({error.why})"
-        if played:
+        if played.digests:
             yield Finding("played", False, f"messages were played, but {why}")
         else:
             yield Finding("played", None, f"nothing was played: {why}")
         return
-    yield _check_playback(claim, recording, objective, played, seams)
+    yield _check_playback(claim, recording, objective, played)
+    if observer is not None:
+        observer.open_objective(objective)
 
 
-def _check_playback(
-    claim: Claim, recording: Objective, objective: Objective, played: list[MessageDigest], seams: list[int]
-) -> Finding:
-    chosen = {name for name in recording.metadata.get(ABOUT, {}).get("topics", "").split(",") if name}
+class _PlayedMessages:
+    """The played messages of a recording, and the numbers of those before which the agent crashed and continued."""
+
+    def __init__(self) -> None:
+        self.digests: list[MessageDigest] = []
+        self.seams: list[int] = []
+
+
+def _check_recording(
+    claim: Claim,
+    recording: Objective,
+    played: _PlayedMessages,
+    *,
+    period: tuple[int, int] | None,
+    observer: RecordingObserver | None,
+) -> Iterator[Finding]:
+    if observer is not None:
+        observer.open(recording)
+    sequence, clock, part = SequenceCheck(), ClockCheck(RecorderParts.of(recording.metadata)), 0
+    for written in recording.in_file_order():
+        message = written.message
+        sequence.add(written)
+        if clock.add(message.log_time_ns) != part:
+            part = clock.part
+            played.seams.append(len(played.digests))
+        if message.role == "objective":
+            played.digests.append(digest_of(message))
+        if observer is not None:
+            observer.add(message, part)
+    yield from check_completeness(recording, sequence)
+    yield clock.finding()
+    if period is not None:
+        yield clock.period(*period)
+    yield from check_about(claim, recording.metadata)
+
+
+def _check_playback(claim: Claim, recording: Objective, objective: Objective, played: _PlayedMessages) -> Finding:
+    chosen = chosen_topics(recording)
     due = [digest_of(message) for message in objective.messages() if not chosen or message.topic in chosen]
-    finding = check_played(due, played, seams=seams, complete=claim.success is not False)
-    if chosen:
-        said = f"{finding.detail}; only {len(chosen)} topics were recorded"
-        return Finding(finding.name, finding.holds, said)
-    return finding
+    finding = check_played(due, played.digests, seams=played.seams, complete=claim.success is not False)
+    left_out = objective.count - len(due)
+    if not left_out or finding.holds is False:
+        return finding
+    said = f"{finding.detail}; only {len(chosen)} topics were recorded, without {left_out} messages of the objective"
+    return Finding(finding.name, None, said)
 
 
 def _check_file(name: str, what: str, cid: str, claimed: str) -> Finding:
@@ -126,99 +181,3 @@ def _check_file(name: str, what: str, cid: str, claimed: str) -> Finding:
     if cid != claimed:
         return Finding(name, False, f"the {what} is {cid}, and it should be {claimed}")
     return Finding(name, True, f"the {what} is {cid}")
-
-
-def _numbers(text: str) -> frozenset[int]:
-    """Numbers separated by commas. Anything else is skipped: the text is untrusted."""
-    return frozenset(int(word) for word in text.split(",") if word.isascii() and word.isdigit() and len(word) < 20)
-
-
-@dataclass
-class _ChannelCount:
-    """What was read of one channel."""
-
-    count: int = 0
-    next: int = 0
-    last_time: int = 0
-
-
-@dataclass
-class SequenceCheck:
-    """Checks the messages of a recording in file order for missing, repeated and moved ones."""
-
-    channels: dict[int, _ChannelCount] = field(default_factory=dict)
-    gaps: list[str] = field(default_factory=list)
-    steps_back: list[str] = field(default_factory=list)
-
-    def add(self, written: ChannelMessage) -> None:
-        """Check the next message."""
-        message = written.message
-        channel = self.channels.setdefault(written.channel, _ChannelCount())
-        if message.sequence != channel.next:
-            self.gaps.append(_gap(written, channel.next))
-        if message.log_time_ns < channel.last_time:
-            name, earlier = f"message {message.sequence} on {message.topic}", channel.last_time - message.log_time_ns
-            self.steps_back.append(f"{name} was recorded {earlier / _MILLISECOND:g} ms before the previous one")
-        channel.count += 1
-        channel.next = message.sequence + 1
-        channel.last_time = message.log_time_ns
-
-
-def check_completeness(recording: Objective, sequence: SequenceCheck) -> Iterator[Finding]:
-    """Check a recording whose messages were all added to `sequence`."""
-    if recording.unchecked:
-        yield Finding("readable", None, f"{recording.unchecked} blocks of it have no checksum")
-    else:
-        yield Finding("readable", True, f"{recording.count} messages, and every checksum is right")
-    yield _check_statistics(recording, sequence)
-    yield _check_closed(recording)
-    yield _fault_finding("sequence", sequence.gaps, "the messages of every channel are numbered without a gap")
-    yield _fault_finding("times", sequence.steps_back, "on every channel, messages are in the order of their times")
-
-
-def _gap(written: ChannelMessage, expected: int) -> str:
-    topic, number = written.message.topic, written.message.sequence
-    if number < expected:
-        return f"message {number} on {topic} comes after message {expected - 1}"
-    if number == expected + 1:
-        return f"message {expected} on {topic} is missing"
-    return f"messages {expected} to {number - 1} on {topic} are missing"
-
-
-def _fault_finding(name: str, faults: list[str], well: str) -> Finding:
-    if not faults:
-        return Finding(name, True, well)
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    return Finding(name, False, faults[0] + more)
-
-
-def _check_statistics(recording: Objective, sequence: SequenceCheck) -> Finding:
-    said = recording.statistics
-    if said is None:
-        return Finding("statistics", False, "the file does not state how many messages it has")
-    if said.messages != recording.count:
-        return Finding("statistics", False, f"the file states {said.messages} messages, and has {recording.count}")
-    counted = {number: channel.count for number, channel in sequence.channels.items()}
-    if {number: count for number, count in said.by_channel.items() if count} != counted:
-        return Finding("statistics", False, "the file states other numbers of messages on its channels than it has")
-    if recording.count and (said.start, said.end) != (recording.start_ns, recording.start_ns + recording.duration_ns):
-        return Finding("statistics", False, "the file states other times of its first and last message than it has")
-    return Finding("statistics", True, "the file has the messages, channels and times that it states")
-
-
-def _check_closed(recording: Objective) -> Finding:
-    closing = recording.metadata.get(CLOSED)
-    if closing is None:
-        return Finding("closed", False, "the recorder did not close it: the end may be missing")
-    if closing.get("messages") != str(recording.count):
-        return Finding(
-            "closed",
-            False,
-            f"the recorder closed it with {closing.get('messages', 'unknown')[:20]} messages, and it has"
-            f" {recording.count}",
-        )
-    if closing.get("lost") != "0":
-        return Finding("closed", False, f"the recorder lost {closing.get('lost', 'unknown')[:20]} messages")
-    if RECOVERED in recording.metadata:
-        return Finding("closed", None, "the agent crashed and continued: the last second before may be missing")
-    return Finding("closed", True, "the recorder closed it and had lost nothing")

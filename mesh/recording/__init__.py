@@ -28,7 +28,7 @@ from mesh.recording.objective import (
     rates_of,
 )
 from mesh.recording.packing import InvalidLine, PackSummary, bag_to_mcap, messages_in, pack, pack_values
-from mesh.recording.partial import ABOUT, CLOSED, RecordingAbout
+from mesh.recording.partial import ABOUT, CLOCK_RECORD, CLOSED, NOTE_TOPIC, MessageRole, RecordingAbout
 from mesh.recording.playback import (
     AtOnce,
     FixedRate,

@@ -105,6 +105,7 @@ class McapReader:
     attachments: list[Attachment] = field(default_factory=list)
     statistics: RecordingStatistics | None = None
     unchecked: int = 0
+    repeated: set[str] = field(default_factory=set)
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _definitions_seen: dict[tuple[int, bytes], bytes] = field(default_factory=dict)
     """The bytes of the last definition of each kind and number."""
@@ -125,6 +126,7 @@ class McapReader:
             tuple(self.attachments),
             self.statistics,
             self.unchecked,
+            frozenset(self.repeated),
         )
 
     def read(self, header: McapRecordHeader) -> None:
@@ -179,6 +181,8 @@ class McapReader:
         if opcode == Opcode.METADATA:
             self._count(len(data))
             name, values = metadata_of(self.path, data)
+            if name in self.metadata:
+                self.repeated.add(name)
             self.metadata[name] = values
             return
         definition = opcode, data[:2]

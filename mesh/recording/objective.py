@@ -80,7 +80,8 @@ class Objective:
 
     `format` is `mcap`, `bag` or `sqlite3` (of rosbag2), `size` is in bytes, `count` the number of messages, `metadata`
     the metadata records by name, and `attachments` the files in it (only MCAP files have these). `statistics` is what
-    an MCAP file states about itself, if it does, and `unchecked` the number of message blocks without a checksum.
+    an MCAP file states about itself, if it does, `unchecked` the number of message blocks without a checksum, and
+    `repeated` the names of metadata records that it has more than once.
     """
 
     def __init__(self, source: RecordingSource) -> None:
@@ -92,6 +93,8 @@ class Objective:
         self.attachments: Final = source.attachments
         self.statistics: Final = source.statistics
         self.unchecked: Final = source.unchecked
+        self.repeated: Final = source.repeated
+        self.channels: Final = len(source.channels)
         self.count: Final = sum(segment.count for segment in source.segments)
         self.start_ns: Final = min((segment.start for segment in source.segments), default=0)
         self.duration_ns: Final = max((segment.end for segment in source.segments), default=0) - self.start_ns

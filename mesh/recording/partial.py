@@ -40,6 +40,8 @@ CLOCK_RECORD: Final = "aira-clock"
 
 `unix_ns` is that time by the machine's clock, `log_ns` the log time that stands for it; a value for each part.
 """
+NOTE_TOPIC: Final = "/aira/note"
+"""Topic of the recording on which the agent says why a job failed."""
 
 _ROLES: Final[Mapping[MessageRole, Mapping[str, str]]] = {role: {"role": role} for role in get_args(MessageRole)}
 

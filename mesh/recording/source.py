@@ -117,6 +117,8 @@ class RecordingSource:
     statistics: RecordingStatistics | None = None
     unchecked: int = 0
     """Blocks of messages without a checksum."""
+    repeated: frozenset[str] = frozenset()
+    """Names of metadata records that the file has more than once; `metadata` has the last one."""
 
     def in_file_order(self) -> Iterator[RecordedMessage]:
         """All messages in file order."""

@@ -10,15 +10,13 @@ from traceback import format_exception_only
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.errors import AiraError
-from mesh.recording import GENEROUS, open_objective
+from mesh.recording import GENEROUS, NOTE_TOPIC, open_objective
 from schemas.errors import InvalidPayload
 from schemas.payloads import String
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-NOTE_TOPIC: Final = "/aira/note"
-"""Topic of the recording on which the agent says why a job failed."""
 HANDLER_FAILED: Final = "handler-failed"
 """The code of an exception that has none: one of a handler's own."""
 LONGEST: Final = 1000

@@ -13,9 +13,8 @@ import zenoh
 
 from mesh.errors import AiraError
 from mesh.log_context import log_event
-from mesh.recording import AtOnce, Unrecordable, play
+from mesh.recording import NOTE_TOPIC, AtOnce, Unrecordable, play
 from mesh.work.job import HandlerCancelled, Job
-from mesh.work.notes import NOTE_TOPIC
 from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey, ProgressKey, parse_agent_key
 from schemas.definitions import defined_by
 from schemas.payloads import JSON, STRING, PayloadType, String, payload_type

@@ -77,7 +77,7 @@ def make_job(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "",
     path.write_bytes(objective(*(("/say", word) for word in WORDS), ("/stop", b"")))
     says = {"liability": LIABILITY, "agent": ROBOT.address, "lighthouse": OTHER, "objective": cid_of_file(path)} | about
     with Recorder(folder / "result.mcap", RecordingAbout(**says, topics=topics)) as recorder:
-        record(recorder, played)
+        record(recorder, played, answered=not topics)
         if played == WORDS and not topics:
             stop(recorder)
     claim = Claim(
@@ -92,11 +92,12 @@ def make_job(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "",
     return JobFiles(path, folder / "result.mcap", claim)
 
 
-def record(recorder: Recorder, words: tuple[str, ...]) -> None:
+def record(recorder: Recorder, words: tuple[str, ...], *, answered: bool = True) -> None:
     """Play these words, each answered by the device."""
     for word in words:
         recorder.record("/say", String(word).encode(), STRING, role="objective")
-        recorder.record("/said", String(word).encode(), STRING, role="device")
+        if answered:
+            recorder.record("/said", String(word).encode(), STRING, role="device")
 
 
 def stop(recorder: Recorder) -> None:

@@ -13,9 +13,9 @@ import msgspec
 import pytest
 
 from mesh.agent import JobFailed, Phase
+from mesh.recording import NOTE_TOPIC
 from mesh.running import cause_of
 from mesh.work.database import LedgerUnusable
-from mesh.work.notes import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
 from tests.support.market import Place, offering, offering_unseen

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.errors import ClosedError, InvalidKey
-from mesh.recording import RecordedTimes
+from mesh.recording import NOTE_TOPIC, RecordedTimes
 from mesh.work.job import HandlerCancelled, Job
 from mesh.work.listening import WAITING
-from mesh.work.notes import NOTE_TOPIC
 from mesh.work.run import QUEUED
 from schemas import InvalidPayload, LiabilityTopicKey, String
 from tests.mesh.work.runs import AGENT, Making, making, session

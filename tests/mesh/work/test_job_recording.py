@@ -9,9 +9,8 @@ import msgspec
 import pytest
 import zenoh
 
-from mesh.recording import json_type, open_objective
+from mesh.recording import NOTE_TOPIC, json_type, open_objective
 from mesh.recording.partial import PartialFile
-from mesh.work.notes import NOTE_TOPIC
 from mesh.work.run import FLUSH, SyncedRun
 from schemas import Empty, String
 from tests.mesh.work.runs import AGENT, Making, making, session

@@ -1,0 +1,214 @@
+"""Judging a result: whether its recording proves that the work was done, by the policies of a validator.
+
+Needs neither a chain nor a network. The recording is read once for all policies.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from mesh.errors import InvalidMessage
+from mesh.evidence import Claim, Finding, verify
+from mesh.recording import Limits
+from mesh.validator.evidence import Evidence
+from mesh.validator.policies import COMPLETE
+from mesh.validator.policy import OwnPolicy
+from schemas import Result, cid_of_file
+from schemas.signing import is_word
+from schemas.signing import verify as verify_signature
+from schemas.verdicts import LONGEST_REPORT, LONGEST_TEXT, MOST_FINDINGS, ReportFinding
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from mesh.recording import Objective, Played
+    from mesh.validator.policy import Policy, PolicyCheck
+    from schemas import Liability
+    from schemas.model import ModelDescription
+
+_LIMITS: Final = Limits()
+_NOT_JUDGED: Final = frozenset({"finalized"})
+"""Findings of `verify` that are not about the result: a validator judges before the contract has ended."""
+_MAY_STAY_OPEN: Final = frozenset({"closed"})
+"""Findings that may stay undecided: that an agent crashed, and may have lost a second of the recording, is no fault."""
+_FINDINGS_SIZE: Final = LONGEST_REPORT - 4096
+"""Bytes of a report that are left for its findings."""
+_MESSAGE: Final = struct.Struct("<qII")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A Result to be judged.
+
+    `message` is the promisor's encoded Result, which claims success if `claimed`. The recording must have been made
+    between `since_ns` and `until_ns`, in nanoseconds of Unix time by the robot's clock: allow for wrong clocks.
+    `owner_of` returns the address of another liability for which a recording with that mark (see `Judgement`) was
+    judged a success; empty if there is none. `model` is the description of the liability's model, if it has one.
+
+    Give the CIDs by which the files were fetched: one that was made with other settings than ours can't be computed.
+    """
+
+    liability: Liability
+    claimed: bool
+    message: bytes
+    since_ns: int
+    until_ns: int
+    owner_of: Callable[[str], str]
+    model: ModelDescription | None = None
+    objective_cid: str = ""
+    recording_cid: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """Whether a result counts, and all that was found: the work counts only if it is claimed and every finding holds.
+
+    `marks` identify the recording, so that it pays only one job: the CID of the file, and a hash of its messages and
+    the times between them, which stays if only metadata and the time of day are changed.
+    """
+
+    success: bool
+    findings: tuple[ReportFinding, ...]
+    marks: tuple[str, ...] = ()
+
+    @property
+    def failures(self) -> tuple[ReportFinding, ...]:
+        """The findings because of which the work does not count."""
+        return tuple(finding for finding in self.findings if finding.holds is False)
+
+
+def judge(
+    case: Case, *, objective: Path, recording: Path, policies: Sequence[Policy], limits: Limits = _LIMITS
+) -> Judgement:
+    """Judge a result by `complete` and the `policies`. Files beyond the `limits` are not readable.
+
+    Use a thread. Raises `OSError` if a file can't be read; whatever is in the files is a finding.
+    """
+    others = [policy for policy in policies if policy.name != COMPLETE.name]
+    trial = _Trial(case, others)
+    cid = case.recording_cid or cid_of_file(recording)
+    signed = _result_in(case.message)
+    verdict = verify(
+        msgspec.structs.replace(
+            Claim.of_contract(case.liability),
+            result="" if signed is None else signed.result,
+            success=case.claimed,
+            finalized=None,
+        ),
+        objective=objective,
+        result=recording,
+        message=case.message,
+        objective_cid=case.objective_cid,
+        result_cid=cid,
+        period=(case.since_ns, case.until_ns),
+        limits=limits,
+        observer=trial,
+    )
+    found = [_check_claimed(case, signed)]
+    found += [_decided(finding) for finding in verdict.findings if finding.name not in _NOT_JUDGED]
+    marks = trial.marks(cid)
+    found.append(_check_replayed(case, marks))
+    reported = [_reported(COMPLETE.name, finding) for finding in found]
+    reported += trial.findings()
+    success = case.claimed and all(finding.holds is not False for finding in reported)
+    return Judgement(success=success, findings=_bounded(reported), marks=marks)
+
+
+class _Trial:
+    """Shows the recording to all policies while it is verified, and computes its hash."""
+
+    def __init__(self, case: Case, policies: Sequence[Policy]) -> None:
+        own = any(isinstance(policy, OwnPolicy) for policy in policies)
+        self._evidence = Evidence(case.liability, model=case.model, keep=own)
+        self._policies = policies
+        self._checks: list[PolicyCheck] = []
+        self._hash = blake2b(digest_size=32)
+        self._count = 0
+        self._last = 0
+
+    def open(self, recording: Objective) -> None:
+        self._evidence.open(recording)
+        self._checks = [policy.begin(self._evidence) for policy in self._policies]
+
+    def add(self, message: Played, part: int) -> None:
+        judged = self._evidence.add(message, part)
+        for check in self._checks:
+            check.add(judged)
+        topic, since = message.topic.encode(), message.log_time_ns - self._last if self._count else 0
+        self._hash.update(_MESSAGE.pack(since, len(topic), len(message.payload)))
+        self._hash.update(topic)
+        self._hash.update(message.payload)
+        self._last = message.log_time_ns
+        self._count += 1
+
+    def open_objective(self, objective: Objective) -> None:
+        self._evidence.open_objective(objective)
+
+    def marks(self, cid: str) -> tuple[str, ...]:
+        """What identifies the recording. Two messages at least, since the times between them make the hash unique."""
+        return (cid, self._hash.hexdigest()) if self._count > 1 else (cid,)
+
+    def findings(self) -> Iterator[ReportFinding]:
+        """What the policies have found; nothing if the recording is not readable."""
+        for policy, check in zip(self._policies, self._checks, strict=False):
+            for finding in check.findings():
+                yield _reported(policy.name, _decided(finding))
+
+
+def _result_in(message: bytes) -> Result | None:
+    """The Result in an encoded message; None if there is none, which a finding says."""
+    try:
+        signed = verify_signature(message).message
+    except InvalidMessage:
+        return None
+    return signed if isinstance(signed, Result) else None
+
+
+def _check_claimed(case: Case, signed: Result | None) -> Finding:
+    if not case.claimed:
+        return Finding("claimed", False, "the promisor does not claim success")
+    if signed is not None and not signed.success:
+        return Finding("claimed", False, "the promisor has signed that it had no success")
+    return Finding("claimed", True, "the promisor claims success")
+
+
+def _check_replayed(case: Case, marks: Sequence[str]) -> Finding:
+    for mark in marks:
+        if owner := case.owner_of(mark):
+            return Finding("replayed", False, f"these messages were the result of another liability, {owner}")
+    return Finding("replayed", True, "no other liability had these messages as its result")
+
+
+def _decided(finding: Finding) -> Finding:
+    """The finding, as a failure if it is undecided and must not be."""
+    if finding.holds is None and finding.name not in _MAY_STAY_OPEN:
+        return Finding(finding.name, False, finding.detail)
+    return finding
+
+
+def _reported(policy: str, finding: Finding) -> ReportFinding:
+    """A finding for the report. Its texts may be those of strangers, or of a user's check."""
+    code = finding.name if is_word(finding.name) else "check"
+    return ReportFinding(policy=policy, code=code, holds=finding.holds, detail=_line(str(finding.detail)))
+
+
+def _line(text: str) -> str:
+    """At most `LONGEST_TEXT` characters of a text that a terminal shows as they are."""
+    shown = "".join(letter if letter.isprintable() else " " for letter in text[: LONGEST_TEXT + 1])
+    return shown if len(shown) <= LONGEST_TEXT else shown[: LONGEST_TEXT - 1] + "…"
+
+
+def _bounded(findings: Sequence[ReportFinding]) -> tuple[ReportFinding, ...]:
+    """As many findings as a report holds, in their order; failures come before others if there are too many."""
+    kept, size = set[int](), 0
+    for number in sorted(range(len(findings)), key=lambda number: findings[number].holds is not False):
+        size += len(findings[number].encode()) + 1
+        if len(kept) < MOST_FINDINGS and size <= _FINDINGS_SIZE:
+            kept.add(number)
+    return tuple(finding for number, finding in enumerate(findings) if number in kept)

@@ -1,0 +1,69 @@
+"""Results to be judged: a job's two files with the case about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from mesh.validator.judging import Case, Judgement, judge
+from schemas import ZERO_ADDRESS, Liability, cid_of_bytes
+from tests.mesh.evidence.jobs import OTHER, JobFiles
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mesh.validator.policy import Policy
+
+ALWAYS = (0, 1 << 63)
+
+
+def liability_of(job: JobFiles) -> Liability:
+    """The contract of a job, which has not ended."""
+    return Liability(
+        address=job.claim.liability,
+        model=cid_of_bytes(b"model"),
+        objective=job.claim.objective,
+        result="",
+        promisee=OTHER,
+        promisor=job.claim.promisor,
+        lighthouse=job.claim.lighthouse,
+        lighthouse_fee=0,
+        token=ZERO_ADDRESS,
+        cost=1,
+        validator=OTHER,
+        validator_fee=0,
+        is_success=False,
+        is_finalized=False,
+    )
+
+
+@dataclass
+class Trial:
+    """Judges the result of a job as a juror does, which remembers what it has judged."""
+
+    job: JobFiles
+    judged: dict[str, str] = field(default_factory=dict)
+
+    def judge(self, *policies: Policy, **changed: Any) -> Judgement:
+        """Judge the result by these policies, with these fields of the case changed."""
+        given: dict[str, Any] = {
+            "liability": liability_of(self.job),
+            "claimed": True,
+            "message": self.job.message(),
+            "since_ns": ALWAYS[0],
+            "until_ns": ALWAYS[1],
+            "owner_of": lambda mark: self.judged.get(mark, ""),
+        }
+        return judge(
+            Case(**given | changed), objective=self.job.objective, recording=self.job.result, policies=policies
+        )
+
+
+def failed(judgement: Judgement) -> dict[str, str]:
+    """The failures by `policy/code`, with their details."""
+    return {f"{finding.policy}/{finding.code}": finding.detail for finding in judgement.failures}
+
+
+def names(policies: Sequence[Policy]) -> list[str]:
+    """The names of policies."""
+    return [policy.name for policy in policies]
