@@ -22,7 +22,8 @@ def table(gas: Gas) -> str:
     for key, row in ROWS.items():
         line = f"{row.label:28}"
         for index, column in enumerate(GENERATIONS.values()):
-            line += f"{gas[key][column]:>9,}{row.bars[index]:>9,}{row.originals[index]:>12}" + "   " * (index == 0)
+            ours, bar = (f"{number:,}" if number else "-" for number in (gas[key].get(column), row.bars[index]))
+            line += f"{ours:>9}{bar:>9}{row.originals[index]:>12}" + "   " * (index == 0)
         lines.append(line)
     return "\n".join(lines)
 

@@ -34,6 +34,8 @@ interface OrderErrors is TokenErrors {
     error WrongNonce(uint256 given, uint256 next);
     /// Not 65 bytes, `v` not 27 or 28, `s` in the upper half of the curve order, or nobody's signature.
     error InvalidSignature();
+    /// Several signatures are in strictly ascending order of their signers.
+    error SignersOutOfOrder(address previous, address next);
     /// The signed fields (in generation 5 also sender and nonce) are not those that were sent.
     error WrongSigner(address expected, address recovered);
     /// A generation-5 validator is asked by a call, so it has to be a contract.
@@ -56,7 +58,7 @@ interface LiabilityErrors {
     error AlreadyFinalized(address liability);
     /// A generation-3 liability with a validator is finalized by that validator alone.
     error NotTheValidator(address caller);
-    /// The validator contract does not accept results of this signer.
+    /// The validator contract does not accept results of this signer; several have one address (see Signatures).
     error RefusedByValidator(address signer);
     error RefundTooEarly(uint256 fromBlock);
     error NotTheFactory(address caller);

@@ -106,6 +106,8 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
     }
 
     /// @notice Ends a liability; for its lighthouse, which adds the provider's address behind the arguments.
+    /// @param signature 65 bytes; of several whom the validator accepts together, 65 bytes each, in ascending order of the
+    /// signers.
     function finalizeLiability(address liability, bytes calldata result, bool success, bytes calldata signature)
         external
     {
@@ -133,8 +135,8 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
     ) external {
         Terms memory terms = _termsOf(msg.sender);
         if (terms.generation != 3 || terms.validator != validator) revert NotTheValidator(validator);
-        (bytes32 digest, address signer) = _readResult(msg.sender, result, success, signature);
-        _requireSigner(terms.promisor, signer);
+        (bytes32 digest, bytes32 hash) = _readResult(msg.sender, result, success);
+        _requireSigner(terms.promisor, Signatures.recover(hash, signature));
         _end(msg.sender, terms, digest, success && agree);
         _credit(terms, success && agree, address(0));
     }
@@ -260,7 +262,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
     }
     // slither-disable-end arbitrary-send-erc20,unchecked-transfer
 
-    /// Ends the liability with a result of the promisor's or, in generation 5, of one whom the validator accepts.
+    /// Ends the liability with a result of the promisor's or, in generation 5, of those whom the validator accepts.
     /// @param provider zero when nobody is to be credited.
     function _finalize(
         address liability,
@@ -270,13 +272,13 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         bytes calldata signature,
         address provider
     ) private {
-        (bytes32 digest, address signer) = _readResult(liability, result, success, signature);
+        (bytes32 digest, bytes32 hash) = _readResult(liability, result, success);
         if (terms.validator == address(0)) {
-            _requireSigner(terms.promisor, signer);
+            _requireSigner(terms.promisor, Signatures.recover(hash, signature));
         } else if (terms.generation == 3) {
             revert NotTheValidator(provider == address(0) ? msg.sender : provider);
         } else {
-            Liability(liability).askValidator(terms.validator, signer);
+            Liability(liability).askValidator(terms.validator, Signatures.recoverAll(hash, signature));
         }
         _end(liability, terms, digest, success);
         _credit(terms, success, provider);
@@ -302,16 +304,17 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         if (_hasValidatorFee(terms)) xrt.transfer(feeTo, terms.validatorFee);
     }
 
-    function _readResult(address liability, bytes calldata result, bool success, bytes calldata signature)
+    /// The digest of a result, and what its signer has signed.
+    function _readResult(address liability, bytes calldata result, bool success)
         private
         pure
-        returns (bytes32 digest, address signer)
+        returns (bytes32 digest, bytes32 hash)
     {
         if (result.length != 34 || uint16(bytes2(result)) != Orders.MULTIHASH) revert MalformedResult();
         digest = bytes32(result[2:]);
         // Digests that nothing has; the liability means an empty slot and a refund by them.
         if (uint256(digest) <= 1) revert MalformedResult();
-        signer = Signatures.recover(keccak256(abi.encodePacked(liability, result, success)), signature);
+        hash = keccak256(abi.encodePacked(liability, result, success));
     }
 
     function _termsOf(address liability) private view returns (Terms memory) {

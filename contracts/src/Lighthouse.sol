@@ -39,7 +39,7 @@ contract Lighthouse is RobonomicsErrors, Turns {
 
     /// @notice Ends a liability of this lighthouse with a signed result, on the provider's turn.
     /// @dev The arguments go to the factory as they came: liability, 34-byte multihash of the result, success and the
-    /// signature of the promisor or, in generation 5, of one whom the validator accepts.
+    /// signature of the promisor or, in generation 5, the signatures of those whom the validator accepts.
     function finalizeLiability(address, bytes calldata, bool, bytes calldata) external returns (bool) {
         _useTurn();
         _callFactory(abi.encodePacked(msg.data, msg.sender));

@@ -90,6 +90,12 @@ class Market:
         carried = liability.encode_abi(FINALIZE, [data, result.success, signature, True])
         return called.functions.to(result.liability, carried)
 
+    def verdict(self, liability: Contract, *jurors: Person, success: bool = True) -> Any:
+        """The call by which a provider ends a liability with one result that several have signed, in that order."""
+        results = [self.result(liability, success=success, by=juror) for juror in jurors]
+        signatures = bytes.fromhex("".join(result.signature for result in results))
+        return self.lighthouse.functions.finalizeLiability(liability.address, parse_cid(RESULT), success, signatures)
+
     def finalization_without_turn(self, result: Result) -> Any:
         """The call by which anybody ends a liability."""
         data, signature = parse_cid(result.result), bytes.fromhex(result.signature)

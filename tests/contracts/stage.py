@@ -51,9 +51,8 @@ class Stage:
         self.judge = self.people[-1]
         self.keeper = suite.deployer.address
         self.lighthouse = str(suite.create_lighthouse(timeout=TIMEOUT).address)
-        foreign, jury = suite.deploy("SilentToken", PEOPLE * FUNDS), suite.deploy("Jury", self.xrt)
+        foreign, jury = suite.deploy("SilentToken", PEOPLE * FUNDS), suite.deploy("Jury", self.xrt, [self.judge], 1)
         self.foreign, self.jury = str(foreign.address), str(jury.address)
-        suite.send(jury.functions.name(self.judge, True))
         for person in suite.people[1 : 1 + PEOPLE]:
             suite.fund(person, FUNDS, self.factory)
             suite.send(suite.xrt.functions.approve(self.factory, UNLIMITED), person)

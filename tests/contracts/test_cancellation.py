@@ -58,7 +58,7 @@ def test_the_promisee_has_the_cost_back_at_once(market: Market) -> None:
 def test_the_validator_who_was_not_asked_is_not_paid(market: Market) -> None:
     suite = market.suite
     before = suite.balance(market.promisee)
-    jury = suite.deploy("Jury", suite.xrt.address)
+    jury = suite.deploy("Jury", suite.xrt.address, [market.outsider.address], 1)
     liability = market.create(cost=COST, validator=jury.address, validator_fee=FEE)
 
     suite.send(cancellation(market, liability))

@@ -20,6 +20,16 @@ SOMEBODY = "0x" + "42" * 20
 CURVE_ORDER = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD0364141
 
 
+def twins_of(signature: bytes) -> list[bytes]:
+    """Other bytes that some recover the same signer from, and bytes that nobody has signed."""
+    mirrored = (CURVE_ORDER - int.from_bytes(signature[32:64], "big")).to_bytes(32, "big")
+    return [
+        signature[:32] + mirrored + bytes((55 - signature[64],)),
+        signature[:64] + bytes((signature[64] - 27,)),
+        bytes(32) + signature[32:],
+    ]
+
+
 @pytest.fixture
 def liability(market: Market) -> Contract:
     """A liability that costs something."""
@@ -46,14 +56,7 @@ def test_a_result_is_for_its_liability_alone(market: Market, liability: Contract
 
 def test_the_twins_of_a_signature_are_refused(market: Market, liability: Contract) -> None:
     result = market.result(liability)
-    signature = bytes.fromhex(result.signature)
-    mirrored = (CURVE_ORDER - int.from_bytes(signature[32:64], "big")).to_bytes(32, "big")
-    twins = [
-        signature[:32] + mirrored + bytes((55 - signature[64],)),
-        signature[:64] + bytes((signature[64] - 27,)),
-        bytes(32) + signature[32:],
-    ]
-    for twin in twins:
+    for twin in twins_of(bytes.fromhex(result.signature)):
         refusal = market.refusal(market.finalization(replace(result, signature=twin.hex())))
         assert refusal == ("InvalidSignature",)
 

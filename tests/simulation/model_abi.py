@@ -135,7 +135,11 @@ def decode(types: Sequence[str], data: bytes) -> list[Any]:
     found: list[Any] = []
     for at, kind in enumerate(types):
         raw = data[WORD * at : WORD * at + WORD]
-        if kind in DYNAMIC:
+        if kind == "address[]":
+            start = int.from_bytes(raw, "big") + WORD
+            count = int.from_bytes(data[start - WORD : start], "big")
+            found.append([data[at + 12 : at + WORD] for at in range(start, start + WORD * count, WORD)])
+        elif kind in DYNAMIC:
             found.append(_dynamic(data, int.from_bytes(raw, "big")))
         elif kind.startswith("bytes"):
             size = int(kind[5:])

@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from schemas import keccak256
-from tests.simulation.model_abi import ModelRevert, artifact, checked, decode, encode, functions, refused
+from tests.simulation.model_abi import ModelRevert, artifact, checked, decode, encode, functions, refused, word
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from tests.simulation.model_state import ModelRun
 
 NOBODY = bytes(20)
 UNLIMITED = 2**256 - 1
+MOST_JURORS = 7
 
 
 class ModelContract:
@@ -246,9 +250,19 @@ class ModelJury(ModelContract):
 
     NAME = "Jury"
 
-    def begin(self, xrt: bytes = NOBODY) -> None:
-        self.set("keeper", self.sender)
-        self.set("xrt", xrt)
+    def begin(self, xrt: bytes = NOBODY, jurors: Sequence[bytes] = (), quorum: int = 0) -> None:
+        if not 1 <= len(jurors) <= MOST_JURORS:
+            raise refused("InvalidJurorCount", len(jurors), MOST_JURORS)
+        if not 1 <= quorum <= len(jurors):
+            raise refused("InvalidQuorum", quorum, len(jurors))
+        for previous, juror in zip((NOBODY, *jurors), jurors, strict=False):
+            if juror <= previous:
+                raise refused("JurorsOutOfOrder", previous, juror)
+        for name, value in (("keeper", self.sender), ("xrt", xrt), ("jurors", tuple(jurors)), ("quorum", quorum)):
+            self.set(name, value)
+
+    def MOST_JURORS(self) -> int:
+        return MOST_JURORS
 
     def keeper(self) -> bytes:
         return bytes(self.get("keeper"))
@@ -256,18 +270,23 @@ class ModelJury(ModelContract):
     def xrt(self) -> bytes:
         return bytes(self.get("xrt"))
 
-    def isValidator(self, signer: bytes) -> bool:
-        return bool(self.get("juror", signer))
+    def jurors(self) -> tuple[bytes, ...]:
+        return tuple(self.get("jurors"))
 
-    def name(self, juror: bytes, serves: bool) -> None:
-        self._only_keeper()
-        self.set("juror", juror, serves)
-        self.log("Named", juror, serves)
+    def quorum(self) -> int:
+        return int(self.get("quorum"))
+
+    def isValidator(self, signer: bytes) -> bool:
+        if self.quorum() == 1:
+            return signer in self.jurors()
+        return any(stand_in(chosen) == signer for chosen in combinations(self.jurors(), self.quorum()))
 
     def collect(self, value: int) -> None:
-        self._only_keeper()
-        ModelToken(self.run, self.xrt(), self.address).transfer(self.keeper(), value)
-
-    def _only_keeper(self) -> None:
         if self.sender != self.keeper():
             raise refused("NotTheKeeper", self.sender)
+        ModelToken(self.run, self.xrt(), self.address).transfer(self.keeper(), value)
+
+
+def stand_in(signers: Sequence[bytes]) -> bytes:
+    """The address that stands for several signers."""
+    return keccak256(b"".join(map(word, signers)))[12:]

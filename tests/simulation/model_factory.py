@@ -17,6 +17,7 @@ from tests.simulation.model_orders import (
     read_order,
     read_result,
     recover_signer,
+    recover_signers,
     require_match,
     require_signer,
 )
@@ -148,8 +149,8 @@ class ModelFactory(ModelEscrow):
         terms = self._terms(self.sender)
         if terms.generation != 3 or terms.validator != validator:
             raise refused("NotTheValidator", validator)
-        digest, signer = read_result(self.sender, result, success, signature)
-        require_signer(terms.promisor, signer)
+        digest, signed = read_result(self.sender, result, success)
+        require_signer(terms.promisor, recover_signer(signed, signature))
         self._end(self.sender, terms, digest, success and agree)
         self._credit(terms, success and agree, NOBODY)
 
@@ -240,12 +241,13 @@ class ModelFactory(ModelEscrow):
 
     def _finalize(self, liability: bytes, result: bytes, success: bool, signature: bytes, provider: bytes) -> None:
         terms = self._terms(liability)
-        digest, signer = read_result(liability, result, success, signature)
+        digest, signed = read_result(liability, result, success)
         if terms.validator == NOBODY:
-            require_signer(terms.promisor, signer)
+            require_signer(terms.promisor, recover_signer(signed, signature))
         elif terms.generation == 3:
             raise refused("NotTheValidator", self.sender if provider == NOBODY else provider)
         else:
+            signer = recover_signers(signed, signature)
             ModelLiability(self.run, liability, self.address).ask_validator(terms.validator, signer)
         self._end(liability, terms, digest, success)
         self._credit(terms, success, provider)

@@ -24,6 +24,7 @@ KINDS: Final = {
     "factory": "Factory",
     "lighthouse": "Lighthouse",
     "jury": "Jury",
+    "panel": "Jury",
 }
 AMOUNTS: Final = (0, 1, 1, XRT - 1, XRT, XRT, 2 * XRT, 5 * XRT, 40 * XRT, 10**6 * XRT, 2**96, 2**128, 2**256 - 1)
 NAMES: Final = (b"airalab", b"tower", b"a", b"", b"-a", b"ab--c", b"Upper", b"x" * 33, "\u00e4".encode())
@@ -183,6 +184,7 @@ class ModelHistory:
             "validator": self.pick(
                 *[NOBODY] * 12,
                 *[self.known["jury"]] * 3,
+                *[self.known["panel"]] * 3,
                 *[self.twins.people[5]] * 3,
                 self.anybody(),
                 self.lighthouses[-1],
@@ -208,9 +210,14 @@ class ModelHistory:
             self.pick(True, True, False),
             self.pick(*[RESULT] * 10, RESULT[:33], bytes(34), RESULT[:33] + b"\0"),
         )
-        signer = self.pick(*[terms["promisor"]] * 6, terms["promisee"], 4, 5)
         digest = keccak256(liability + RESULT + bytes([success if self.pick(*[True] * 9, False) else not success]))
-        return result, success, self.twins.signers[signer].sign_hash(digest)
+        if self.pick(False, terms["validator"] == self.known["panel"]):
+            signers = sorted(self.chance.sample(range(3, PEOPLE), 2), key=lambda who: self.twins.people[who])
+            signers = self.pick(*[signers] * 6, signers[::-1], signers[:1] * 2, [2, *signers], [*signers, 1])
+        else:
+            signers = [self.pick(*[terms["promisor"]] * 6, terms["promisee"], 3, 4, 5)]
+        signatures = b"".join(self.twins.signers[who].sign_hash(digest) for who in signers)
+        return result, success, self.pick(*[signatures] * 20, signatures[:-1], signatures + b"\0")
 
     def finish(self) -> None:
         if not self.made:
@@ -242,7 +249,10 @@ class ModelHistory:
             "refund": (self.known["factory"], call_of("Factory", "refund", liability)),
             "cancel": (self.known["factory"], call_of("Factory", "cancel", liability, *signatures)),
             "settle": (liability, call_of("Liability", "settle", RESULT[2:], True)),
-            "ask": (liability, call_of("Liability", "askValidator", self.known["jury"], self.person())),
+            "ask": (
+                liability,
+                call_of("Liability", "askValidator", self.known[self.pick("jury", "panel")], self.person()),
+            ),
         }
         self.do(self.person(), *calls[self.pick("refund", "refund", "cancel", "settle", "ask")])
 
@@ -275,9 +285,8 @@ class ModelHistory:
 
     def jury(self) -> None:
         sender = self.pick(self.twins.people[0], self.person())
-        calls = (("name", (self.person(), self.pick(True, False))), ("collect", (self.pick(0, 1, XRT),)))
-        function, values = self.pick(*calls)
-        self.do(sender, self.known["jury"], call_of("Jury", function, *values))
+        jury = self.known[self.pick("jury", "panel")]
+        self.do(sender, jury, call_of("Jury", "collect", self.pick(0, 1, XRT)))
 
     def again(self) -> None:
         """What was sent before, by the same or another account, perhaps with ether."""

@@ -9,9 +9,11 @@ from coincurve import PublicKey
 
 from schemas import keccak256
 from tests.simulation.model_abi import refused, word
-from tests.simulation.model_contracts import NOBODY
+from tests.simulation.model_contracts import NOBODY, stand_in
 
 MULTIHASH: Final = bytes.fromhex("1220")
+SIGNATURE: Final = 65
+"""Bytes."""
 HALF_ORDER: Final = 0x7FFFFFFFFFFFFFFFFFFFFFFFFFFFFFFF5D576E7357A4501DDFE92F46681B20A0
 
 
@@ -111,11 +113,11 @@ def require_match(demand: ModelOrder, offer: ModelOrder) -> None:
             raise refused(name)
 
 
-def read_result(liability: bytes, result: bytes, success: bool, signature: bytes) -> tuple[bytes, bytes]:
-    """The digest of a result, and who signed it."""
+def read_result(liability: bytes, result: bytes, success: bool) -> tuple[bytes, bytes]:
+    """The digest of a result, and what its signers sign."""
     if len(result) != 34 or result[:2] != MULTIHASH or int.from_bytes(result[2:], "big") <= 1:
         raise refused("MalformedResult")
-    return result[2:], recover_signer(keccak256(liability + result + bytes([success])), signature)
+    return result[2:], keccak256(liability + result + bytes([success]))
 
 
 def require_signer(expected: bytes, signer: bytes) -> None:
@@ -132,10 +134,29 @@ def recover_signer(digest: bytes, signature: bytes) -> bytes:
     return signer
 
 
+def recover_signers(digest: bytes, signatures: bytes) -> bytes:
+    """Who signed a hash, or the address that stands for several signers."""
+    if len(signatures) <= SIGNATURE:
+        return recover_signer(digest, signatures)
+    if len(signatures) % SIGNATURE:
+        raise refused("InvalidSignature")
+    signers = [NOBODY]
+    for at in range(0, len(signatures), SIGNATURE):
+        signer = recover_signer(digest, signatures[at : at + SIGNATURE])
+        if signer <= signers[-1]:
+            raise refused("SignersOutOfOrder", signers[-1], signer)
+        signers.append(signer)
+    return stand_in(signers[1:])
+
+
 @lru_cache(maxsize=10_000)
 def _signer_of(digest: bytes, signature: bytes) -> bytes | None:
     """Who signed a hash as EIP-191 has it; None for nobody."""
-    if len(signature) != 65 or int.from_bytes(signature[32:64], "big") > HALF_ORDER or signature[64] not in (27, 28):
+    if (
+        len(signature) != SIGNATURE
+        or int.from_bytes(signature[32:64], "big") > HALF_ORDER
+        or signature[64] not in (27, 28)
+    ):
         return None
     prefixed = keccak256(b"\x19Ethereum Signed Message:\n32" + digest)
     try:

@@ -30,6 +30,8 @@ GAS: Final = 8_000_000
 REFUND_DELAY: Final = 12
 TIMEOUT: Final = 4
 PEOPLE: Final = 6
+JURY: Final = ["address", "address[]", "uint256"]
+"""What its constructor takes."""
 PLAN: Final = DeploymentPlan(timeout_blocks=TIMEOUT, refund_delay=REFUND_DELAY)
 
 
@@ -140,12 +142,14 @@ class Twins:
                 each = TransactionSender(node, Account.from_key(key))
                 for spender in (found.factory, found.lighthouse):
                     await each.call(token.approve(spender, 1000 * XRT))
-            arguments: dict[str, tuple[str, Any]] = {
-                "other": ("XRT", ("uint256", 500 * XRT)),
-                "jury": ("Jury", ("address", found.xrt)),
+            jurors = sorted((Signer(key).address for key in evm.funded_keys[3:PEOPLE]), key=address_bytes)
+            arguments: dict[str, tuple[str, list[str], list[Any]]] = {
+                "other": ("XRT", ["uint256"], [500 * XRT]),
+                "jury": ("Jury", JURY, [found.xrt, jurors[-1:], 1]),
+                "panel": ("Jury", JURY, [found.xrt, jurors, 2]),
             }
-            for name, (kind, (type_, value)) in arguments.items():
-                data = bytes.fromhex(artifact(kind)["bytecode"][2:]) + encode([type_], [value])
+            for name, (kind, types, values) in arguments.items():
+                data = bytes.fromhex(artifact(kind)["bytecode"][2:]) + encode(types, values)
                 receipt = await sender.send(to=None, data=data)
                 assert receipt.contract is not None
                 addresses[name] = address_bytes(receipt.contract)
