@@ -18,7 +18,7 @@ with needs_extra("chain", "the chain"):
         new_private_key,
         write_keyfile,
     )
-    from mesh.chain.admission import Allowances, OrderCosts, UnsafeValidator
+    from mesh.chain.admission import Allowances, OrderCosts
     from mesh.chain.answers import BlockHeader
     from mesh.chain.client import Chain
     from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
@@ -27,7 +27,6 @@ with needs_extra("chain", "the chain"):
         FeeTooHigh,
         InsufficientFunds,
         InsufficientTokens,
-        InvalidName,
         NoAccount,
         NoContracts,
         NodeUnreachable,
@@ -56,8 +55,18 @@ with needs_extra("chain", "the chain"):
     from mesh.chain.funds import Funding, Holding
     from mesh.chain.liabilities import Created, RefundState, Settled
     from mesh.chain.lighthouse_state import LighthouseState
-    from mesh.chain.names import namehash
+    from mesh.chain.names import InvalidName, namehash
     from mesh.chain.node import Node
     from mesh.chain.policy import GWEI, FeePolicy, Timing
     from mesh.chain.tokens import Token
     from mesh.chain.transactions import TransactionSender
+    from mesh.chain.validators import (
+        CollectedFees,
+        DeployedJury,
+        InvalidJury,
+        JuryState,
+        NoFees,
+        NotAJury,
+        UnsafeValidator,
+        ValidatorWithoutCode,
+    )

@@ -1,32 +1,18 @@
-"""What orders need: an allowance for what they cost, makers who can pay, and a validator that they may name.
-
-A validator is no lighthouse, and nothing that could become one. An offer on lighthouse L with validator V is, with the
-same signature, a demand on lighthouse V with validator L: the format has the two addresses in swapped places. So a
-stranger whose demand names a lighthouse as validator could use the offer of a robot that agrees to it as that robot's
-demand, and take the cost from the robot. Our contracts refuse such orders when the liability is created; the originals
-don't.
-"""
+"""What orders need: an allowance for what they cost, and makers who can pay it."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import math
-import time
 from typing import TYPE_CHECKING, Final
 
-from mesh.chain.contracts import OriginalContracts
 from mesh.chain.errors import InsufficientTokens, Reverted
 from mesh.chain.funds import NO_TOKEN, SHORT_POLLS, Holding
-from mesh.chain.lighthouses import Lighthouses
-from mesh.errors import InputError
-from mesh.flood import BoundedDict
 from mesh.log_context import log_event
-from schemas.address import ZERO_ADDRESS
 from schemas.messages import Offer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+    from collections.abc import Hashable, Iterable, Mapping, Sequence
 
     from mesh.chain.contracts import Contracts
     from mesh.chain.funds import Funding, Funds
@@ -36,10 +22,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-REMEMBERED: Final = 4096
-"""Validators whose verdict is remembered, the latest ones."""
-RECHECK: Final = 60.0
-"""Seconds after which a verdict is asked for again that a transaction can change."""
 TOKEN_UNREADABLE: Final = "TokenUnreadable"
 """The reason of a rejection when a contract does not tell balances and allowances, so that it can't be paid with."""
 LEAST_AHEAD: Final = 4
@@ -96,67 +78,6 @@ def _lacks(funding: Funding | None, amount: int) -> str:
     if funding == NO_TOKEN:
         return TOKEN_UNREADABLE
     return "ERC20InsufficientAllowance" if funding.allowance < amount else "ERC20InsufficientBalance"
-
-
-class UnsafeValidator(InputError, code="validator-unsafe"):
-    """An order names a validator that is a lighthouse, or could become one: it could be used as another order."""
-
-    def __init__(self, validator: str) -> None:
-        super().__init__(
-            f"the validator {validator} is a lighthouse, or an account that is not known on the chain",
-            hint="name another validator, or none; an account is known once it has sent a transaction",
-        )
-        self.validator = validator
-
-
-class Validators:
-    """Verdicts on validators, each asked from the chain once. A contract or a lighthouse stays what it is.
-
-    With the originals, an address without code must have sent a transaction: else it may be that of a lighthouse which
-    somebody is about to create.
-    """
-
-    def __init__(self, contracts: Contracts, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._contracts = contracts
-        self._clock = clock
-        self._verdicts: BoundedDict[str, tuple[bool, float]] = BoundedDict(REMEMBERED)
-
-    def known(self, validator: str) -> bool | None:
-        """Whether orders may name the validator (EIP-55 address); None if the chain has to be asked."""
-        if validator == ZERO_ADDRESS:
-            return True
-        verdict, until = self._verdicts.get(validator, (None, 0.0))
-        return verdict if self._clock() < until else None
-
-    async def is_safe(self, validator: str) -> bool:
-        """Whether orders may name the validator. Raises `ChainError` if the chain can't be asked."""
-        verdict = self.known(validator)
-        if verdict is None:
-            verdict, is_final = await self._ask(validator)
-            self._verdicts[validator] = (verdict, math.inf if is_final else self._clock() + RECHECK)
-        return verdict
-
-    async def check(self, order: Order) -> None:
-        """Raise `UnsafeValidator` if the order names a validator that it must not name; `ChainError`."""
-        if not await self.is_safe(order.validator):
-            raise UnsafeValidator(order.validator)
-
-    def check_known(self, order: Order) -> None:
-        """Like `check`, without asking the chain: a validator that is not known raises, too."""
-        if not self.known(order.validator):
-            raise UnsafeValidator(order.validator)
-
-    async def _ask(self, validator: str) -> tuple[bool, bool]:
-        """The verdict, and whether it is final."""
-        if await Lighthouses(self._contracts).exists(validator):
-            return False, True
-        node = self._contracts.node
-        if await node.code(validator):
-            return True, True
-        if not isinstance(self._contracts.version, OriginalContracts):
-            return True, False
-        has_sent = await node.transaction_count(validator) > 0
-        return has_sent, has_sent
 
 
 class Allowances:

@@ -7,7 +7,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
-from mesh.chain.admission import OrderCosts, Validators
+from mesh.chain.admission import OrderCosts
 from mesh.chain.artifacts import is_code_of
 from mesh.chain.contracts import Contracts, contract_version
 from mesh.chain.errors import NoContracts, UnknownName
@@ -21,6 +21,7 @@ from mesh.chain.node import Node
 from mesh.chain.reader import EventSources, read_events
 from mesh.chain.tokens import Tokens
 from mesh.chain.transactions import TransactionSender
+from mesh.chain.validators import Validators
 from mesh.errors import ClosedError
 from mesh.telemetry.metrics import gauge
 

@@ -14,7 +14,9 @@ from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
 from mesh.chain.lighthouse_state import GETTERS, LighthouseState, lighthouse_state, original_state
 from mesh.errors import InvalidMessage
 from mesh.flood import BoundedDict
+from schemas.address import address_bytes
 from schemas.cid import parse_cid
+from schemas.signing import recover
 from schemas.wire import message_hash
 
 if TYPE_CHECKING:
@@ -48,9 +50,12 @@ class ContractVersion:
     def check_order(self, order: Order) -> None:
         """Raise `InvalidMessage` for an order that the contracts can't read."""
 
-    def finalization(self, lighthouse: ContractFunctions, result: Result) -> ContractCall:
-        """The call by which a provider finalizes a liability with its result."""
-        return lighthouse.finalizeLiability(result.liability, *result_arguments(result))
+    def finalization(self, lighthouse: ContractFunctions, result: Result, *others: Result) -> ContractCall:
+        """The call by which a provider finalizes a liability with its result, which `others` have signed, too.
+
+        Raises `NotOffered`.
+        """
+        return lighthouse.finalizeLiability(result.liability, *result_arguments(result, *others))
 
     def finalization_without_turn(self, result: Result) -> ContractCall:
         """The call by which anybody finalizes a liability with its result. Raises `NotOffered`."""
@@ -126,7 +131,9 @@ class OriginalContracts(ContractVersion):
                 detail=f"the contracts are of generation {self.generation}, the order of {order.generation}",
             )
 
-    def finalization(self, lighthouse: ContractFunctions, result: Result) -> ContractCall:
+    def finalization(self, lighthouse: ContractFunctions, result: Result, *others: Result) -> ContractCall:
+        if others:
+            raise NotOffered("finalization by several signers", self.generation)
         if self.generation == 5:
             return super().finalization(lighthouse, result)
         call = super().validation(result, agree=AGREE)
@@ -185,9 +192,19 @@ def contract_version(kind: ContractKind, node: Node, factory: str, generation: i
     return (OriginalContracts if kind == "original" else ContractVersion)(node, factory, generation)
 
 
-def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:
-    """A signed result as arguments of the contracts."""
-    return parse_cid(result.result), result.success, bytes.fromhex(result.signature)
+def result_arguments(result: Result, *others: Result) -> tuple[bytes, bool, bytes]:
+    """A signed result as arguments of the contracts; `others` are the same, signed by others.
+
+    Several signatures are in ascending order of their signers.
+    """
+    if not others:
+        return parse_cid(result.result), result.success, bytes.fromhex(result.signature)
+    digest = message_hash(result)
+    if any(message_hash(other) != digest for other in others):
+        raise InvalidMessage("result", "results with different contents can't finalize a contract together")
+    signed = sorted((result, *others), key=lambda one: address_bytes(recover(digest, one.signature)))
+    signatures = bytes.fromhex("".join(one.signature for one in signed))
+    return parse_cid(result.result), result.success, signatures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,6 +26,9 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
         "WrongSigner": "another account signed it, or the terms differ from those that were signed",
         "InvalidSignature": "a signature is 65 bytes with v 27 or 28 and a low s",
         "NotAProvider": "stake on the lighthouse first: only its providers may send to it",
+        "NotTheKeeper": "only the account that deployed the validator collects its fees",
+        "RefusedByValidator": "the validator does not accept this signer, or not these signers together",
+        "SignersOutOfOrder": "several signatures are sorted by their signers' addresses, each signer once",
         "NotTheValidator": "the contract names a validator, and only that account can finalize it",
         "AlreadyFinalized": "it has ended; its record says how",
         "RefundTooEarly": "wait for that block: until then the promisor may bring a result",
@@ -279,14 +282,6 @@ class TransactionDamaged(ConfigurationError, code="transaction-damaged"):
 
 class UnknownContracts(ConfigurationError, code="unknown-contracts"):
     """The settings name contracts, or a generation of them, that do not exist."""
-
-
-class InvalidName(InputError, code="invalid-name"):
-    """A text that is not an ENS name."""
-
-    def __init__(self, text: str, why: str) -> None:
-        super().__init__(f"{text[:80]!r} is not an ENS name: {why}")
-        self.text = text
 
 
 def _ether(wei: int) -> str:

@@ -183,10 +183,10 @@ class Liabilities:
                     raise OrderAlreadyUsed(digest.hex()) from error
             raise
 
-    async def finalize(self, lighthouse: str, result: Result) -> Settled:
-        """Finalize a liability by its signed result, as a provider of the lighthouse."""
+    async def finalize(self, lighthouse: str, result: Result, *others: Result) -> Settled:
+        """Finalize a liability by its signed result, as a provider; `others` are the same, signed by more jurors."""
         functions = await self._contracts.lighthouse_contract(lighthouse)
-        return await self._settle(self._contracts.version.finalization(functions, result))
+        return await self._settle(self._contracts.version.finalization(functions, result, *others))
 
     async def finalize_without_turn(self, result: Result) -> Settled:
         """Finalize a liability by its signed result as any account, when no provider does; nothing is minted.

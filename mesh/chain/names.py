@@ -10,7 +10,8 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.abi import ContractFunctions, functions_of
-from mesh.chain.errors import InvalidName, NoContracts, Reverted, UnknownName
+from mesh.chain.errors import NoContracts, Reverted, UnknownName
+from mesh.errors import InputError
 from schemas import keccak256
 from schemas.address import ZERO_ADDRESS, is_ens_name, parse_address
 from schemas.cid import format_cid, parse_cid
@@ -45,6 +46,14 @@ ADDRESS_SECONDS: Final = 300.0
 """How long the address of a name is used before it is looked up again."""
 
 NAME_RULE: Final = "names end in .eth, .sid or .test, and hold ASCII letters, digits, - and _"
+
+
+class InvalidName(InputError, code="invalid-name"):
+    """A text that is not an ENS name."""
+
+    def __init__(self, text: str, why: str) -> None:
+        super().__init__(f"{text[:80]!r} is not an ENS name: {why}")
+        self.text = text
 
 
 def namehash(name: str) -> bytes:

@@ -18,11 +18,11 @@ from web3 import Web3
 
 from mesh.agent import Agent
 from mesh.chain import XRT, Account, Chain, UnsafeValidator
-from mesh.chain.admission import Validators
 from mesh.chain.events import lighthouse_created
 from mesh.chain.names import namehash
 from mesh.chain.node import Node
 from mesh.chain.transactions import TransactionSender
+from mesh.chain.validators import Validators
 from mesh.settings import Settings
 from schemas import Demand, Offer, Result, Verified, keccak256, message_hash, order_abi, parse_cid
 from tests.support.market import QUICK

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec.structs import asdict
 
-from mesh.chain import XRT, Account, UnsafeValidator, admission, new_private_key
+from mesh.chain import XRT, Account, UnsafeValidator, new_private_key, validators
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash, recover
 from tests.mesh.chain.conftest import next_nonce, reverted
 
@@ -107,7 +107,7 @@ async def test_an_address_that_may_become_a_lighthouse_is_refused_where_the_cont
     async with market.chain(contracts=contracts, generation=generation) as chain:
         assert await chain.validators.is_safe(unused) is (contracts == "mesh")
         assert chain.validators.known(unused) is not None
-        monkeypatch.setattr(admission, "RECHECK", 0.0)
+        monkeypatch.setattr(validators, "RECHECK", 0.0)
         other = Account.from_key(new_private_key()).address
         await chain.validators.is_safe(other)
         assert chain.validators.known(other) is None, "a transaction can change it"
@@ -116,7 +116,7 @@ async def test_an_address_that_may_become_a_lighthouse_is_refused_where_the_cont
 async def test_a_limited_number_of_verdicts_is_remembered(
     market: DeployedMarket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(admission, "REMEMBERED", 2)
+    monkeypatch.setattr(validators, "REMEMBERED", 2)
     asked = (market.deployment.xrt, market.promisee.address, market.promisor.address)
     async with market.chain() as chain:
         for validator in asked:
