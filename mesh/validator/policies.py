@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _SECOND: Final = 10**9
 _WITHIN: Final = _SECOND
 _GAP: Final = 10 * _SECOND
+_REPEATED: Final = 64
+"""Open commands among which one that is played again after a crash is looked for."""
 
 COMPLETE: Final = Policy(
     "complete",
@@ -29,7 +31,7 @@ COMPLETE: Final = Policy(
 
 @dataclass(frozen=True)
 class Acknowledged(Policy):
-    """Each command is followed by a message of the device in time. The topics are empty for any."""
+    """Each command is answered by the device in time. The topics are empty for any."""
 
     command: str = ""
     answer: str = ""
@@ -51,34 +53,39 @@ class Acknowledged(Policy):
 
 
 class _AnswerCheck(PolicyCheck):
-    """Waits for the answer to each command. A crash of the agent begins the wait of an open command again."""
+    """Waits for the answer to each command.
+
+    A message on a named `answer` topic answers the command that has waited longest; the robot has the time for each, as
+    it works on one after the other. Without a named topic, any message of the device answers all.
+    A command that was open when the agent crashed is answered if it is played again, or by the first answer in time.
+    """
 
     def __init__(self, policy: Acknowledged) -> None:
         self._policy = policy
-        self._waiting: deque[tuple[int, JudgedMessage]] = deque()
-        """Commands without an answer, each with the time until which it may come."""
+        self._waiting: deque[JudgedMessage] = deque()
+        self._interrupted: list[JudgedMessage] = []
+        """Commands that were open at a crash."""
         self._part = 0
-        self._last = 0
-        self._commands = 0
-        self._unanswered = 0
+        self._last = self._answered = self._resumed = 0
+        """When the last message came, when the last answer, and when the agent continued."""
+        self._commands = self._unanswered = 0
         self._first: JudgedMessage | None = None
 
     def add(self, message: JudgedMessage) -> None:
         if message.part != self._part:
-            self._part = message.part
             self._expire(self._last)
-            self._waiting = deque((message.time_ns + self._policy.within_ns, command) for _, command in self._waiting)
+            self._interrupted += self._waiting
+            self._waiting.clear()
+            self._part, self._resumed = message.part, message.time_ns
         self._last = message.time_ns
         if message.role == "objective" and self._policy.command in ("", message.topic):
-            self._commands += 1
-            self._waiting.append((message.time_ns + self._policy.within_ns, message))
+            self._command(message)
         elif message.role == "device" and self._policy.answer in ("", message.topic):
-            self._expire(message.time_ns)
-            self._waiting.clear()
+            self._answer(message.time_ns)
 
     def findings(self) -> Iterator[Finding]:
-        for _, command in self._waiting:
-            self._count(command)
+        for command in (*self._interrupted, *self._waiting):
+            self._miss(command)
         within = self._policy.within_ns / _SECOND
         if self._first is None:
             yield Finding("answers", True, f"{self._commands} commands, each answered within {within:g} s")
@@ -86,12 +93,30 @@ class _AnswerCheck(PolicyCheck):
         said = f"the command on {self._first.topic} at {self._first.time:.3f} s was not answered within {within:g} s"
         yield Finding("answers", False, f"{said}: {self._unanswered} of {self._commands} commands were not")
 
+    def _command(self, message: JudgedMessage) -> None:
+        self._commands += 1
+        self._waiting.append(message)
+        for number, command in enumerate(self._interrupted[:_REPEATED]):
+            if command.topic == message.topic and command.payload == message.payload:
+                del self._interrupted[number]
+                return
+
+    def _answer(self, now: int) -> None:
+        if self._interrupted and now <= self._resumed + self._policy.within_ns:
+            self._interrupted.clear()
+        self._expire(now)
+        if self._waiting and self._policy.answer:
+            self._waiting.popleft()
+        else:
+            self._waiting.clear()
+        self._answered = now
+
     def _expire(self, now: int) -> None:
         """Give up commands whose answers are overdue."""
-        while self._waiting and self._waiting[0][0] < now:
-            self._count(self._waiting.popleft()[1])
+        while self._waiting and max(self._waiting[0].time_ns, self._answered) + self._policy.within_ns < now:
+            self._miss(self._waiting.popleft())
 
-    def _count(self, command: JudgedMessage) -> None:
+    def _miss(self, command: JudgedMessage) -> None:
         self._unanswered += 1
         self._first = self._first or command
 

@@ -61,7 +61,7 @@ def test_two_files_are_verified_without_chain_and_network(job: JobFiles) -> None
     lines = done.stdout.splitlines()
     assert any(line.startswith("holds") and "played" in line and "all 6 messages" in line for line in lines)
     assert any(line.startswith("open") and "signature" in line for line in lines)
-    assert lines[-1] == "0 of 14 checks failed, 7 stayed open"
+    assert lines[-1] == "0 of 17 checks failed, 7 stayed open"
 
 
 def test_a_failed_check_is_named_and_the_exit_code_is_1(job: JobFiles) -> None:
@@ -70,7 +70,7 @@ def test_a_failed_check_is_named_and_the_exit_code_is_1(job: JobFiles) -> None:
     assert done.exit_code == 1
     assert "FAILS  closed" in done.stdout
     assert "closed it with 11 messages, and it has 4" in done.stdout
-    assert done.stdout.splitlines()[-1].startswith("2 of 14 checks failed")
+    assert done.stdout.splitlines()[-1].startswith("2 of 17 checks failed")
 
 
 def test_unplayed_messages_fail_without_chain_and_network(tmp_path: Path) -> None:
