@@ -1,0 +1,235 @@
+"""A robot with a lamp that does real jobs: what it is ordered, how it works, and what its recordings must show."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import msgspec
+from msgspec import Meta
+
+from mesh.clock import SYSTEM_CLOCK
+from mesh.recording import Recorders, open_objective
+from mesh.settings import Settings
+from mesh.validator.judging import Case, Judgement, judge
+from mesh.validator.policies import policy_of
+from mesh.validator.policy import OwnPolicy
+from mesh.work import Ledger
+from mesh.work.playbacks import Playbacks
+from schemas import (
+    ZERO_ADDRESS,
+    Liability,
+    Result,
+    Signer,
+    checksum_address,
+    cid_of_file,
+    encode,
+    keccak256,
+)
+from schemas.model import ModelDescription, ModelTopic
+from schemas.value_schema import ValueSchema
+from tests.support.objectives import MILLISECOND, timed
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+    from pathlib import Path
+
+    import zenoh
+
+    from mesh.clock import Clock
+    from mesh.recording import Played
+    from mesh.validator.evidence import Evidence
+    from mesh.validator.policy import Policy
+    from mesh.work.job import Job
+
+    Handler = Callable[[Job, Played], Awaitable[object]]
+
+ROBOT: Final = Signer(b"\x01" * 32)
+THIEF: Final = Signer(b"\x02" * 32)
+LIGHTHOUSE: Final = "0x" + "2" * 40
+VALIDATOR: Final = "0x" + "4" * 40
+SLACK_NS: Final = 300 * 10**9
+"""How wrong a robot's clock may be."""
+LEVELS: Final = tuple(number / 20 for number in range(20))
+MODEL: Final = ModelDescription(
+    title="A lamp",
+    result=(
+        ModelTopic(topic="/lamp/state", required=True),
+        ModelTopic(topic="/lamp/temperature", required=True, value=ValueSchema(type="number", minimum=-20, maximum=80)),
+    ),
+)
+
+
+class LampState(msgspec.Struct):
+    """What the lamp says after each command."""
+
+    level: Annotated[float, Meta(ge=0, le=1)]
+    mode: str = "on"
+
+
+class Crashed(Exception):
+    """The robot's process ends here, as by `kill -9`."""
+
+
+def follows_levels(evidence: Evidence) -> Iterator[str]:
+    """The lamp shows the levels that it was told to, in order; those of a crash may be shown twice."""
+    told = [message.value for message in evidence.objective.on("/lamp")]
+    shown = list(dict.fromkeys(message.value["level"] for message in evidence.device.on("/lamp/state")))
+    if shown != told:
+        yield f"the lamp showed the levels {shown}, not {told}"
+
+
+POLICIES: Final[tuple[Policy, ...]] = (
+    policy_of("acknowledged:command=/lamp:answer=/lamp/state:within=1s"),
+    policy_of("schema"),
+    policy_of("rate:topic=/lamp/temperature:min=5:max=1000:gap=1s"),
+    OwnPolicy("levels", "The lamp shows each level that it was told to.", follows_levels),
+)
+
+
+def order(path: Path, levels: tuple[float, ...] = LEVELS, *, step_ns: int = 5 * MILLISECOND) -> Path:
+    """Write an objective with these levels on `/lamp`."""
+    path.write_bytes(timed(("/lamp", level, number * step_ns) for number, level in enumerate(levels)))
+    return path
+
+
+def contract(name: str, objective: Path, *, robot: Signer = ROBOT) -> Liability:
+    """The contract of the job called `name`."""
+    return Liability(
+        address=checksum_address(keccak256(name.encode())[:20]),
+        model=MODEL.cid,
+        objective=cid_of_file(objective),
+        result="",
+        promisee=ZERO_ADDRESS,
+        promisor=robot.address,
+        lighthouse=LIGHTHOUSE,
+        lighthouse_fee=0,
+        token=ZERO_ADDRESS,
+        cost=1,
+        validator=VALIDATOR,
+        validator_fee=0,
+        is_success=False,
+        is_finalized=False,
+    )
+
+
+async def shine(job: Job, message: Played) -> None:
+    """Do what a command on `/lamp` says."""
+    level = message.value
+    job.publish("/lamp/temperature", 20.5 + math.sin(level))
+    job.publish("/lamp/state", LampState(level))
+
+
+@dataclass
+class FinishedJob:
+    """A job whose recording is closed, with what a juror gets of it. Times are in nanoseconds of Unix time."""
+
+    liability: Liability
+    objective: Path
+    recording: Path
+    message: bytes
+    since_ns: int
+    until_ns: int
+    claimed: bool = True
+    objective_cid: str = ""
+    recording_cid: str = ""
+
+    def judge(
+        self, judged: dict[str, str], policies: tuple[Policy, ...] = POLICIES, *, model: ModelDescription | None = MODEL
+    ) -> Judgement:
+        """Judge it as a juror that has judged those recordings, and remembers this one if it counts."""
+        address = self.liability.address
+
+        def owner_of(mark: str) -> str:
+            owner = judged.get(mark, "")
+            return "" if owner == address else owner
+
+        case = Case(
+            liability=self.liability,
+            claimed=self.claimed,
+            message=self.message,
+            since_ns=self.since_ns,
+            until_ns=self.until_ns,
+            owner_of=owner_of,
+            model=model,
+            objective_cid=self.objective_cid,
+            recording_cid=self.recording_cid,
+        )
+        judgement = judge(case, objective=self.objective, recording=self.recording, policies=policies)
+        if judgement.success:
+            judged.update((mark, address) for mark in judgement.marks)
+        return judgement
+
+
+def signed_by(robot: Signer, liability: str, recording: str, *, success: bool = True) -> bytes:
+    """An encoded Result."""
+    return encode(robot.sign(Result(liability=liability, result=recording, success=success)))
+
+
+class LampRobot:
+    """Does jobs as an agent does: with its ledger, playbacks and recorder, on a session with a router."""
+
+    def __init__(
+        self, session: zenoh.Session, folder: Path, *, robot: Signer = ROBOT, clock: Clock = SYSTEM_CLOCK
+    ) -> None:
+        self._session = session
+        self._robot = robot
+        self._clock = clock
+        self.folder = folder
+
+    async def work(
+        self, name: str, objective: Path, handler: Handler = shine, *, topics: str = "", playback: str = "recorded"
+    ) -> FinishedJob:
+        """Do the job called `name`, and continue after each `Crashed` that the handler raises."""
+        liability, since = contract(name, objective, robot=self._robot), self._clock.time_ns()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        settings: Any = Settings(recording_topics=topics, playback=playback)  # type: ignore[arg-type]
+        async with Ledger(self.folder / "ledger.sqlite") as ledger:
+            await ledger.add_job(liability)
+            recording = None
+            while recording is None:
+                with suppress(Crashed):
+                    recording = await self._run(ledger, settings, liability, objective, handler)
+        return FinishedJob(
+            liability=liability,
+            objective=objective,
+            recording=recording,
+            message=signed_by(self._robot, liability.address, cid_of_file(recording)),
+            since_ns=since - SLACK_NS,
+            until_ns=self._clock.time_ns() + SLACK_NS,
+        )
+
+    async def _run(
+        self, ledger: Ledger, settings: Any, liability: Liability, objective: Path, handler: Handler
+    ) -> Path:
+        """One run from the ledger's position. Raises `Crashed` with the files as a killed process leaves them."""
+        job = await ledger.job(liability.address)
+        assert job is not None
+        playbacks = Playbacks(self._session, self._robot.address, ledger, settings, self.folder / "recordings")
+        playbacks.recorders = Recorders(clock=self._clock)
+        played = await asyncio.to_thread(open_objective, objective)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                await playbacks.begin(job, played, play=lambda run: playbacks.play_and_save(run, handler), tasks=tasks)
+        except ExceptionGroup as group:
+            if group.subgroup(Crashed) is None:
+                raise
+            await self._crash(playbacks, liability.address)
+            raise Crashed from None
+        run = await playbacks.stop(liability.address)
+        assert run is not None
+        return (await run.close(sync=False)).path
+
+    async def _crash(self, playbacks: Playbacks, address: str) -> None:
+        """Leave the recording as it is on the disk now, without what the recorder would write when it is closed."""
+        recordings, aside = self.folder / "recordings", self.folder / "aside"
+        shutil.copytree(recordings, aside)
+        run = await playbacks.stop(address)
+        assert run is not None
+        await run.close()
+        shutil.rmtree(recordings)
+        aside.rename(recordings)
