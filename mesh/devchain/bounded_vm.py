@@ -40,11 +40,17 @@ class _RunTooLong(Exception):
     """A run used up its time. Not an error of the EVM: it ends the outermost run."""
 
 
+CHECKED_RUNS: Final = 64
+"""The clock is read at one of so many jumps and calls: reading a thread's clock costs as much as a few opcodes."""
+
+
 class _Limit(threading.local):
     """The limit of the run in this thread."""
 
     deadline: float | None = None
     """As `time.thread_time` counts: a busy machine does not shorten a run."""
+    checks: int = 0
+    """Jumps and calls so far."""
 
 
 _limit: Final = _Limit()
@@ -63,7 +69,8 @@ def bounded(seconds: float) -> Iterator[None]:
 
 
 def _check_time(computation: object = None) -> None:
-    if _limit.deadline is not None and time.thread_time() > _limit.deadline:
+    _limit.checks += 1
+    if _limit.checks % CHECKED_RUNS == 0 and _limit.deadline is not None and time.thread_time() > _limit.deadline:
         raise _RunTooLong
 
 
