@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
@@ -15,6 +16,8 @@ from tests.support.routers import EmbeddedRouter, Zenohd
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+
+gc.disable()  # until all tests are collected: they stay, and looking through them takes a third of that time
 
 ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
 """Parameters that name a second implementation of what another parameter of the same test names already."""
@@ -35,6 +38,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         sampled_before[path] += len(group) > 1
     config.hook.pytest_deselected(items=[item for item in items if item not in kept])
     items[:] = [item for item in items if item in kept]
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from now on, without looking at the tests."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -3,7 +3,12 @@
 This is a server; the client is `mesh.chain`.
 """
 
+import os
+
 from mesh.extras import needs_extra
+
+# Before py-evm is imported, which hashes at import. It would spend a sixth of its time in the objects of the default.
+os.environ.setdefault("ETH_HASH_BACKEND", "pysha3")
 
 with needs_extra("demo", "the development chain"):
     from mesh.devchain.embedded import EmbeddedChain, ServedChain, serve_embedded
