@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     )
     from mesh.agent.answers import Answer, Unanswered
     from mesh.agent.own_model import ModelUnfit
+    from mesh.agent.validators import AnnouncedValidator, ValidatorSilent
     from mesh.amounts import XRT
     from mesh.chain import InsufficientTokens, NodeUnreachable, NotALiability
     from mesh.content import ContentUnavailable
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
     )
     from schemas.model import InvalidDescription, ModelDescription, ModelLimits, ModelTopic
     from schemas.value_schema import ValueSchema
+    from schemas.verdicts import PolicyNote, ReportFinding, ValidatorAnnouncement, ValidatorReport
 
     __version__: str
 
@@ -76,6 +78,7 @@ _NAMES: Final = {
     "mesh.agent.own_model": "ModelUnfit",
     "mesh.agent.orders": "Order OrderState",
     "mesh.agent.progress": "Progress",
+    "mesh.agent.validators": "AnnouncedValidator ValidatorSilent",
     "mesh.amounts": "XRT",
     "mesh.chain": "InsufficientTokens NodeUnreachable NotALiability",
     "mesh.content": "ContentUnavailable",
@@ -96,6 +99,7 @@ _NAMES: Final = {
     ),
     "schemas.model": "InvalidDescription ModelDescription ModelLimits ModelTopic",
     "schemas.value_schema": "ValueSchema",
+    "schemas.verdicts": "PolicyNote ReportFinding ValidatorAnnouncement ValidatorReport",
 }
 _load = on_demand(__name__, _NAMES)
 
@@ -122,6 +126,7 @@ __all__ = [
     "ZERO_ADDRESS",
     "Agent",
     "AiraError",
+    "AnnouncedValidator",
     "Answer",
     "ChainError",
     "ClosedError",
@@ -159,17 +164,22 @@ __all__ = [
     "PayloadType",
     "Phase",
     "Played",
+    "PolicyNote",
     "Progress",
     "Reading",
     "Recorder",
     "RecordingAbout",
     "RemoteError",
+    "ReportFinding",
     "Result",
     "RosTypes",
     "Settings",
     "String",
     "Unanswered",
     "UnknownRosType",
+    "ValidatorAnnouncement",
+    "ValidatorReport",
+    "ValidatorSilent",
     "ValueSchema",
     "Verified",
     "WrongPhase",

@@ -10,17 +10,21 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 
 from mesh.agent.errors import LiabilityReverted
+from mesh.agent.judged_contract import code_of, verdict
 from mesh.agent.progress import Progress, followed_job, nothing, report
 from mesh.content import ContentUnavailable
 from mesh.errors import AiraError
 from mesh.log_context import log_event
 from mesh.work.notes import Reason, read_reason
+from schemas import ZERO_ADDRESS
+from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.progress import OnProgress
+    from mesh.agent.reports import ContractReports
     from schemas import Liability
 
 log = logging.getLogger(__name__)
@@ -33,23 +37,28 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True, repr_omit_defaults=True
     """How a contract ended: `success` means that the promisor was paid; `result` is the recording's CID, or empty.
 
     If it failed, `reason` says why in a line of text and `code` for programs. They come from the promisor's recording,
-    which may lie or be unavailable (`recording-unavailable`); without a result the code is `no-result`.
+    which may lie or be unavailable (`recording-unavailable`); without a result the code is `no-result`. If a validator
+    has judged that the work does not count, they are its reason. `reports` has what its jurors reported.
     """
 
     success: bool
     result: str
     reason: str = ""
     code: str = ""
+    reports: tuple[ValidatorReport, ...] = ()
 
 
 class Contract:
     """A contract on the chain: `await contract.outcome()`, then `await contract.recording()`."""
 
-    def __init__(self, liability: Liability, ended: asyncio.Future[Outcome], parts: AgentComponents) -> None:
+    def __init__(
+        self, liability: Liability, ended: asyncio.Future[Outcome], parts: AgentComponents, reports: ContractReports
+    ) -> None:
         self.liability = liability
         """Its record, as it was when the contract was first read."""
         self._ended = ended
         self._parts = parts
+        self._reports = reports
         self._failure: Reason | None = None
 
     def __repr__(self) -> str:
@@ -76,8 +85,12 @@ class Contract:
 
         Of a job that failed it fetches the recording, for at most `REASON_TIMEOUT`, and reads the reason.
         """
-        async with followed_job(self._parts, self.liability, on_progress):
+        async with (
+            self._reports.followed(self.liability, on_progress) as on_job,
+            followed_job(self._parts, self.liability, on_job),
+        ):
             ended = await asyncio.shield(self._ended)
+            ended = msgspec.structs.replace(ended, reports=await self._last_reports())
         if not ended.success:
             if self._failure is None:
                 self._failure = await self._reason(ended)
@@ -85,6 +98,13 @@ class Contract:
         kind: Literal["paid", "refunded"] = "paid" if ended.success else "refunded"
         report(on_progress, Progress(kind=kind, agent=self.liability.promisor, code=ended.code, detail=ended.reason))
         return ended
+
+    async def reports(self) -> tuple[ValidatorReport, ...]:
+        """What the jurors of its validator have reported until now, each report signed and by a juror, one of each.
+
+        Jurors are asked for what this agent missed. Empty if the contract names no validator. Raises `ChainError`.
+        """
+        return await self._reports.of(self.liability)
 
     async def recording(self) -> Path:
         """Wait for the outcome, and fetch the result's recording, every block of it checked.
@@ -100,10 +120,23 @@ class Contract:
         limit = self._parts.settings.objective_expanded_limit
         return await self._parts.exchange.fetch(cid, size_limit=limit, timeout=timeout)
 
+    async def _last_reports(self) -> tuple[ValidatorReport, ...]:
+        """The reports at the end; those that are known if the node is away."""
+        try:
+            return await self._reports.of(self.liability)
+        except AiraError as error:
+            log.debug("the reports are not asked for: %s", error)
+            return self._reports.known(self.liability.address)
+
     async def _reason(self, ended: Outcome) -> Reason:
-        """Why the job failed, as its recording says."""
+        """Why the job failed, as its validator or its recording says."""
+        refused = next((one for one in ended.reports if one.claimed and not one.success), None)
+        if not ended.result and self.liability.validator != ZERO_ADDRESS:
+            return Reason("no result, or no verdict of the validator, came in time", "no-result")
         if not ended.result:
             return Reason("no result came in time", "no-result")
+        if refused is not None:
+            return Reason(f"the validator judged: {verdict(refused)}", code_of(refused))
         try:
             timeout = min(REASON_TIMEOUT, self._parts.settings.fetch_timeout)
             return await asyncio.to_thread(read_reason, await self._fetch(ended.result, timeout))
@@ -126,8 +159,9 @@ class _WatchedContract:
 class WatchedContracts:
     """The contracts whose end is waited for, by address."""
 
-    def __init__(self, parts: AgentComponents) -> None:
+    def __init__(self, parts: AgentComponents, reports: ContractReports) -> None:
         self._parts = parts
+        self._reports = reports
         self._watched: dict[str, _WatchedContract] = {}
 
     def __len__(self) -> int:
@@ -148,7 +182,8 @@ class WatchedContracts:
     def watch(self, liability: Liability, *, order: str = "") -> Contract:
         """The contract of `liability`, which was created from our `order` (hash), if from any."""
         watched = self._watch(liability.address)
-        contract = Contract(liability, watched.ended, self._parts)
+        contract = Contract(liability, watched.ended, self._parts, self._reports)
+        self._reports.follow(liability)
         if order:
             watched.order, watched.contract = order, contract
         if liability.is_finalized:
@@ -162,6 +197,7 @@ class WatchedContracts:
         """
         if (watched := self._watched.get(liability.address)) is not None:
             watched.reverted_until = None
+        self._reports.follow(liability)
         again = next((one for one in self._watched.values() if order and one.order == order), None)
         if again is None or again.contract is None:
             return None

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mesh.network import Reading, ReadingSubscription, Subscription
     from mesh.work.job import Job
     from mesh.work.ledger import Phase
+    from schemas.verdicts import ValidatorReport
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +33,7 @@ OfferHandler = Callable[[Verified[Offer]], object]
 ResultHandler = Callable[[Verified[Result]], object]
 LiabilityHandler = Callable[["Phase", Liability], object]
 ReadingHandler = Callable[["Reading"], object]
+ReportHandler = Callable[["ValidatorReport"], object]
 PeriodicHandler = Callable[[], object]
 
 
@@ -71,6 +73,7 @@ class Handlers:
     """`topics.declared` has the type of each topic's messages."""
     market: dict[type[Demand | Offer | Result], list[Handler]] = field(default_factory=dict)
     liabilities: list[LiabilityHandler] = field(default_factory=list)
+    reports: list[ReportHandler] = field(default_factory=list)
     readings: list[tuple[str, str, ReadingHandler]] = field(default_factory=list)
     """The topic, the agent (`*` for any), and the handler."""
     periodic: list[tuple[float, PeriodicHandler]] = field(default_factory=list)
@@ -81,6 +84,7 @@ O = TypeVar("O", bound=OfferHandler)  # noqa: E741
 R = TypeVar("R", bound=ResultHandler)
 L = TypeVar("L", bound=LiabilityHandler)
 G = TypeVar("G", bound=ReadingHandler)
+J = TypeVar("J", bound=ReportHandler)
 P = TypeVar("P", bound=PeriodicHandler)
 K = TypeVar("K")
 V = TypeVar("V")
@@ -140,6 +144,15 @@ class HandlerDecorators:
         """Handle each phase of each of the agent's jobs: `async def handler(phase, liability)`."""
         check_handler(handler, "phase: Phase, liability: Liability", arguments=2)
         self._handlers.liabilities.append(handler)
+        return handler
+
+    def on_report(self, handler: J) -> J:
+        """Handle each juror's report on a contract of the agent's account: `async def handler(report)`.
+
+        The report is signed, by a juror of the contract's validator; `success` is the verdict, `failures` the reasons.
+        """
+        check_handler(handler, "report: ValidatorReport", arguments=1)
+        self._handlers.reports.append(handler)
         return handler
 
     def on_reading(self, topic: str, *, agent: str = "*") -> Callable[[G], G]:

@@ -39,7 +39,19 @@ PRESENCE_INTERVAL: Final = 2.0
 """Seconds between two questions whether an agent is present."""
 
 Kind: TypeAlias = Literal[
-    "offer", "declined", "rejected", "contract", "ready", "playing", "gone", "back", "result", "paid", "refunded"
+    "offer",
+    "declined",
+    "rejected",
+    "contract",
+    "ready",
+    "playing",
+    "gone",
+    "back",
+    "result",
+    "judged",
+    "unjudged",
+    "paid",
+    "refunded",
 ]
 
 
@@ -55,6 +67,10 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     - `playing`: `agent` has played `position` of `total` messages.
     - `gone`: `agent`, which has the contract, is not present any more; `back`: it is again.
     - `result`: `agent` has signed the result `detail` (CID); its code is `failed` if the job was not done.
+    - `judged`: the juror `agent` of the contract's validator has judged, as the `position`-th of `total` needed alike;
+      `code` is empty if the work counts, else that of the first reason; `detail` says so in words.
+    - `unjudged`: the validator `agent` is `silent`, or its jurors `disagree` (the code): `position` of `total` needed
+      have judged alike. `detail` says from which block the cost can be refunded.
     - `paid`, `refunded`: the contract has ended; `refunded` has the code and the detail of the failure.
 
     What an agent says of its job before the end is its own word, and may be lost on the way.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -10,15 +11,19 @@ from mesh.agent.declines import DeclinePublisher
 from mesh.agent.demands import DemandDispatcher
 from mesh.agent.handlers import call
 from mesh.agent.listener import ChainListener, LateResults
+from mesh.agent.reports import ContractReports
 from mesh.agent.services import offer_services
 from mesh.agent.status import AgentStatus
 from mesh.agent.trade import Trader
+from mesh.agent.validators import ValidatorDirectory
+from mesh.chain import NotALiability
 from mesh.role import Role
 from mesh.telemetry.logs import LogService
 from mesh.work.executor import Executor
-from mesh.work.ledger import Phase
+from mesh.work.ledger import UNFINISHED, Phase
 from mesh.work.objectives import Objectives
 from mesh.work.playbacks import Playbacks
+from schemas import ZERO_ADDRESS, Demand, decode
 from schemas.agent_keys import EventKey, LiabilityEvent
 
 if TYPE_CHECKING:
@@ -30,8 +35,9 @@ if TYPE_CHECKING:
     from mesh.network import Subscription
     from mesh.telemetry.metrics import MetricFamily
     from mesh.work.models import Models
-    from schemas import Demand, Liability
+    from schemas import Liability
     from schemas.model import ModelDescription
+    from schemas.verdicts import ValidatorReport
 
 PUBLISHED: Final[dict[Phase, LiabilityEvent]] = {
     Phase.INCOMING: "incoming",
@@ -59,7 +65,9 @@ class AgentRuntime(Role):
         topics = handlers.topics or None
         self.parts = parts
         self.models = models
-        self.trader = Trader(parts)
+        self.validators = ValidatorDirectory(parts.network.session, parts.channel, parts.chain)
+        self.reports = ContractReports(parts, self._on_report if handlers.reports else None)
+        self.trader = Trader(parts, self.reports)
         self.objectives = Objectives(parts.store, parts.exchange, parts.settings, topics, description)
         self.playbacks = Playbacks(
             parts.network.session, parts.signer.address, parts.ledger, parts.settings, parts.recordings
@@ -79,6 +87,7 @@ class AgentRuntime(Role):
         self._handlers = handlers
 
     async def _open(self, stack: AsyncExitStack) -> None:
+        await stack.enter_async_context(self.reports)
         await stack.enter_async_context(self.trader)
         services = self.parts.services
         offer_services(self.parts, self.executor, has_handlers=bool(self._handlers.topics))
@@ -92,6 +101,7 @@ class AgentRuntime(Role):
             tasks.create_task(self.parts.outbox.run(), name="outbox")
             tasks.create_task(self.listener.run(), name="listener")
             tasks.create_task(LateResults(self.parts).run(), name="late results")
+            tasks.create_task(self._follow_earlier(), name="reports on earlier contracts")
 
     async def _do_jobs(self) -> None:
         await self.listener.finalize_ended()
@@ -125,6 +135,24 @@ class AgentRuntime(Role):
     def health(self) -> Mapping[str, str]:
         """The state of each of its parts, as `aira status` shows it."""
         return self._status.health()
+
+    async def _follow_earlier(self) -> None:
+        """Ask for the reports on contracts of earlier runs that have not ended."""
+        parts = self.parts
+        for job in await parts.ledger.jobs(UNFINISHED):
+            self.reports.follow(job.liability)
+        for payload, address in await parts.ledger.contracts("demand"):
+            demand = decode(payload)
+            if isinstance(demand, Demand) and demand.validator != ZERO_ADDRESS:
+                read = partial(parts.chain.liabilities.get, address)
+                with suppress(NotALiability):
+                    liability = await parts.chain.retrying(read, outages=parts.outages)
+                    if not liability.is_finalized:
+                        self.reports.follow(liability)
+
+    async def _on_report(self, report: ValidatorReport) -> None:
+        for handler in self._handlers.reports:
+            await call(handler, report)
 
     async def _on_phase(self, phase: Phase, liability: Liability) -> None:
         if phase in PUBLISHED:

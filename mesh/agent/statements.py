@@ -1,6 +1,7 @@
-"""What others state about an account's own orders: providers' rejections, and agents' declines of its demands.
+"""What others state about an account's own orders and contracts: rejections, declines, and reports of validators.
 
-Anybody can sign either, so only those count that a provider with a stake, or an agent that is present, has signed.
+Anybody can sign any, so only those count that a provider with a stake, an agent that is present, or a juror of the
+contract's validator (`mesh.agent.reports`) has signed.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from mesh.log_context import log_event
 from mesh.market.book import Refusal
 from mesh.network import PresentAgents
 from schemas import InvalidRecord, market_selector
-from schemas.signing import Decline, Rejection
+from schemas.signing import Decline, Rejection, SignedRecord
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Container, Iterator, Mapping
@@ -30,15 +31,17 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 QUEUED: Final = 64
-"""Most signed rejections, and most declines, that wait to be checked; more are dropped, since anybody can sign one."""
+"""Most signed rejections, declines or reports that wait to be checked; more are dropped, as anybody can sign one."""
 QUEUED_OF_ONE: Final = 16
-"""Of these, those of one agent or provider."""
+"""Of these, those of one signer."""
 PER_AGENT: Final = Rate(per_second=1.0, burst=32)
 """Declines by one agent that are looked at: it may decline many demands."""
+DROPPED: Final = {"reject": "rejections", "decline": "declines", "report": "reports"}
+"""How records that were dropped are counted."""
 HEARD: Final = Rate(per_second=20.0, burst=200)
 """Declines in all that are looked at."""
 
-S = TypeVar("S", Rejection, Decline)
+S = TypeVar("S", bound=SignedRecord)
 
 
 @asynccontextmanager
@@ -62,14 +65,13 @@ async def received_rejections(
         else:
             await on_rejection(rejection)
 
-    async def check_all(queue: FairQueue[Rejection]) -> None:
-        while True:
-            await parts.chain.retrying(partial(check, await queue.get()), outages=parts.outages)
+    async def check_until_known(rejection: Rejection) -> None:
+        await parts.chain.retrying(partial(check, rejection), outages=parts.outages)
 
-    with _queued(parts, "reject", Rejection, orders) as queue:
-        async with Background() as tasks:
-            tasks.start(check_all(queue), "rejections")
-            yield
+    is_wanted = partial(_is_about, orders)
+    async with received(parts, "reject", Rejection, is_wanted, check_until_known) as subscribe:
+        subscribe()
+        yield
 
 
 @asynccontextmanager
@@ -82,14 +84,33 @@ async def received_declines(
     """
     agents, limiter = PresentAgents(parts.channel, role="agent"), RateLimiter(per_sender=PER_AGENT, total=HEARD)
 
-    async def check_all(queue: FairQueue[Decline]) -> None:
+    async def check(decline: Decline) -> None:
+        if not limiter.allow(decline.agent) or not await agents.is_present(decline.agent):
+            parts.drops.count("declines", decline.agent)
+        elif (order := orders.get(decline.order)) is not None and order.is_open and order.decline(decline):
+            facts = log_event("order-declined", order=decline.order, agent=decline.agent, code=decline.code)
+            log.info("agent %s declines the %s (%s)", decline.agent, order, decline.code, extra=facts)
+
+    async with received(parts, "decline", Decline, partial(_is_about, orders), check) as subscribe:
+        yield subscribe
+
+
+@asynccontextmanager
+async def received(
+    parts: AgentComponents,
+    kind: Literal["reject", "decline", "report"],
+    record: type[S],
+    is_wanted: Callable[[S], bool],
+    check: Callable[[S], Awaitable[None]],
+) -> AsyncIterator[Callable[[], None]]:
+    """Meanwhile call `check` with the signed records of a kind for this account that are wanted, one after the other.
+
+    Yields the function that subscribes, to be called when the first one may come. `is_wanted` runs on any thread.
+    """
+
+    async def check_all(queue: FairQueue[S]) -> None:
         while True:
-            decline = await queue.get()
-            if not limiter.allow(decline.agent) or not await agents.is_present(decline.agent):
-                parts.drops.count("declines", decline.agent)
-            elif (order := orders.get(decline.order)) is not None and order.is_open and order.decline(decline):
-                facts = log_event("order-declined", order=decline.order, agent=decline.agent, code=decline.code)
-                log.info("agent %s declines the %s (%s)", decline.agent, order, decline.code, extra=facts)
+            await check(await queue.get())
 
     with ExitStack() as subscription:
         async with Background() as tasks:
@@ -99,22 +120,29 @@ async def received_declines(
                 nonlocal subscribed
                 if not subscribed:
                     subscribed = True
-                    queue = subscription.enter_context(_queued(parts, "decline", Decline, orders))
-                    tasks.start(check_all(queue), "declines")
+                    queue = subscription.enter_context(_queued(parts, kind, record, is_wanted))
+                    tasks.start(check_all(queue), f"{kind}s")
 
             yield subscribe
 
 
+def _is_about(orders: Container[str], statement: Rejection | Decline) -> bool:
+    return statement.order in orders
+
+
 @contextmanager
 def _queued(
-    parts: AgentComponents, kind: Literal["reject", "decline"], record: type[S], orders: Container[str]
+    parts: AgentComponents,
+    kind: Literal["reject", "decline", "report"],
+    record: type[S],
+    is_wanted: Callable[[S], bool],
 ) -> Iterator[FairQueue[S]]:
-    """Meanwhile put the signed statements about these orders into the queue, while it has room."""
+    """Meanwhile put the wanted records into the queue if they are signed, while it has room."""
     loop, queue = asyncio.get_running_loop(), FairQueue[S](per_sender=QUEUED_OF_ONE, total=QUEUED)
 
     def put(statement: S) -> None:
         for dropped in queue.put(statement.signer, statement):
-            parts.drops.count("declines" if kind == "decline" else "rejections", dropped.signer)
+            parts.drops.count(DROPPED[kind], dropped.signer)
 
     def receive(sample: zenoh.Sample) -> None:
         try:
@@ -122,7 +150,7 @@ def _queued(
         except InvalidRecord as error:
             log.debug("an unreadable statement: %s", error)
             return
-        if statement.order in orders and statement.is_signed:  # others cost no more than reading them
+        if is_wanted(statement) and statement.is_signed:  # others cost no more than reading them
             call_in_loop(loop, put, statement)
 
     selector = market_selector(parts.channel.lighthouse, kind, parts.signer.address)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
     from mesh.agent.orders import Terms
     from mesh.agent.progress import OnProgress
+    from mesh.agent.reports import ContractReports
     from schemas import Liability
     from schemas.signing import Rejection
 
@@ -48,7 +49,7 @@ class Trader(Lifecycle):
 
     title = "trader"
 
-    def __init__(self, parts: AgentComponents) -> None:
+    def __init__(self, parts: AgentComponents, reports: ContractReports) -> None:
         self._parts = parts
         self._chain = parts.chain
         self._address = parts.signer.address
@@ -58,7 +59,7 @@ class Trader(Lifecycle):
         self._hear_declines: Callable[[], None] = lambda: None
         self._answers = OpenOffers()
         self._changing = asyncio.Lock()
-        self.contracts = WatchedContracts(parts)
+        self.contracts = WatchedContracts(parts, reports)
         self.customers = KnownSenders()
         """Who demanded the contracts of this account."""
 

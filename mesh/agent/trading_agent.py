@@ -7,25 +7,28 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypedDict, Unpack, overload
 
 from mesh.agent.demands import current_buyer
 from mesh.agent.errors import NotAnObjective, OrderClosed
 from mesh.agent.orders import Order, OrderState
 from mesh.agent.progress import nothing
+from mesh.agent.validators import ValidatorSilent, check_named, require_accepted
 from mesh.amounts import XRT
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.recording import pack_values
 from mesh.role import Lifecycle
 from mesh.settings import load
-from schemas import Demand, Offer, Result, Verified
+from schemas import ZERO_ADDRESS, Demand, Offer, Result, Verified
 from schemas.cid import is_cid
 
 if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
+    from mesh.agent.orders import Terms
     from mesh.agent.progress import OnProgress
     from mesh.agent.runtime import AgentRuntime
+    from mesh.agent.validators import AnnouncedValidator
     from mesh.content import Store
     from mesh.network import Channel, Network
     from mesh.recording import Objective
@@ -46,7 +49,7 @@ class DemandTerms(TypedDict, total=False):
     model: str
     token: str
     validator: str
-    validator_fee: int | str
+    validator_fee: int | str | None
     lifetime: int | None
 
 
@@ -116,12 +119,13 @@ class TradingAgent(Lifecycle):
         terms, valid for `lifetime` blocks, by default about ten minutes. `lighthouse_fee` (`"0.1 XRT"`, or wn) is paid
         to the provider.
 
-        Raises `InsufficientTokens`, `InvalidAmount`, and for an objective that can't be played `ObjectiveUnfit` or a
-        `ContentError`.
+        Raises `InsufficientTokens`, `InvalidAmount`, for an objective that can't be played `ObjectiveUnfit` or a
+        `ContentError`, and `Declined` for a demand whose validator the setting `accepted_validators` excludes.
         """
         trader = self.runtime.trader
         if demand is not None:
             wanted = demand.message if isinstance(demand, Verified) else demand
+            await require_accepted(self.parts.chain, wanted.validator, self.settings.accepted_validators)
             await self.examine(wanted.objective)
             terms = trader.writer.terms_of(wanted)
         else:
@@ -146,18 +150,19 @@ class TradingAgent(Lifecycle):
         model: str = "",
         token: str = "",
         validator: str = "",
-        validator_fee: int | str = 0,
+        validator_fee: int | str | None = None,
         lifetime: int | None = None,
     ) -> Order:
         """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
 
         `objective` is a CID, the path of a file (also as text), or messages that are played one after the other, such
         as `[("/blink", "red"), ("/stop", Empty())]`; the agent serves it. The other terms are as for `offer`;
-        `validator_fee` is `"0.1 XRT"`, or wn. The factory gets the allowance that they need. A restarted agent sends
-        the order again.
+        `validator_fee` is `"0.1 XRT"`, or wn; by default what the validator announces. The factory gets the allowance
+        that they need. A restarted agent sends the order again.
 
-        Raises `NotAnObjective`, `InvalidAmount`, `InsufficientTokens`, and `ObjectiveUnfit` if a file is not playable,
-        or if the model's description is available and excludes the objective.
+        Raises `NotAnObjective`, `InvalidAmount`, `InsufficientTokens`, `ObjectiveUnfit` if a file is not playable, or
+        if the model's description is available and excludes the objective, `UnsafeValidator` and its like for a
+        validator that can't be named, and `ValidatorSilent` if its fee is not known because nobody answers.
         """
         writer = self.runtime.trader.writer
         cid = await self._cid_of(objective)
@@ -165,7 +170,8 @@ class TradingAgent(Lifecycle):
             model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
         )
         await self.runtime.require_fit(cid, terms["model"])
-        return await self.runtime.trader.post(Demand, terms, validator_fee=XRT.amount(validator_fee))
+        fee = await self._announced_fee(terms) if validator_fee is None else XRT.amount(validator_fee)
+        return await self.runtime.trader.post(Demand, terms, validator_fee=fee)
 
     async def demand(
         self, objective: str | Path | Messages, *, on_progress: OnProgress = nothing, **terms: Unpack[DemandTerms]
@@ -183,6 +189,23 @@ class TradingAgent(Lifecycle):
                 with suppress(OrderClosed):  # it has just become a contract
                     await order.withdraw()
             raise
+
+    @overload
+    async def validator(self, whose: str) -> AnnouncedValidator: ...
+
+    @overload
+    async def validator(self, whose: Verified[Demand] | Demand) -> AnnouncedValidator | None: ...
+
+    async def validator(self, whose: str | Verified[Demand] | Demand) -> AnnouncedValidator | None:
+        """How a validator (address or name), or that of a demand, judges, as its jurors announce it now.
+
+        `AnnouncedValidator.is_silent` if none answers. None for a demand without a validator. The answers are kept for
+        a minute. Raises `ChainError`, and for a name that can't be resolved what `demand` raises.
+        """
+        if not isinstance(whose, str):
+            named = (whose.message if isinstance(whose, Verified) else whose).validator
+            return None if named == ZERO_ADDRESS else await self.runtime.validators.find(named)
+        return await self.runtime.validators.find(await self.parts.chain.names.address(whose))
 
     def orders(self, *states: OrderState) -> list[Order]:
         """The account's orders in these states, oldest first; by default the open ones, those of earlier runs included.
@@ -212,6 +235,16 @@ class TradingAgent(Lifecycle):
     async def add(self, path: str | Path) -> str:
         """Copy a file to the agent's store, which serves it to others; returns its CID."""
         return await asyncio.to_thread(self.parts.store.put_file, Path(path))
+
+    async def _announced_fee(self, terms: Terms) -> int:
+        """What the validator of these terms wants, in wn. Raises `ValidatorSilent`."""
+        if (validator := terms["validator"]) == ZERO_ADDRESS:
+            return 0
+        await check_named(self.parts.chain, terms)
+        announced = await self.runtime.validators.find(validator)
+        if announced.is_silent:
+            raise ValidatorSilent(validator)
+        return announced.fee
 
     async def _cid_of(self, objective: str | Path | Messages) -> str:
         """The CID of an objective, once the agent's store has it. Raises `NotAnObjective`, and `ObjectiveUnfit`."""

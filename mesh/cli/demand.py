@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import shutil
 from contextlib import closing
 from dataclasses import replace
@@ -16,6 +17,7 @@ from mesh.amounts import XRT
 from mesh.background import Background
 from mesh.cli.amounts import AmountText
 from mesh.cli.chain_client import check_balance
+from mesh.cli.demand_validator import agreed_fee
 from mesh.cli.errors import InvalidOptions, JobNotDone, OutputFailed
 from mesh.cli.existing import take_existing
 from mesh.cli.files import file_or_cid, require_model, require_readable, require_writable
@@ -25,6 +27,7 @@ from mesh.cli.output import format_duration, plural, print_json, print_line, pri
 from mesh.cli.waiting import JobPrinter, print_connection_changes
 from mesh.errors import AiraError
 from mesh.settings import ChainSettings, NetworkSettings, options_of
+from schemas.address import ZERO_ADDRESS
 
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract, Order
@@ -48,7 +51,7 @@ SILENCE: Final = 5.0
 )
 @click.option("--validator", type=ADDRESS, default="", help="address or ENS name of the validator of the result [none]")
 @click.option(
-    "--validator-fee", type=AmountText(), default="0", show_default=True, help="the validator's fee, in XRT (or wn)"
+    "--validator-fee", type=AmountText(), help="the validator's fee, in XRT (or wn) [what the validator announces]"
 )
 @click.option(
     "--lifetime",
@@ -60,6 +63,7 @@ SILENCE: Final = 5.0
     type=click.Choice(["wait", "withdraw", "new"]),
     help="what to do if an equal demand is open: wait for it, withdraw it first, or post another [ask]",
 )
+@click.option("--yes", "confirmed", is_flag=True, help="post the demand even if perhaps nobody judges the work")
 @click.option("--out", type=click.Path(path_type=Path), help="file to copy the recording to")
 @click.option(
     "--withdraw-on-exit", is_flag=True, help="withdraw the demand if the command is interrupted before the contract"
@@ -83,6 +87,10 @@ async def command(settings: Settings, **order: Any) -> None:
     the contract. A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks
     what to do; without a terminal it needs --existing.
 
+    With --validator, the command first says who judges the work and by which policies, what that costs, and what
+    happens if nobody judges. If nobody answers as the validator, or wants a higher fee, it asks; without a terminal it
+    needs --yes.
+
     The exit code is 1 if the work was not done and the cost was returned, or if --out can't be written. --json prints
     an object for each thing that happens, with its `kind`, and one when the contract has ended; that has an `error` if
     the exit code is 1.
@@ -94,9 +102,10 @@ async def demand(
     settings: Settings,
     *,
     objective: str,
-    validator_fee: str,
+    validator_fee: str | None,
     out: Path | None,
     as_json: bool,
+    confirmed: bool = False,
     existing: str | None = None,
     withdraw_on_exit: bool = False,
     **terms: Any,
@@ -106,7 +115,7 @@ async def demand(
     require_model(terms["model"])
     settings.keyfile_and_password()
     source = await asyncio.to_thread(_source, objective)
-    fee = XRT.parse(validator_fee)
+    fee = None if validator_fee is None else XRT.parse(validator_fee)
     if fee and not terms["validator"]:
         raise InvalidOptions("--validator-fee needs --validator", hint="give --validator, or omit the fee")
     if out is not None:
@@ -121,7 +130,10 @@ async def demand(
             tasks.start(wait_for_broken_pipe(), "readers of stdout")
             printer.line(f"demand by {agent.address} for {agent.model}")
             cid = source if isinstance(source, str) else await agent.add(source)
-            terms |= {"cost": unit.parse(terms["cost"]), "validator_fee": fee}
+            terms["cost"] = unit.parse(terms["cost"])
+            fee = await agreed_fee(agent, cid, fee, confirmed=confirmed, as_json=as_json, **terms)
+            terms["validator_fee"] = fee
+            printer.awaited = "the validator" if terms["validator"] else printer.awaited
             order = await take_existing(agent, cid, existing, quiet=as_json, **terms)
             if order is None:
                 await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
@@ -218,6 +230,8 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
         click.echo(f"{goes_on}, `aira liability show` says from when the cost can be refunded", err=True)
         raise
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
+    if contract.liability.validator != ZERO_ADDRESS:
+        facts["reports"] = [json.loads(one.encode()) for one in outcome.reports]
     printer.close()
     printer.line(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
     failure: AiraError | None = None

@@ -113,6 +113,10 @@ class DemandExists(ConfigurationError, code="demand-exists"):
     """An equal demand is open, so that a second one may pay twice. `--existing` says what to do."""
 
 
+class DoubtfulValidator(RemoteError, code="validator-doubtful"):
+    """Perhaps nobody judges the work: the validator is silent, or wants more. `--yes` demands it all the same."""
+
+
 class UnknownOrder(InputError, code="unknown-order"):
     """The ledger has no open order with this hash."""
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
-import threading
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from mesh.cli.errors import DemandExists
 from mesh.cli.output import plural
+from mesh.cli.waiting import answer_of
 
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract, Order
@@ -44,7 +43,7 @@ async def take_existing(
     if existing is None and (quiet or not sys.stdin.isatty()):
         choices = ", ".join(f"--existing {choice} ({meaning})" for choice, meaning in CHOICES.items())
         raise DemandExists("an equal demand is open; a second one would be paid too", hint=f"choose: {choices}")
-    choice = existing or await _ask()
+    choice = existing or await answer_of(_ask)
     if choice == "wait":
         return contract or demands[0]
     for order in demands if choice == "withdraw" else ():
@@ -75,19 +74,6 @@ async def _equal(
     return demands, await agent.contract(latest)
 
 
-async def _ask() -> str:
-    """Ask in the terminal what to do, in a thread that does not keep an interrupted program alive."""
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[str] = loop.create_future()
-
-    def ask() -> None:
-        click.echo("\n".join(f"  {choice}: {meaning}" for choice, meaning in CHOICES.items()), err=True)
-        try:
-            given = click.prompt("what now?", type=click.Choice(list(CHOICES)), err=True)
-        except click.Abort:
-            loop.call_soon_threadsafe(answer.cancel)
-        else:
-            loop.call_soon_threadsafe(answer.set_result, given)
-
-    threading.Thread(target=ask, name="prompt", daemon=True).start()
-    return await answer
+def _ask() -> str:
+    click.echo("\n".join(f"  {choice}: {meaning}" for choice, meaning in CHOICES.items()), err=True)
+    return str(click.prompt("what now?", type=click.Choice(list(CHOICES)), err=True))

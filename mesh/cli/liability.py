@@ -15,6 +15,7 @@ from mesh.cli.files import FETCH_SETTINGS, fetch, opened_store
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import ADDRESS, with_chain_settings, with_json, with_settings
 from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, printable, short_address
+from mesh.cli.verdicts import CONNECT_TIMEOUT, reports_json, reports_on, verdict_facts
 from mesh.errors import AiraError
 from mesh.settings import ChainSettings, options_of
 from schemas.address import ZERO_ADDRESS
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from schemas.records import Liability
 
 
-CONNECT_TIMEOUT: Final = 3.0
-"""Seconds to connect to a router, for the recording of a failed job."""
 FETCH_TIMEOUT: Final = 10.0
 """Seconds without a block of that recording after which it is given up."""
 HEAD = ("LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR")
@@ -114,11 +113,12 @@ async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> S
 @command.command("show", short_help="show the parties, terms, cost and state of one")
 @click.argument("address", type=ADDRESS)
 @with_json
-@with_settings(*dict.fromkeys((*FETCH_SETTINGS, *options_of(ChainSettings))))
+@with_settings(*dict.fromkeys((*FETCH_SETTINGS, "lighthouse_contract", *options_of(ChainSettings))))
 async def show(settings: Settings, address: str, as_json: bool) -> None:
     """Show the liability at ADDRESS: its parties, terms, cost and state, and from which block it can be refunded.
 
-    Of a job that failed, show also why, as its recording says; that is fetched if the store does not have it.
+    Of a job that failed, show also why, as its recording says; that is fetched if the store does not have it. If it
+    names a validator, show how its jurors have judged, as those say that are on the mesh.
     """
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
@@ -128,11 +128,13 @@ async def show(settings: Settings, address: str, as_json: bool) -> None:
 async def print_liability(
     chain: Chain, liability: Liability, settings: Settings, *, own: str | None, as_json: bool
 ) -> None:
-    """Print all facts about a liability; of a failed job also why it failed."""
+    """Print all facts about a liability; of a failed job also why it failed, and how its validator judged."""
     refund = await refund_state(chain, liability)
+    reports = await reports_on(settings, chain, liability)
     failure = await _failure(settings, liability.result) if state_of(liability) == "failed" else None
     if as_json:
         facts = liability_json(liability) | {"refundableFrom": None if refund is None else refund.refundable_from}
+        facts |= {} if liability.validator == ZERO_ADDRESS else {"reports": reports_json(reports)}
         print_json(facts if failure is None else facts | {"reason": failure.text, "code": failure.code})
         return
     units = await units_of(chain, [liability])
@@ -142,7 +144,7 @@ async def print_liability(
         described["reason"] = (
             f"{printable(failure.text)} ({failure.code})" if failure.text else "the recording has none"
         )
-    print_facts(described)
+    print_facts(described | verdict_facts(reports or ()))
 
 
 async def _failure(settings: Settings, result: str) -> Reason:

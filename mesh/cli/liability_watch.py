@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mesh.background import Background
 from mesh.cli.chain_client import open_chain, own_address, units_of
 from mesh.cli.liability import liability_json, print_liability, state_of
 from mesh.cli.options import ADDRESS, with_chain_settings, with_json
 from mesh.cli.output import print_json, print_line, short_address
+from mesh.cli.verdicts import print_verdicts
 from mesh.outage_log import OutageLog
+from mesh.settings import NetworkSettings, options_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -39,9 +42,10 @@ log = logging.getLogger(__name__)
     "--from-block", type=click.IntRange(min=0), help="without ADDRESS: the first block to read [the next one]"
 )
 @with_json
-@with_chain_settings("confirmations", "poll_interval")
+@with_chain_settings(*options_of(NetworkSettings), "lighthouse_contract", "confirmations", "poll_interval")
 async def watch(settings: Settings, address: str | None, from_block: int | None, as_json: bool) -> None:
-    """Wait until the liability at ADDRESS has ended, then show it. If the node is unreachable, wait for it.
+    """Wait until the liability at ADDRESS has ended, then show it. If the node is unreachable, wait for it. If it names
+    a validator, print how its jurors judge when they do.
 
     Without ADDRESS, print each liability when it is created and when it ends, until Ctrl-C; with --json one object per
     line.
@@ -52,9 +56,12 @@ async def watch(settings: Settings, address: str | None, from_block: int | None,
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
         liability = await chain.liabilities.get(address)
-        if not liability.is_finalized and not as_json:
-            print_line(f"{liability.address} is open; waiting until it ends (Ctrl-C stops waiting)")
-        await print_liability(chain, await chain.liabilities.watch(address), settings, own=own, as_json=as_json)
+        async with Background() as tasks:
+            if not liability.is_finalized and not as_json:
+                print_line(f"{liability.address} is open; waiting until it ends (Ctrl-C stops waiting)")
+                tasks.start(print_verdicts(settings, chain, liability), "verdicts")
+            ended = await chain.liabilities.watch(address)
+        await print_liability(chain, ended, settings, own=own, as_json=as_json)
 
 
 async def _watch_all(settings: Settings, from_block: int | None, as_json: bool) -> None:

@@ -127,13 +127,14 @@ async def _withdraw(
 ) -> None:
     from mesh.agent.components import working
     from mesh.agent.orders import OrderState
+    from mesh.agent.reports import ContractReports
     from mesh.agent.trade import Trader
     from mesh.composition import load_account
     from mesh.flood import Drops
 
     account = await asyncio.to_thread(load_account, settings)
     async with working(settings, account, None, drops=Drops()) as parts:
-        trader = Trader(parts)
+        trader = Trader(parts, ContractReports(parts))
         await trader.load()
         orders = trader.orders(OrderState.OPEN, OrderState.WITHDRAWN)
         parts.outbox.hold(order.hash for order in orders if order.state is OrderState.OPEN)

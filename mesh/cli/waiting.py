@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from collections import Counter
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from mesh.agent import Progress
     from mesh.amounts import Unit
     from mesh.network import Network
+
+A = TypeVar("A")
 
 STEP: Final = 10
 """Percent of a playback after which another line is printed where there is no bar."""
@@ -30,6 +34,8 @@ class JobPrinter:
     def __init__(self, unit: Unit, *, as_json: bool) -> None:
         self._unit = unit
         self.as_json = as_json
+        self.awaited = "the payment"
+        """What follows the robot's result."""
         self._bar = ExitStack()
         self._move: Callable[[int, int | None], None] | None = None
         self._percent = -STEP
@@ -95,7 +101,14 @@ class JobPrinter:
             case "result" if seen.code:
                 return "the robot has given up; waiting for the chain to return the cost"
             case "result":
-                return "the robot is done; waiting for the payment"
+                return f"the robot is done; waiting for {self.awaited}"
+            case "judged":
+                votes = f", {seen.position} of {seen.total} needed" if seen.total > 1 else ""
+                return f"juror {who} judged{votes}: {printable(seen.detail)}"
+            case "unjudged" if seen.code == "disagree":
+                return f"the jurors of {who} disagree: {seen.detail}"
+            case "unjudged":
+                return f"the validator {who} is silent: {seen.detail}"
         return ""
 
     def _difference(self, offer: Progress) -> str:
@@ -121,7 +134,26 @@ def _json(seen: Progress) -> dict[str, Any]:
     facts: dict[str, Any] = {"kind": seen.kind, "agent": seen.agent}
     if seen.kind == "playing":
         return facts | {"position": seen.position, "total": seen.total}
+    if seen.kind in ("judged", "unjudged"):
+        facts |= {"votes": seen.position, "needed": seen.total}
     return facts | {"code": seen.code, "detail": seen.detail}
+
+
+async def answer_of(ask: Callable[[], A]) -> A:
+    """What `ask` returns, which asks in the terminal, in a thread that does not keep an interrupted program alive."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[A] = loop.create_future()
+
+    def ask_there() -> None:
+        try:
+            given = ask()
+        except click.Abort:
+            loop.call_soon_threadsafe(answer.cancel)
+        else:
+            loop.call_soon_threadsafe(answer.set_result, given)
+
+    threading.Thread(target=ask_there, name="prompt", daemon=True).start()
+    return await answer
 
 
 async def print_connection_changes(network: Network, *, before: Callable[[], object] = lambda: None) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
+from mesh.agent.judged_contract import verdict
 from mesh.amounts import XRT, Unit
 from mesh.background import Background
 from mesh.cli.options import with_json, with_settings
@@ -25,6 +26,7 @@ from mesh.telemetry.logs import configure_logging
 from mesh.watching import JobEvent
 from schemas import Demand, Empty, InvalidAddress, Result, String, Verified, parse_address, parse_cid
 from schemas.signing import Decline, Rejection
+from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -57,8 +59,8 @@ EVENT_WIDTH: Final = 9
 def command(
     settings: Settings, model: str | None, with_open: bool, readings: bool, out: Path | None, as_json: bool
 ) -> None:
-    """Print one line for each event on a lighthouse's channel: orders, rejections, declines, contracts, jobs and
-    results. Ctrl-C stops it.
+    """Print one line for each event on a lighthouse's channel: orders, rejections, declines, contracts, jobs,
+    results and validators' verdicts. Ctrl-C stops it.
 
     Needs a router, but no account and no chain. Prints only orders and results with valid signatures; invalid messages
     are counted, and the counts are printed at the end and on SIGUSR1. --json prints one object per line, with amounts
@@ -196,6 +198,8 @@ def event_json(seen: MarketEvent, *, time: str) -> dict[str, Any]:
         case Decline():
             about = {"event": "declined", "order": seen.order, "agent": seen.agent}
             about |= {"code": seen.code, "detail": seen.detail}
+        case ValidatorReport():
+            about = {"event": "judged", **msgspec.json.decode(seen.encode())}
         case Reading():
             about = {"event": "reading", "agent": seen.agent, "topic": seen.topic, "value": _value(seen)}
             if seen.result:
@@ -241,6 +245,9 @@ class EventFormatter:
             case Decline():
                 why = f"{printable(seen.detail[:LONGEST_TEXT])} ({seen.code})".lstrip()
                 kind, words = "declined", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.agent)}: {why}"
+            case ValidatorReport():
+                why = printable(verdict(seen)[:LONGEST_TEXT])
+                kind, words = "judged", f"{seen.liability} by juror {short_address(seen.juror)}: {why}"
             case Reading():
                 kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.agent)}"
             case JobEvent(_, kind, liability):
@@ -272,13 +279,8 @@ class EventFormatter:
 
 def _value(reading: Reading) -> Any:
     """The value of a reading for JSON, in which bytes become base64."""
-    match reading.value:
-        case Empty():
-            return None
-        case String(data):
-            return data
-        case value:
-            return value
+    value = reading.value
+    return value.data if isinstance(value, String) else None if isinstance(value, Empty) else value
 
 
 def _shown(reading: Reading) -> str:

@@ -171,6 +171,10 @@ class MarketSettings:
         DEADLINE_LIMIT,
         "blocks after which a provider drops an order, and an agent's offer for a demand ends, before its deadline",
     )
+    accepted_validators: str = option(
+        "any",
+        "validators under which an agent works for demands: any, none, or names and addresses, separated by commas",
+    )
     blocked_signers: str = option(
         "", "file of addresses, one a line, whose messages are dropped; read again when it changes (empty: none)"
     )

@@ -1,7 +1,7 @@
-"""A live view of a market: verified orders and results, rejections, declines, and agents' job events, in one stream.
+"""A live view of a market: orders and results, rejections, declines, reports, and agents' job events, in one stream.
 
-A rejection is signed by its provider, a decline by its agent. A job event is not signed: it must be on a key of the
-agent that its liability names as promisor. A router with a roster lets nobody else write there.
+A rejection is signed by its provider, a decline by its agent, a report by a juror. A job event is not signed: it must
+be on a key of the agent that its liability names as promisor. A router with a roster lets nobody else write there.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from schemas import (
     parse_key,
 )
 from schemas.signing import Decline, Rejection
+from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
@@ -59,11 +60,11 @@ class JobEvent(NamedTuple):
 
 
 MarketEvent: TypeAlias = (
-    Verified[Demand] | Verified[Offer] | Verified[Result] | Rejection | Decline | JobEvent | Reading
+    Verified[Demand] | Verified[Offer] | Verified[Result] | Rejection | Decline | ValidatorReport | JobEvent | Reading
 )
-Claim: TypeAlias = Rejection | Decline | JobEvent
+Claim: TypeAlias = Rejection | Decline | ValidatorReport | JobEvent
 C = TypeVar("C", bound=Claim)
-S = TypeVar("S", Rejection, Decline)
+S = TypeVar("S", Rejection, Decline, ValidatorReport)
 
 
 class ClaimReader(Generic[C]):
@@ -127,10 +128,10 @@ class RecentSet(BoundedDict[str, None]):
 class MarketWatch(Lifecycle):
     """Events on an open channel from now on: `async with MarketWatch(session, channel) as watch`, then iterate.
 
-    With `model` (CIDv0), only events about orders and liabilities of that model; a result counts once its agent has
-    reported the liability. With `readings` also those of agents, which name no model. Readings, declines and job events
-    are taken from agents that are present when one arrives. For one consumer. Leaving `async with` ends it; the caller
-    closes session and channel.
+    With `model` (CIDv0), only events about orders and liabilities of that model; a result or a report counts once its
+    agent has announced the liability. With `readings` also those of agents, which name no model. Readings, declines,
+    reports and job events are taken from agents that are present when one arrives. For one consumer. Leaving `async
+    with` ends it; the caller closes session and channel.
     """
 
     title = "market watch"
@@ -153,12 +154,13 @@ class MarketWatch(Lifecycle):
         self._results = await stack.enter_async_context(channel.subscribe(Result))
         self._rejection_reader = ClaimReader(partial(read_statement, Rejection), reason="rejection")
         self._decline_reader = ClaimReader(partial(read_statement, Decline), reason="decline")
+        self._report_reader = ClaimReader(partial(read_statement, ValidatorReport), reason="report")
         self._event_reader = ClaimReader(read_event, reason="event")
-        selector = market_selector(channel.lighthouse, "reject")
-        self._rejected = await stack.enter_async_context(Pump(self._session, selector, self._rejection_reader))
-        selector = market_selector(channel.lighthouse, "decline")
-        self._declined = await stack.enter_async_context(Pump(self._session, selector, self._decline_reader))
-        self._events = await stack.enter_async_context(Pump(self._session, event_selector(), self._event_reader))
+        enter, selector = stack.enter_async_context, partial(market_selector, channel.lighthouse)
+        self._rejected = await enter(Pump(self._session, selector("reject"), self._rejection_reader))
+        self._declined = await enter(Pump(self._session, selector("decline"), self._decline_reader))
+        self._reported = await enter(Pump(self._session, selector("report"), self._report_reader))
+        self._events = await enter(Pump(self._session, event_selector(), self._event_reader))
         if self._readings is not None:
             await stack.enter_async_context(self._readings)
         tasks = await stack.enter_async_context(Background())
@@ -168,6 +170,7 @@ class MarketWatch(Lifecycle):
             ("results", self._seen_results()),
             ("rejections", self._seen_rejections()),
             ("declines", self._seen_declines()),
+            ("reports", self._seen_reports()),
             ("events", self._seen_events()),
         ):
             tasks.start(self._move(items), f"watched {name}")
@@ -191,6 +194,7 @@ class MarketWatch(Lifecycle):
         claims: tuple[tuple[Pump[Any], ClaimReader[Any]], ...] = (
             (self._rejected, self._rejection_reader),
             (self._declined, self._decline_reader),
+            (self._reported, self._report_reader),
             (self._events, self._event_reader),
         )
         return _sum_of(
@@ -229,6 +233,15 @@ class MarketWatch(Lifecycle):
             elif self._is_new(decline, decline.code):
                 yield decline
 
+    async def _seen_reports(self) -> AsyncIterator[MarketEvent]:
+        async for report in self._reported:
+            if not await self._agents.is_present(report.juror):
+                self._report_reader.refuse()
+            elif (self._model == "*" or report.liability in self._contracts) and self._statements.add(
+                f"{report.liability} {report.juror}"  # it is put once for each party
+            ):
+                yield report
+
     def _is_new(self, statement: Rejection | Decline, word: str) -> bool:
         """Whether a statement is about an order of the model, and its author did not say the same of it before."""
         wanted = self._model == "*" or statement.order in self._orders
@@ -251,7 +264,7 @@ class MarketWatch(Lifecycle):
 
 
 def read_statement(kind: type[S], key: str, payload: bytes) -> S:
-    """A signed rejection or decline on a valid key. Raises `AiraError`."""
+    """A signed rejection, decline or report on a valid key. Raises `AiraError`."""
     parse_key(key)
     statement = kind.decode(payload)
     if not statement.is_signed:

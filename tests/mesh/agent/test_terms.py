@@ -72,7 +72,7 @@ async def test_a_file_that_no_robot_can_play_is_refused(place: Place, tmp_path: 
 async def test_a_contract_prints_its_address_state_cost_and_parties() -> None:
     def contract() -> tuple[Contract, asyncio.Future[Outcome]]:
         ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
-        return Contract(liability(), ended, None), ended  # type: ignore[arg-type]
+        return Contract(liability(), ended, None, None), ended  # type: ignore[arg-type]
 
     shown, ended = contract()
     for part in (shown.address, "open", f"cost={liability().cost}", liability().promisee, liability().promisor):

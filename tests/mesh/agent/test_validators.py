@@ -66,8 +66,10 @@ async def test_a_robot_does_not_offer_where_its_offer_would_be_a_demand(
             assert (caught.value.code, caught.value.validator) == ("validator-unsafe", lighthouse)
             with pytest.raises(UnsafeValidator):
                 await robot.demand(OBJECTIVE, cost=5, validator=lighthouse)
-            with pytest.raises(InvalidMessage) as same:
+            with pytest.raises(UnsafeValidator):
                 await robot.demand(OBJECTIVE, cost=5, validator=settings.lighthouse_contract)
+            with pytest.raises(InvalidMessage) as same:
+                await robot.demand(OBJECTIVE, cost=5, validator=settings.lighthouse_contract, validator_fee=1)
             assert same.value.reason == "validator"
             assert await waiting(robot) == []
 

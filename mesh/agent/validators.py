@@ -1,0 +1,189 @@
+"""How validators say that they judge: asked from their jurors on the mesh, and checked on the chain."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from mesh.agent.errors import Declined
+from mesh.amounts import XRT
+from mesh.errors import RemoteError
+from mesh.flood import BoundedDict
+from mesh.watching.queries import query_all
+from schemas import ZERO_ADDRESS, Demand, InvalidRecord
+from schemas.keys import ValidatorKey
+from schemas.verdicts import LONGEST_REPORT, PolicyNote, ValidatorAnnouncement
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import zenoh
+
+    from mesh.agent.orders import Terms
+    from mesh.chain import Chain
+    from mesh.network import Channel
+
+ANSWER_TIMEOUT: Final = 3.0
+"""Seconds that jurors have to answer."""
+KEPT: Final = 60.0
+"""Seconds for which the announcements of a validator are not asked again, …"""
+KEPT_SILENCE: Final = 5.0
+"""… and those for which a validator without any is not."""
+REMEMBERED: Final = 256
+"""Validators whose announcements are kept."""
+LOOKUPS: Final = 8
+"""Validators that are asked at once: strangers' demands may name any number."""
+OLDEST: Final = 24 * 3600.0
+"""Seconds since a juror signed an announcement after which it does not count."""
+CLOCK_ERROR: Final = 300.0
+"""Seconds by which a juror's clock may be ahead."""
+MOST_UNKNOWN: Final = 16
+"""Most jurors that are looked at of a validator whose jurors the chain does not list."""
+
+
+class ValidatorSilent(RemoteError, code="validator-silent"):
+    """No juror of the validator answers on the mesh, so its fee is not known, and perhaps nobody judges."""
+
+    def __init__(self, validator: str) -> None:
+        super().__init__(
+            f"nobody answers as the validator {validator} on the mesh",
+            hint="start it, or name another; with an explicit fee the demand is posted all the same",
+        )
+        self.validator = validator
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnnouncedValidator:
+    """A validator as those of its jurors announce it that answered: `await agent.validator(address)`."""
+
+    address: str
+    """A contract, or in generation 3 an account that judges itself (EIP-55)."""
+    announcements: tuple[ValidatorAnnouncement, ...]
+    """One of each juror that answered; the validator accepts their signatures."""
+    jurors: int
+    """How many jurors the validator has."""
+    quorum: int
+    """How many of them must judge alike before the contract ends."""
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether no juror answered: perhaps nobody will judge."""
+        return not self.announcements
+
+    @property
+    def has_quorum(self) -> bool:
+        """Whether enough jurors answered to judge."""
+        return len(self.announcements) >= self.quorum
+
+    @property
+    def title(self) -> str:
+        """What the first juror calls the validator; empty if it is silent."""
+        return self.announcements[0].title if self.announcements else ""
+
+    @property
+    def fee(self) -> int:
+        """The fee at which enough jurors judge, in wn; if too few answered, the highest of theirs."""
+        fees = sorted(int(one.fee) for one in self.announcements)
+        return fees[min(self.quorum, len(fees)) - 1] if fees else 0
+
+    @property
+    def policies(self) -> tuple[PolicyNote, ...]:
+        """What any juror judges by, each policy once."""
+        return tuple(dict.fromkeys(policy for one in self.announcements for policy in one.policies))
+
+    @property
+    def is_unanimous(self) -> bool:
+        """Whether all jurors that answered judge by the same policies."""
+        return len({frozenset(one.policies) for one in self.announcements}) < 2
+
+    def __repr__(self) -> str:
+        policies = ", ".join(policy.name for policy in self.policies)
+        online = f"{len(self.announcements)} of {self.jurors} jurors answer"
+        return f"AnnouncedValidator({self.address}, {self.title!r}, {online}, fee={XRT.show(self.fee)}, {policies})"
+
+
+class ValidatorDirectory:
+    """Asks validators how they judge: `await directory.find(address)`. Answers are kept for a minute."""
+
+    def __init__(self, session: zenoh.Session, channel: Channel, chain: Chain) -> None:
+        self._session = session
+        self._channel = channel
+        self._chain = chain
+        self._found: BoundedDict[str, tuple[AnnouncedValidator, float]] = BoundedDict(REMEMBERED)
+        self._turns = asyncio.Semaphore(LOOKUPS)
+
+    async def find(self, validator: str) -> AnnouncedValidator:
+        """The validator (EIP-55 address) as its jurors announce it now. Raises `ChainError`."""
+        async with self._turns:
+            found, until = self._found.get(validator, (None, 0.0))
+            if found is None or time.monotonic() >= until:
+                found = await self._ask(validator)
+                kept = KEPT_SILENCE if found.is_silent else KEPT
+                self._found[validator] = found, time.monotonic() + kept
+            return found
+
+    async def _ask(self, validator: str) -> AnnouncedValidator:
+        key = str(ValidatorKey(self._channel.lighthouse, validator))
+        replies = await query_all(self._session, [key], timeout=ANSWER_TIMEOUT)
+        said = await asyncio.to_thread(_signed, replies, validator)
+        jurors = await accepted_of(self._chain, validator, said)
+        announcements = tuple(said[juror] for juror in jurors)
+        if (jury := await self._chain.validators.jury(validator)) is not None:
+            number, quorum = len(jury.jurors), jury.quorum
+        else:
+            number = max((one.jurors for one in announcements), default=1)
+            quorum = max((one.quorum for one in announcements), default=1)
+        return AnnouncedValidator(address=validator, announcements=announcements, jurors=number, quorum=quorum)
+
+
+async def accepted_of(chain: Chain, validator: str, signers: Iterable[str]) -> list[str]:
+    """Those of the signers (addresses) whose judgement the validator accepts, sorted. Raises `ChainError`."""
+    if (jury := await chain.validators.jury(validator)) is not None:
+        return sorted(set(signers) & set(jury.jurors))
+    some = sorted(signers, key=lambda signer: (signer != validator, signer))[:MOST_UNKNOWN]
+    return [signer for signer in some if await chain.validators.accepts(validator, signer)]
+
+
+async def check_named(chain: Chain, terms: Terms) -> None:
+    """Raise what signing a demand with these terms would raise because of its validator: `UnsafeValidator`, …"""
+    from mesh.chain import UnsafeValidator  # an agent that watches does without the chain
+
+    if terms["validator"] == terms["lighthouse"]:
+        raise UnsafeValidator(terms["validator"])
+    nonce = "00" * 32 if terms["sender"] is None else 0
+    await chain.validators.check(Demand(**terms, nonce=nonce, validator_fee=0))
+
+
+async def refund_delay(chain: Chain) -> int | None:
+    """The blocks after which a contract that was never finalized can be refunded; None if its contracts offer none."""
+    if not await chain.has_mesh_contracts():
+        return None
+    return int(await chain.node.read(chain.node.contract("Factory", chain.factory).refundDelay()))
+
+
+async def require_accepted(chain: Chain, validator: str, accepted: str) -> None:
+    """Raise `Declined` if an agent does not work under a validator (address) that the setting does not accept."""
+    if validator == ZERO_ADDRESS or accepted == "any":
+        return
+    names = [] if accepted == "none" else [name.strip() for name in accepted.split(",")]
+    if validator not in [await chain.names.address(name) for name in names]:
+        raise Declined("validator-not-accepted", f"it does not accept the validator {validator}")
+
+
+def _signed(replies: Iterable[zenoh.Reply], validator: str) -> dict[str, ValidatorAnnouncement]:
+    """The signed and recent announcements of a validator, the latest of each juror."""
+    said: dict[str, ValidatorAnnouncement] = {}
+    now = time.time()
+    for sample in (reply.ok for reply in replies if reply.ok is not None):
+        if len(sample.payload) > LONGEST_REPORT:
+            continue
+        with suppress(InvalidRecord):
+            one = ValidatorAnnouncement.decode(sample.payload.to_bytes())
+            is_recent = now - OLDEST <= one.made_at <= now + CLOCK_ERROR
+            is_newer = one.juror not in said or said[one.juror].made_at < one.made_at
+            if one.validator == validator and is_recent and is_newer and one.is_signed:
+                said[one.juror] = one
+    return said
