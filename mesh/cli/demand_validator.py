@@ -68,10 +68,9 @@ class _JudgedTerms:
     def _refund(self) -> str:
         if self.refund_delay is None:
             return "the contracts offer no refund, so the cost stays in the contract"
-        minutes = round(self.refund_delay * (self.block_time or 0) / 60)
-        about = f", in about {plural(minutes or 1, 'minute')}" if self.block_time else ""
+        about = f" (about {_rough(self.refund_delay * self.block_time)})" if self.block_time else ""
         return (
-            f"cost and fee can be refunded {plural(self.refund_delay, 'block')} after the contract was created{about}"
+            f"cost and fee can be refunded {plural(self.refund_delay, 'block')}{about} after the contract was created"
         )
 
     def json(self) -> dict[str, Any]:
@@ -92,6 +91,14 @@ class _JudgedTerms:
             "blockTime": self.block_time,
             "doubts": self.doubts,
         }
+
+
+def _rough(seconds: float) -> str:
+    """A time for people, in minutes, hours or days."""
+    for unit, length in (("day", 86_400), ("hour", 3600)):
+        if seconds >= 2 * length:
+            return plural(round(seconds / length), unit)
+    return plural(max(round(seconds / 60), 1), "minute")
 
 
 async def agreed_fee(

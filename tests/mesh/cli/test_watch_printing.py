@@ -13,7 +13,8 @@ from schemas import Empty, String, verify_message
 from schemas.payloads import encode_value
 from schemas.signing import Decline, Rejection
 from tests.mesh.watching.test_market import JOB
-from tests.support.orders import CONTRACT, RECORDING, ROBOT, TOKEN, demand, offer, result
+from tests.support.jurors import MISSING, Juror
+from tests.support.orders import CONTRACT, MARKET, PERSON, RECORDING, ROBOT, TOKEN, demand, liability, offer, result
 
 NOON = "2026-01-01T12:00:00.000Z"
 
@@ -84,6 +85,16 @@ def test_a_decline_is_printed_as_a_line_and_as_json() -> None:
         "code": "too-cheap",
         "detail": "\x1b[2Jat least 5 XRT",
     }
+
+
+def test_a_report_is_printed_as_a_line_and_as_json() -> None:
+    juror = Juror(endpoint="", lighthouse=MARKET, signer=ROBOT, validator=PERSON.address)
+    report = juror.report(liability(), RECORDING, success=False)
+    line = format_line(report)
+    assert line.startswith(f"judged     {report.liability} by juror 0x")
+    assert line.endswith(f": the work does not count: {MISSING.detail} ({MISSING.code})")
+    printed = event_json(report, time=NOON)
+    assert (printed["event"], printed["success"], printed["findings"][0]["code"]) == ("judged", False, MISSING.code)
 
 
 def test_counters_are_printed_as_a_sentence() -> None:

@@ -11,8 +11,19 @@ import pytest
 
 from mesh.network import Channel, Endpoints, Network, message_key
 from mesh.watching import JobEvent, MarketWatch
-from schemas import DeclineKey, EventKey, ProgressKey, RejectKey, Signer, Verified, encode, message_hash
+from schemas import (
+    DeclineKey,
+    EventKey,
+    ProgressKey,
+    RejectKey,
+    ReportKey,
+    Signer,
+    Verified,
+    encode,
+    message_hash,
+)
 from schemas.signing import Decline, Rejection
+from tests.support.jurors import Juror
 from tests.support.orders import (
     CONTRACT,
     LIGHTHOUSE,
@@ -54,6 +65,7 @@ class Market:
         for key in (
             str(rejection),
             str(decline),
+            str(ReportKey(MARKET, PERSON.address)),
             EVENT,
             *(str(self.key(message)) for message in (demand(), offer(), result())),
         ):
@@ -139,6 +151,24 @@ async def test_a_decline_is_shown_once_and_only_of_a_present_agent_that_has_sign
     market.decline(order)
     market.decline("ab" * 32)
     assert [(await market.next()).order for _ in range(2)] == [order, "ab" * 32]
+
+
+async def test_a_report_is_shown_once_and_only_of_a_present_juror_that_has_signed_it(market: Market) -> None:
+    def put(juror: Signer, party: str, contract: str = CONTRACT, **changes: Any) -> Any:
+        like = Juror(endpoint="", lighthouse=MARKET, signer=juror, validator=STRANGER.address)
+        report = like.report(msgspec.structs.replace(JOB, address=contract), RECORDING, success=False)
+        report = msgspec.structs.replace(report, **changes)
+        market.channel.put(str(ReportKey(MARKET, party)), report.encode())
+        return report
+
+    put(ROBOT, PERSON.address, judged_at=1)
+    await market.refused("report")
+    put(STRANGER, PERSON.address)
+    await market.refused("report", 2)
+    shown = [put(ROBOT, party) for party in (PERSON.address, ROBOT.address)]
+    another = put(ROBOT, PERSON.address, STRANGER.address)
+    assert await market.next() in shown
+    assert await market.next() == another
 
 
 async def test_the_progress_of_a_playback_is_neither_shown_nor_refused(market: Market) -> None:

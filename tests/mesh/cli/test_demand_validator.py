@@ -1,0 +1,128 @@
+"""`aira demand --validator`: what it means is said before anything is signed, and the verdict with its reasons."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.chain import UnsafeValidator
+from mesh.cli.demand import demand
+from mesh.cli.errors import DoubtfulValidator, JobNotDone
+from schemas import Demand, Result
+from tests.mesh.operations.site import MODEL, Site, settings_of
+from tests.support.commands import aira
+from tests.support.jurors import COMPLETE, MISSING, Juror
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from mesh import Agent
+    from tests.support.nodes import Anvil
+    from tests.support.routers import EmbeddedRouter
+
+TERMS: dict[str, Any] = {"model": MODEL, "cost": "7wn", "lifetime": 500, "out": None}
+
+
+@pytest.fixture
+async def site(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path) -> Site:
+    return await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+
+
+@pytest.fixture
+async def juror(site: Site) -> AsyncIterator[Juror]:
+    """A validator of generation 3, an account with ether."""
+    signer = site.accounts["rival"].signer
+    async with Juror(endpoint=site.endpoint, lighthouse=site.lighthouse, signer=signer) as juror:
+        yield juror
+
+
+async def judge(site: Site, juror: Juror, *, success: bool) -> None:
+    """Judge the first result on the market, report it to both parties, and end its contract."""
+    async with site.agent("rival") as reader, reader.channel.subscribe(Result) as results:
+        result = (await anext(aiter(results))).message
+        contract = await reader.contract(result.liability)
+        juror.judge(contract, result.result, success=success)
+        await reader.parts.chain.liabilities.validate(result, agree=success)
+
+
+async def ordered(site: Site, robot: Agent, juror: Juror, *, success: bool, as_json: bool) -> None:
+    """Order a job under the juror's judgement, until it ends."""
+    async with site.provider(), robot, asyncio.TaskGroup() as tasks:
+        tasks.create_task(judge(site, juror, success=success))
+        objective, validator = str(site.job("word")), juror.signer.address
+        await demand(
+            settings_of(site, "person"),
+            objective=objective,
+            validator=validator,
+            validator_fee=None,
+            as_json=as_json,
+            **TERMS,
+        )
+
+
+async def test_a_person_reads_what_the_validator_means_and_how_it_judged(
+    site: Site, juror: Juror, capsys: pytest.CaptureFixture[str]
+) -> None:
+    await ordered(site, site.robot([]), juror, success=True, as_json=False)
+    lines = capsys.readouterr().out.splitlines()
+    said = lines.index(f"validator {juror.title}, {juror.signer.address}")
+    assert said < next(number for number, line in enumerate(lines) if line.startswith("posted "))
+    assert lines[said + 1].startswith("  1 of 1 juror answer, 1 must judge alike")
+    assert lines[said + 2] == f"  judges by complete: {COMPLETE.description}"
+    assert lines[said + 3].startswith("  fee 0.0000001 XRT, ")
+    assert lines[said + 4].startswith("  if it is silent: cost and fee can be refunded 50,400 blocks")
+    assert f"juror {juror.signer.address} judged: the work counts" in lines
+    assert any(line.startswith("paid, result") for line in lines)
+
+
+async def test_a_refusal_is_told_with_its_reason_also_later(
+    site: Site, juror: Juror, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ExceptionGroup) as caught:
+        await ordered(site, site.robot([]), juror, success=False, as_json=True)
+    assert [type(error) for error in caught.value.exceptions] == [JobNotDone]
+    *progress, end = map(json.loads, capsys.readouterr().out.splitlines())
+    meant = next(one for one in progress if one["kind"] == "validator")
+    assert (meant["fee"], meant["announcedFee"], meant["online"]) == ("100", "100", [juror.signer.address])
+    assert meant["policies"] == [{"name": COMPLETE.name, "description": COMPLETE.description}]
+    judged = next(one for one in progress if one["kind"] == "judged")
+    assert (judged["agent"], judged["code"], judged["votes"]) == (juror.signer.address, MISSING.code, 1)
+    assert (end["code"], len(end["reports"])) == (MISSING.code, 1)
+    assert MISSING.detail in end["reason"]
+    variables = site.variables("person")
+    shown = await asyncio.to_thread(aira, "liability", "show", end["liability"], "--json", **variables)
+    assert json.loads(shown.stdout)["reports"] == end["reports"]
+    shown = await asyncio.to_thread(aira, "liability", "show", end["liability"], **variables)
+    assert f"the work does not count: {MISSING.detail} ({MISSING.code})" in shown.stdout
+
+
+@pytest.mark.parametrize("who", ["silent", "cheap", "lighthouse"])
+async def test_a_doubtful_validator_is_named_before_anything_is_signed(
+    site: Site, juror: Juror, who: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with site.chain("person") as chain:
+        lighthouse = await chain.names.address(site.lighthouse)
+    validator = {"silent": site.address("poor"), "cheap": juror.signer.address, "lighthouse": lighthouse}[who]
+    fee = "99wn" if who == "cheap" else None
+    options: dict[str, Any] = {"objective": str(site.job("word")), "validator": validator, "validator_fee": fee}
+    settings = settings_of(site, "person")
+    expected = UnsafeValidator if who == "lighthouse" else DoubtfulValidator
+    with pytest.raises(expected):
+        await demand(settings, as_json=True, **options, **TERMS)
+    async with site.agent("person") as person:
+        assert person.orders() == []
+    if who == "lighthouse":
+        return
+    (said,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert list(said["doubts"]) == ["low-fee" if who == "cheap" else "silent"]
+    waiting = asyncio.create_task(demand(settings, as_json=False, confirmed=True, **options, **TERMS))
+    async with site.agent("poor") as watcher, watcher.channel.subscribe(Demand) as demands:
+        async with asyncio.timeout(60):
+            posted = (await anext(aiter(demands))).message
+    waiting.cancel()
+    await asyncio.wait([waiting])
+    assert (posted.validator, posted.validator_fee) == (validator, 99 if who == "cheap" else 0)
