@@ -13,6 +13,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from bridges.web.views import Labels, liability_json, result_json
+from mesh.agent.judged_contract import verdict_words
+from mesh.agent.reports import is_about
+from mesh.agent.validators import accepted_of
 from mesh.background import Background
 from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation
 from mesh.errors import AiraError
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
 
     from bridges.web.components import WebComponents
     from bridges.web.stream import Stream
+    from schemas.verdicts import ValidatorReport
 
 JOBS: Final = 16_384
 """Jobs that are remembered, the latest ones."""
@@ -64,6 +68,8 @@ class SeenJob:
     steps: list[dict[str, Any]] = field(default_factory=list)
     playback: PlaybackPosition | None = None
     phase: str = "incoming"
+    reports: dict[str, ValidatorReport] = field(default_factory=dict)
+    """How jurors of its validator have judged, by juror."""
 
     @property
     def orders(self) -> tuple[tuple[str, str], tuple[str, str]]:
@@ -150,6 +156,18 @@ class ContractFollower(Lifecycle):
             self.results[key] = seen
             self._stream.publish("market", "result", result_json(seen))
             self.say(seen.message.liability, seen.signer, "result", seen.message.result)
+
+    async def take_report(self, report: ValidatorReport) -> None:
+        """Remember how a juror has judged a job, if it is one of the job's validator."""
+        job = self.jobs.get(report.liability)
+        if job is None or report.juror in job.reports or not is_about(report, job.liability):
+            return
+        if not self._limiter.allow(report.juror):
+            return
+        with suppress(AiraError):
+            if await accepted_of(self._parts.chain, report.validator, [report.juror]):
+                job.reports[report.juror] = report
+                self._step(job, "judged", agent=report.juror, detail=verdict_words(report), at=self._clock())
 
     def say(self, address: str, agent: str, kind: str, detail: str) -> None:
         """An agent says that its job took a step. Of a liability that was not read yet, it is kept until then."""

@@ -10,6 +10,7 @@ import msgspec
 
 from bridges.web.alerts import alerts_of, waiting_parts
 from bridges.web.views import liability_json, result_json
+from mesh.agent.judged_contract import code_of, verdict_words
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
 from mesh.evidence import Claim, Verdict, check_end, verify
@@ -69,7 +70,7 @@ class Views:
         for step in job.steps:
             if step["at"] is None and step["block"] is not None:
                 step["at"] = await self._contracts.time_of(step["block"])
-        order = ("created", "ready", "playing", "result", "reverted", "paid", "refunded")
+        order = ("created", "ready", "playing", "result", "judged", "reverted", "paid", "refunded")
         return sorted(job.steps, key=lambda step: order.index(step["kind"]))
 
     async def _refundable_from(self, job: SeenJob) -> int | None:
@@ -80,12 +81,15 @@ class Views:
         return None
 
     async def _reason(self, job: SeenJob) -> dict[str, str] | None:
-        """Why a job failed, if its recording is at hand."""
+        """Why a job failed, as its validator says, or its recording if that is at hand."""
         liability = job.liability
         if not liability.is_finalized or liability.is_success:
             return None
         if not liability.result:
             return {"code": "no-result", "text": ""}
+        refused = next((one for one in job.reports.values() if one.claimed and not one.success), None)
+        if refused is not None:
+            return {"code": code_of(refused), "text": verdict_words(refused)}
         held = await asyncio.to_thread(self._parts.store.checked, liability.result)
         if held is None:
             return {"code": "recording-unavailable", "text": ""}

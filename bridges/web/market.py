@@ -19,6 +19,7 @@ from mesh.role import Lifecycle
 from mesh.watching import JobEvent, MarketWatch
 from schemas import Demand, Offer, Result, Verified
 from schemas.signing import Decline, Rejection
+from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -198,6 +199,8 @@ class Market(Lifecycle):
                     self._state(order_hash, "rejected", agent, code, event.detail)
             case Decline(order=order_hash, agent=agent, code=code):
                 self._state(order_hash, "declined", agent, code, event.detail)
+            case ValidatorReport():
+                await self.contracts.take_report(event)
             case JobEvent(agent, "ready", liability):
                 self.contracts.say(liability.address, agent, "ready", "")
             case JobEvent(agent, "complete", liability):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 
 from mesh.agent.errors import LiabilityReverted
-from mesh.agent.judged_contract import code_of, verdict
+from mesh.agent.judged_contract import code_of, verdict_words
 from mesh.agent.progress import Progress, followed_job, nothing, report
 from mesh.content import ContentUnavailable
 from mesh.errors import AiraError
@@ -136,7 +136,7 @@ class Contract:
         if not ended.result:
             return Reason("no result came in time", "no-result")
         if refused is not None:
-            return Reason(f"the validator judged: {verdict(refused)}", code_of(refused))
+            return Reason(f"the validator judged: {verdict_words(refused)}", code_of(refused))
         try:
             timeout = min(REASON_TIMEOUT, self._parts.settings.fetch_timeout)
             return await asyncio.to_thread(read_reason, await self._fetch(ended.result, timeout))

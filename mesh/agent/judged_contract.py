@@ -53,7 +53,7 @@ class JudgedContract:
         return True
 
 
-def verdict(report: ValidatorReport) -> str:
+def verdict_words(report: ValidatorReport) -> str:
     """How a juror judged, and why, in one line. The reasons are the juror's own words."""
     if report.success:
         return "the work counts"
@@ -75,7 +75,7 @@ def judged_progress(found: ValidatorReport, judged: JudgedContract) -> Progress:
         kind="judged",
         agent=found.juror,
         code=code_of(found),
-        detail=verdict(found),
+        detail=verdict_words(found),
         position=votes,
         total=needed,
     )

@@ -12,9 +12,9 @@ from contextlib import asynccontextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent.judged_contract import JudgedContract, judged_progress, verdict
+from mesh.agent.judged_contract import JudgedContract, judged_progress, verdict_words
 from mesh.agent.progress import Progress, nothing, report
-from mesh.agent.statements import received
+from mesh.agent.received import received
 from mesh.agent.validators import accepted_of
 from mesh.background import Background
 from mesh.errors import AiraError
@@ -192,7 +192,7 @@ class ContractReports(Lifecycle):
     async def _is_juror(self, report: ValidatorReport) -> bool:
         if (judged := self._judged.get(report.liability)) is not None:
             await self._read_jury(judged)
-        return bool(await accepted_of(self._parts.chain, report.validator, [report.juror]))
+        return await self._parts.chain.validators.accepts(report.validator, report.juror)
 
     def _add(self, judged: JudgedContract, report: ValidatorReport) -> None:
         if not judged.add(report):
@@ -200,7 +200,7 @@ class ContractReports(Lifecycle):
         with liability_context(report.liability):
             codes = ",".join(finding.code for finding in report.failures)
             facts = log_event("result-judged", juror=report.juror, success=report.success, codes=codes)
-            log.info("%s judged: %s", report.juror, verdict(report), extra=facts)
+            log.info("%s judged: %s", report.juror, verdict_words(report), extra=facts)
         for listener in judged.listeners:
             listener(report)
         if self._on_report is not None:

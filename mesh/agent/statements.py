@@ -1,47 +1,34 @@
-"""What others state about an account's own orders and contracts: rejections, declines, and reports of validators.
+"""What others state about an account's own orders: providers' rejections, and agents' declines of its demands.
 
-Anybody can sign any, so only those count that a provider with a stake, an agent that is present, or a juror of the
-contract's validator (`mesh.agent.reports`) has signed.
+Anybody can sign either, so only those count that a provider with a stake, or an agent that is present, has signed.
 """
 
 from __future__ import annotations
 
-import asyncio
 import logging
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Final
 
-from mesh.background import Background, call_in_loop
-from mesh.flood import FairQueue, Rate, RateLimiter
+from mesh.agent.received import received
+from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
 from mesh.market.book import Refusal
 from mesh.network import PresentAgents
-from schemas import InvalidRecord, market_selector
-from schemas.signing import Decline, Rejection, SignedRecord
+from schemas.signing import Decline, Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Container, Iterator, Mapping
-
-    import zenoh
+    from collections.abc import AsyncIterator, Awaitable, Callable, Container, Mapping
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.orders import TradedOrder
 
 log = logging.getLogger(__name__)
 
-QUEUED: Final = 64
-"""Most signed rejections, declines or reports that wait to be checked; more are dropped, as anybody can sign one."""
-QUEUED_OF_ONE: Final = 16
-"""Of these, those of one signer."""
 PER_AGENT: Final = Rate(per_second=1.0, burst=32)
 """Declines by one agent that are looked at: it may decline many demands."""
-DROPPED: Final = {"reject": "rejections", "decline": "declines", "report": "reports"}
-"""How records that were dropped are counted."""
 HEARD: Final = Rate(per_second=20.0, burst=200)
 """Declines in all that are looked at."""
-
-S = TypeVar("S", bound=SignedRecord)
 
 
 @asynccontextmanager
@@ -95,68 +82,5 @@ async def received_declines(
         yield subscribe
 
 
-@asynccontextmanager
-async def received(
-    parts: AgentComponents,
-    kind: Literal["reject", "decline", "report"],
-    record: type[S],
-    is_wanted: Callable[[S], bool],
-    check: Callable[[S], Awaitable[None]],
-) -> AsyncIterator[Callable[[], None]]:
-    """Meanwhile call `check` with the signed records of a kind for this account that are wanted, one after the other.
-
-    Yields the function that subscribes, to be called when the first one may come. `is_wanted` runs on any thread.
-    """
-
-    async def check_all(queue: FairQueue[S]) -> None:
-        while True:
-            await check(await queue.get())
-
-    with ExitStack() as subscription:
-        async with Background() as tasks:
-            subscribed = False
-
-            def subscribe() -> None:
-                nonlocal subscribed
-                if not subscribed:
-                    subscribed = True
-                    queue = subscription.enter_context(_queued(parts, kind, record, is_wanted))
-                    tasks.start(check_all(queue), f"{kind}s")
-
-            yield subscribe
-
-
 def _is_about(orders: Container[str], statement: Rejection | Decline) -> bool:
     return statement.order in orders
-
-
-@contextmanager
-def _queued(
-    parts: AgentComponents,
-    kind: Literal["reject", "decline", "report"],
-    record: type[S],
-    is_wanted: Callable[[S], bool],
-) -> Iterator[FairQueue[S]]:
-    """Meanwhile put the wanted records into the queue if they are signed, while it has room."""
-    loop, queue = asyncio.get_running_loop(), FairQueue[S](per_sender=QUEUED_OF_ONE, total=QUEUED)
-
-    def put(statement: S) -> None:
-        for dropped in queue.put(statement.signer, statement):
-            parts.drops.count(DROPPED[kind], dropped.signer)
-
-    def receive(sample: zenoh.Sample) -> None:
-        try:
-            statement = record.decode(sample.payload.to_bytes())
-        except InvalidRecord as error:
-            log.debug("an unreadable statement: %s", error)
-            return
-        if is_wanted(statement) and statement.is_signed:  # others cost no more than reading them
-            call_in_loop(loop, put, statement)
-
-    selector = market_selector(parts.channel.lighthouse, kind, parts.signer.address)
-    subscriber: Any = parts.network.session.declare_subscriber(selector, receive)
-    try:
-        yield queue
-    finally:
-        if not parts.network.session.is_closed():
-            subscriber.undeclare()

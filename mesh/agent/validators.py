@@ -6,7 +6,7 @@ import asyncio
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.errors import Declined
 from mesh.amounts import XRT
@@ -18,11 +18,10 @@ from schemas.keys import ValidatorKey
 from schemas.verdicts import LONGEST_REPORT, PolicyNote, ValidatorAnnouncement
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     import zenoh
 
-    from mesh.agent.orders import Terms
     from mesh.chain import Chain
     from mesh.network import Channel
 
@@ -131,11 +130,9 @@ class ValidatorDirectory:
         said = await asyncio.to_thread(_signed, replies, validator)
         jurors = await accepted_of(self._chain, validator, said)
         announcements = tuple(said[juror] for juror in jurors)
-        if (jury := await self._chain.validators.jury(validator)) is not None:
-            number, quorum = len(jury.jurors), jury.quorum
-        else:
-            number = max((one.jurors for one in announcements), default=1)
-            quorum = max((one.quorum for one in announcements), default=1)
+        jury = await self._chain.validators.jury(validator)
+        number = max((one.jurors for one in announcements), default=1) if jury is None else len(jury.jurors)
+        quorum = 1 if jury is None else jury.quorum  # of another contract, or an account
         return AnnouncedValidator(address=validator, announcements=announcements, jurors=number, quorum=quorum)
 
 
@@ -147,7 +144,7 @@ async def accepted_of(chain: Chain, validator: str, signers: Iterable[str]) -> l
     return [signer for signer in some if await chain.validators.accepts(validator, signer)]
 
 
-async def check_named(chain: Chain, terms: Terms) -> None:
+async def check_named(chain: Chain, terms: Mapping[str, Any]) -> None:
     """Raise what signing a demand with these terms would raise because of its validator: `UnsafeValidator`, …"""
     from mesh.chain import UnsafeValidator  # an agent that watches does without the chain
 

@@ -43,9 +43,9 @@ async def reports_on(settings: Settings, chain: Chain, liability: Liability) -> 
 
 def verdict_facts(reports: Sequence[ValidatorReport]) -> dict[str, str | None]:
     """Each juror's verdict, for people."""
-    from mesh.agent.judged_contract import verdict
+    from mesh.agent.judged_contract import verdict_words
 
-    return {f"juror {short_address(one.juror)}": printable(verdict(one)) for one in reports}
+    return {f"juror {short_address(one.juror)}": printable(verdict_words(one)) for one in reports}
 
 
 def reports_json(reports: Sequence[ValidatorReport] | None) -> list[Any] | None:
@@ -55,7 +55,7 @@ def reports_json(reports: Sequence[ValidatorReport] | None) -> list[Any] | None:
 
 async def print_verdicts(settings: Settings, chain: Chain, liability: Liability) -> None:
     """Print each juror's verdict on an open liability when it is there, until cancelled."""
-    from mesh.agent.judged_contract import verdict
+    from mesh.agent.judged_contract import verdict_words
 
     if liability.validator == ZERO_ADDRESS:
         return
@@ -69,7 +69,7 @@ async def print_verdicts(settings: Settings, chain: Chain, liability: Liability)
                 for one in await _ask(network, settings, chain, liability):
                     if one.juror not in said:
                         said.add(one.juror)
-                        print_line(f"juror {one.juror} judged: {printable(verdict(one))}")
+                        print_line(f"juror {one.juror} judged: {printable(verdict_words(one))}")
                 await asyncio.sleep(INTERVAL)
     except AiraError as error:
         click.echo(f"aira: the validator's reports are not known: {error}", err=True)

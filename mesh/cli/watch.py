@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
-from mesh.agent.judged_contract import verdict
+from mesh.agent.judged_contract import verdict_words
 from mesh.amounts import XRT, Unit
 from mesh.background import Background
 from mesh.cli.options import with_json, with_settings
@@ -246,7 +246,7 @@ class EventFormatter:
                 why = f"{printable(seen.detail[:LONGEST_TEXT])} ({seen.code})".lstrip()
                 kind, words = "declined", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.agent)}: {why}"
             case ValidatorReport():
-                why = printable(verdict(seen)[:LONGEST_TEXT])
+                why = printable(verdict_words(seen)[:LONGEST_TEXT])
                 kind, words = "judged", f"{seen.liability} by juror {short_address(seen.juror)}: {why}"
             case Reading():
                 kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.agent)}"

@@ -21,6 +21,7 @@ from mesh import (
     Agent,
     AiraError,
     Contract,
+    Declined,
     Demand,
     Empty,
     Job,
@@ -32,6 +33,7 @@ from mesh import (
     Result,
     Settings,
     String,
+    ValidatorReport,
     Verified,
     __version__,
 )
@@ -46,7 +48,15 @@ agent = Agent(model="QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82", settings=S
 
 @agent.on_demand
 async def offer(demand: Verified[Demand]) -> None:
+    validator = await agent.validator(demand)
+    if validator is not None and (not validator.has_quorum or "rate" in [one.name for one in validator.policies]):
+        raise Declined("validator", validator.title)
     await agent.offer(demand)
+
+
+@agent.on_report
+async def judged(report: ValidatorReport) -> None:
+    print(report.success, [finding.detail for finding in report.failures])
 
 
 @agent.on("/blink")
@@ -102,7 +112,9 @@ async def trade() -> Outcome:
     except AiraError as error:
         print(error.code)
         raise
-    return await contract.outcome()
+    outcome = await contract.outcome()
+    print((await agent.validator(contract.liability.validator)).fee, outcome.reports, await contract.reports())
+    return outcome
 
 
 if __name__ == "__main__":
@@ -131,6 +143,8 @@ BAD = {
     "unverified": ("@agent.on_demand\nasync def f(demand: Demand) -> None: ...", "type-var"),
     "swapped": ("@agent.on_liability\nasync def f(liability: Liability, phase: Phase) -> None: ...", "type-var"),
     "arguments": ("@agent.every(1.0)\nasync def f(seconds: float) -> None: ...", "type-var"),
+    "report_of_result": ("@agent.on_report\nasync def f(result: Verified[Offer]) -> None: ...", "type-var"),
+    "no_validator": ("async def fee(d: Demand) -> int:\n    return (await agent.validator(d)).fee", "union-attr"),
     "private": ("@agent.on('/go')\nasync def go(job: Job, m: object) -> None:\n    job.close()", "attr-defined"),
     "missing_name": ("from mesh import Nothing", "attr-defined"),
 }

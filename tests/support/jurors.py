@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
 from mesh.network import Endpoints, Network
-from schemas import ReportKey, Signer, ValidatorKey
+from schemas import PresenceKey, ReportKey, Signer, ValidatorKey
 from schemas.verdicts import PolicyNote, ReportFinding, ValidatorAnnouncement, ValidatorReport
 
 if TYPE_CHECKING:
@@ -46,6 +46,8 @@ class Juror:
         self._session = (await self._stack.enter_async_context(Network(Endpoints(connect=(self.endpoint,))))).session
         lighthouse = self.lighthouse.lower()
         key = str(ValidatorKey(lighthouse, self.validator))
+        presence = str(PresenceKey(lighthouse, "validator", self.signer.address))
+        self._present: Any = self._session.liveliness().declare_token(presence)
         self._announcing: Any = self._session.declare_queryable(key, self._announce)
         self._reporting: Any = self._session.declare_queryable(f"aira/{lighthouse}/report/*", self._answer)
         return self

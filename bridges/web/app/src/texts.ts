@@ -191,7 +191,7 @@ export const texts = {
   reason: { "no-result": "The robot sent no recording.", "recording-unavailable": "Its recording, which says why, is not here yet." } as Record<string, string>,
   unchecked: "No description to check against",
   stepName: {
-    created: "Contract created", ready: "Robot ready", playing: "Playback began", result: "Result sent", gone: "Robot not present",
+    created: "Contract created", ready: "Robot ready", playing: "Playback began", result: "Result sent", judged: "Judged", gone: "Robot not present",
     back: "Robot back", paid: "Paid", refunded: "Money back", reverted: "Taken back by the chain",
   } as Record<string, string>,
   refundLater: (sum: string, block: number, time: string) => `If nothing comes, you can take ${sum} back from block ${block.toLocaleString("en")}, in about ${time}.`,
