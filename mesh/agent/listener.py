@@ -55,6 +55,8 @@ LEAST_BLOCKS: Final = 20
 """… or fewer than this."""
 SOON: Final = 3
 """Blocks that leave a Result unsettled before the chain is asked when it would be late."""
+JUDGED: Final = frozenset({"NotTheValidator", "RefusedByValidator"})
+"""How the contracts refuse a Result that only a validator can finalize."""
 NEVER: Final = 2**63
 
 
@@ -285,6 +287,9 @@ class LateResults:
             # The originals, a liability that has ended, or one whose validator must confirm the result.
             self._late_from[address] = NEVER
             log.debug("only a provider can finalize this: %s", error)
+            if isinstance(error, Reverted) and error.reason in JUDGED:
+                facts = log_event("verdict-late", code=error.reason)
+                log.warning("the validator has not judged the result, and the cost can be refunded soon", extra=facts)
         except ChainError as error:
             facts = log_event("late-result-waits", code=error.code)
             log.warning("no provider finalized the contract, and finalizing it failed: %s", error, extra=facts)

@@ -12,9 +12,10 @@ from mesh.agent.components import ChainHead
 from mesh.chain import DeploymentPlan
 from mesh.devchain.development import deploy_market
 from mesh.devchain.embedded import EmbeddedChain
-from tests.mesh.work.restarts import COST, made_by_a_provider_that_leaves, speaking
+from tests.mesh.work.restarts import COST, made_by_a_provider_that_leaves, speaking, words
+from tests.support.log_events import logged_facts
 from tests.support.market import Founded, Place, in_phase, offering
-from tests.support.waiting import until_found
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -74,3 +75,18 @@ async def test_a_robot_that_begins_after_a_newer_block_than_it_opened_at_waits_f
 
 async def _has_read(robot: Agent, place: Place) -> bool:
     return robot.parts.chain_head.head == await place.chains["person"].block_number()
+
+
+async def test_a_robot_whose_validator_is_silent_is_told_before_the_refund(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with place.agent("person") as person, speaking(offering(place.agent("robot")), []) as robot:
+        async with place.provider():
+            silent = place.address("provider")
+            contract = await person.demand(words(place), cost=COST, validator=silent, validator_fee=0)
+        await in_phase(robot, contract, Phase.COMPLETE)
+        await place.node.mine(1)
+        await until_found(lambda: _has_read(robot, place), what="the next block read")
+        refundable = await place.chains["person"].liabilities.refundable_from(contract.address)
+        await place.node.mine(refundable - await place.chains["person"].block_number() - 2)
+        await until(lambda: [one["code"] for one in logged_facts(caplog, "verdict-late")] == ["NotTheValidator"])
