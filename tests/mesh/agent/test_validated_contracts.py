@@ -245,59 +245,49 @@ def test_the_fee_of_several_jurors_is_what_the_quorum_asks() -> None:
 
 
 @asynccontextmanager
-async def jury_of_two(place: Place) -> AsyncIterator[tuple[Juror, Juror]]:
-    """Two jurors of a contract of generation 5, which must judge alike."""
+async def under_a_jury(place: Place) -> AsyncIterator[tuple[Juror, Juror, Agent, Agent, Contract]]:
+    """A contract of generation 5 between robot and person, whose two jurors must judge alike."""
     signers = [Signer(bytes([number]) * 32) for number in (21, 22)]
     jury = await place.chains["person"].validators.deploy([signer.address for signer in signers], 2)
-    like, asks = juror_of(place), {"validator": jury.address, "jurors": 2, "quorum": 2}
-    first, second = (
-        Juror(endpoint=like.endpoint, lighthouse=like.lighthouse, signer=signer, fee=fee, **asks)
-        for signer, fee in zip(signers, (100, 50), strict=True)
-    )
-    async with first, second:
-        yield first, second
+    first, second = (juror_of(place, validator=jury.address, fee=fee, jurors=2, quorum=2) for fee in (100, 50))
+    first.signer, second.signer = signers
+    robot = working(place.agent("robot", generation=5))
+    async with first, second, place.provider(), robot, place.agent("person", generation=5) as person:
+        contract = await person.demand(job(place), cost=5, validator=first.validator)
+        yield first, second, robot, person, contract
 
 
 async def test_jurors_that_disagree_are_shown_to_both(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reports, "SILENCE", 0.3)
     heard: list[Progress] = []
-    robot = working(place.agent("robot", generation=5))
-    async with jury_of_two(place) as (first, second), place.provider(), robot:
-        async with place.agent("person", generation=5) as person:
-            announced = await person.validator(first.validator)
-            assert (announced.jurors, announced.quorum, announced.fee, announced.has_quorum) == (2, 2, 100, True)
-            contract = await person.demand(job(place), cost=5, validator=first.validator)
-            assert contract.liability.validator_fee == 100
-            ending = asyncio.create_task(contract.outcome(on_progress=heard.append))
-            result = await signed_result(robot, contract)
-            first.judge(contract, result.result, success=True)
-            await until(lambda: [one.position for one in heard if one.kind == "unjudged"] == [1])
-            second.judge(contract, result.result, success=False)
-            await until(lambda: any(one.code == "disagree" for one in heard))
-            votes = [(one.kind, one.code, one.position, one.total) for one in heard if "judged" in one.kind]
-            assert votes == [
-                ("judged", "", 1, 2),
-                ("unjudged", "silent", 1, 2),
-                ("judged", MISSING.code, 1, 2),
-                ("unjudged", "disagree", 1, 2),
-            ]
-            assert {report.juror for report in await contract.reports()} == {
-                first.signer.address,
-                second.signer.address,
-            }
-            ending.cancel()
+    async with under_a_jury(place) as (first, second, robot, person, contract):
+        announced = await person.validator(first.validator)
+        assert (announced.jurors, announced.quorum, announced.fee, announced.has_quorum) == (2, 2, 100, True)
+        assert contract.liability.validator_fee == 100
+        ending = asyncio.create_task(contract.outcome(on_progress=heard.append))
+        result = await signed_result(robot, contract)
+        first.judge(contract, result.result, success=True)
+        await until(lambda: [one.position for one in heard if one.kind == "unjudged"][-1:] == [1])
+        second.judge(contract, result.result, success=False)
+        await until(lambda: any(one.code == "disagree" for one in heard))
+        votes = [(one.kind, one.code, one.position, one.total) for one in heard if "judged" in one.kind]
+        assert [vote for vote in votes if vote[2]] == [
+            ("judged", "", 1, 2),
+            ("unjudged", "silent", 1, 2),
+            ("judged", MISSING.code, 1, 2),
+            ("unjudged", "disagree", 1, 2),
+        ]
+        assert {one.juror for one in await contract.reports()} == {first.signer.address, second.signer.address}
+        ending.cancel()
 
 
 async def test_a_report_of_a_stranger_to_the_jury_does_not_count(place: Place) -> None:
-    robot = working(place.agent("robot", generation=5))
-    async with jury_of_two(place) as (first, _), place.provider(), robot:
-        async with place.agent("person", generation=5) as person:
-            contract = await person.demand(job(place), cost=5, validator=first.validator)
-            stranger = Juror(endpoint="", lighthouse=first.lighthouse, signer=STRANGER, validator=first.validator)
-            false = stranger.report(contract.liability, OBJECTIVE, success=False)
-            first.publish(false, person.address, robot.address)
-            await until(lambda: person.drops.totals().get("reports", 0) > 0)
-            assert await contract.reports() == ()
+    async with under_a_jury(place) as (first, _, robot, person, contract):
+        stranger = Juror(endpoint="", lighthouse=first.lighthouse, signer=STRANGER, validator=first.validator)
+        false = stranger.report(contract.liability, OBJECTIVE, success=False)
+        first.publish(false, person.address, robot.address)
+        await until(lambda: person.drops.totals().get("reports", 0) > 0)
+        assert await contract.reports() == ()
 
 
 async def test_a_validator_without_code_is_refused_before_anything_is_signed(place: Place) -> None:
