@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from mesh.agent import Agent, LiabilityReverted, OrderExpired, Progress
 from mesh.chain import Chain, Timing
+from mesh.chain.validators import Validators
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
 from schemas.signing import Rejection
@@ -62,11 +63,19 @@ async def test_a_rejection_is_information_and_the_order_stays_valid(
         assert (await place.chains["person"].liabilities.order_hashes(contract.address))[0].hex() == order.hash
 
 
-async def test_the_reason_of_the_contracts_is_reported(place: Place) -> None:
+async def test_the_reason_of_the_contracts_is_reported(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To agents that sign what the contracts refuse."""
+
+    async def unchecked(validators: Validators, order: object) -> None:
+        pass
+
+    monkeypatch.setattr(Validators, "check", unchecked)
     robot = working(place.agent("robot"))
     heard: list[Progress] = []
     async with place.provider(), robot, place.agent("person", generation=5) as person:
-        wanted = person.demand(OBJECTIVE, validator=place.address("provider"), on_progress=heard.append)
+        wanted = person.demand(
+            OBJECTIVE, validator=place.address("provider"), validator_fee=0, on_progress=heard.append
+        )
         demand = asyncio.create_task(wanted)
         await until(lambda: any(progress.kind == "rejected" for progress in heard))
         (rejected,) = (progress for progress in heard if progress.kind == "rejected")
