@@ -123,6 +123,7 @@ async def test_a_frozen_daemon_is_detected_and_used_again_afterwards(
         assert bridge.status().losses >= 1
 
 
+@pytest.mark.full
 async def test_messages_without_listeners_are_sent_once_there_is_one(
     own_daemon: JsIpfs | Kubo,
     swarm: Swarm,

@@ -54,6 +54,7 @@ def test_text_that_a_sketch_prints_between_frames_does_no_harm() -> None:
         assert client.dialect.counters.damaged > 0  # the text
 
 
+@pytest.mark.full
 def test_a_thousand_calls_are_done_once_each_over_a_line_that_damages_one_byte_in_a_hundred() -> None:
     with board(COUNTER) as uno, frames(uno) as client:
         uno.add_noise(0.01, seed=3)

@@ -48,6 +48,7 @@ def unplug_during_a_command(uno: SimulatedBoard, *, reset: bool = False) -> None
     uno.plug()
 
 
+@pytest.mark.full
 def test_a_command_is_read_although_the_cable_was_pulled_in_its_callback() -> None:
     # On a busy machine the board runs slower than its line: allow it more time to announce its topics.
     patient = RosserialDialect(baud=57_600, settle_time=3.0)

@@ -70,6 +70,7 @@ def test_what_the_page_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         page_server()
 
 
+@pytest.mark.full
 def test_the_page_goes_on_when_its_market_is_started_afresh(tmp_path: Path) -> None:
     endpoint, node, port = f"tcp/127.0.0.1:{free_port()}", free_port(), free_port()
     up = ("up", "--no-web", "--engine", "embedded", "--listen", endpoint, "--port", str(node), "--data-dir", tmp_path)

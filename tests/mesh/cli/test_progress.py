@@ -122,6 +122,7 @@ def large(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.full
 def test_a_bar_of_few_large_messages_shows_what_is_between(large: Path) -> None:
     terminal = Terminal("objective", "convert", large)
     assert terminal.end() == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import pytest
 from click.testing import CliRunner
 
 from mesh.chain import Node
@@ -24,6 +25,7 @@ def up(folder: Path, *options: str | Path, **variables: str) -> Serving:
     return Serving(*AIRA, "up", *arguments, says="provider    0x", variables=variables)
 
 
+@pytest.mark.full
 def test_anvil_on_the_path_is_used(tmp_path: Path, on_path: dict[str, str]) -> None:
     with up(tmp_path, **on_path) as server:
         assert columns(server.log())["engine"] == f"anvil ({tmp_path}/programs/anvil)"
@@ -33,6 +35,7 @@ def kept_withdrawals(folder: Path) -> int:
     return len(list(folder.rglob("withdrawals-*.sqlite")))
 
 
+@pytest.mark.full
 async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
     options = ("--anvil", require("anvil"), "--state", tmp_path / "chain.json")
     first_blocks = []

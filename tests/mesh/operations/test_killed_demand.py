@@ -190,6 +190,7 @@ async def test_run_again_in_a_terminal_it_asks(person: Person) -> None:
     os.close(terminal)
 
 
+@pytest.mark.full
 async def test_an_interrupted_demand_stays_open_until_it_is_withdrawn(person: Person) -> None:
     command = person.demand()
     await asyncio.to_thread(command.start)
