@@ -54,14 +54,27 @@ class MarketStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unk
     minted: UInt256
 
 
-class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
-    """The status of an agent or a provider (service `status`).
+class ValidationStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
+    """A validator's work: the addresses that it judges for, its policies, its liabilities by stage, its store.
 
-    Agents report `work`, providers `market`. One account may run several of them: then each one answers.
+    `fee` is the least fee for which it judges, in wn.
+    """
+
+    validators: tuple[str, ...]
+    policies: tuple[str, ...]
+    fee: UInt256
+    cases: Mapping[str, int]
+    store: StoreUse
+
+
+class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
+    """The status of an agent, a provider or a validator (service `status`).
+
+    Agents report `work`, providers `market`, validators `validation`. One account may run several of them: then each one answers.
     """
 
     role: str
-    """`agent` or `provider`."""
+    """`agent`, `provider` or `validator`."""
     address: str
     """The address of its account, EIP-55."""
     version: str
@@ -79,6 +92,7 @@ class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_f
     """Seconds since it started."""
     work: Work | None = None
     market: MarketStatus | None = None
+    validation: ValidationStatus | None = None
     model: str = ""
     """The model of an agent that has one, a CIDv0."""
     dropped: Mapping[str, int] = {}

@@ -1,0 +1,191 @@
+"""How a case is decided: its files are fetched, its recording is judged, and the juror reports what it found.
+
+Files and time are shared fairly: one promisor's cases can't keep those of others waiting, whatever they consist of.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Final, NamedTuple
+from weakref import WeakValueDictionary
+
+from mesh.amounts import XRT
+from mesh.chain import NoContracts, NotALiability, NotOffered
+from mesh.content import ContentCorrupt, ContentTooLarge, ContentUnavailable, StoreFull
+from mesh.flood import FairQueue
+from mesh.log_context import log_event
+from mesh.retry import Backoff, RetryPolicy
+from mesh.validator.judging import Case, Judgement, judge
+from schemas import Result, decode
+from schemas.verdicts import ReportFinding, ValidatorReport
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.validator.components import ValidatorComponents
+    from mesh.validator.ledger import StoredVerdict
+
+log = logging.getLogger(__name__)
+
+FETCHES: Final = 16
+"""Cases whose files are fetched at once."""
+FETCHES_OF_PROMISOR: Final = 4
+"""The same for one promisor: files that nobody serves must not delay the cases of others."""
+FETCH_SECONDS: Final = 600.0
+"""The most seconds of one attempt to fetch; the next attempt continues where it ended."""
+FETCH_AGAIN: Final = RetryPolicy(initial=1.0, ceiling=300.0)
+"""How long to wait before files that nobody serves are looked for again."""
+JUDGED_OF_PROMISOR: Final = 512
+"""Recordings of one promisor that wait to be judged."""
+CLOCK_TOLERANCE: Final = 60 * 10**9
+"""Nanoseconds by which the clocks of robot, chain and validator may differ."""
+
+
+class _Judging(NamedTuple):
+    """A recording that waits to be judged."""
+
+    case: Case
+    objective: Path
+    recording: Path
+    outcome: asyncio.Future[Judgement | None]
+
+
+class CaseJudge:
+    """Decides the cases of a validator, one recording at a time: `run`, and `decide` for each case."""
+
+    def __init__(self, parts: ValidatorComponents) -> None:
+        self._parts = parts
+        self._fetching = asyncio.Semaphore(FETCHES)
+        self._fetching_of: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
+        self._waiting: FairQueue[_Judging] = FairQueue(
+            per_sender=JUDGED_OF_PROMISOR, total=JUDGED_OF_PROMISOR * FETCHES
+        )
+        self.seconds = 0.0
+        """Seconds that judging took since the start."""
+
+    async def run(self) -> None:
+        """Judge one recording after another, one of each promisor before the second of any, until cancelled."""
+        while True:
+            work = await self._waiting.get()
+            if not work.outcome.done():
+                await self._judge(work)
+
+    def refusal(self, stored: StoredVerdict) -> ValidatorReport | None:
+        """The report on a liability that pays too little to be judged; None for one that pays enough."""
+        pays, asks = stored.liability.validator_fee, self._parts.terms.fee
+        if pays >= asks:
+            return None
+        detail = f"not judged: the liability pays {XRT.show(pays)}, and the validator asks for {XRT.show(asks)}"
+        finding = ReportFinding(policy="fee", code="fee-too-low", holds=False, detail=detail)
+        return self._report(stored, stored.liability.objective, claimed=False, judgement=Judgement(False, (finding,)))
+
+    async def decide(self, stored: StoredVerdict) -> ValidatorReport | None:
+        """Decide a case whose Result has arrived; its report, None if its files or the judgement never came."""
+        claim = decode(stored.result)
+        assert isinstance(claim, Result)
+        if not claim.success:
+            judgement = _failed("claim", "no-success-claimed", "the promisor itself claims no success")
+            return self._report(stored, claim.result, claimed=False, judgement=judgement)
+        try:
+            files = await self._fetch(stored, claim.result)
+        except ContentTooLarge as error:
+            judgement = _failed("files", error.code, "a file is larger than this validator takes")
+            return self._report(stored, claim.result, claimed=True, judgement=judgement)
+        found = None if files is None else await self._judged_in_turn(stored, claim, *files)
+        return None if found is None else self._report(stored, claim.result, claimed=True, judgement=found)
+
+    async def _judged_in_turn(
+        self, stored: StoredVerdict, claim: Result, objective: Path, recording: Path
+    ) -> Judgement | None:
+        address = stored.liability.address
+        owner = await self._parts.ledger.owner_of(claim.result, other_than=address)
+        case = Case(
+            liability=stored.liability,
+            claimed=claim.success,
+            message=stored.result,
+            since_ns=stored.since_ns - CLOCK_TOLERANCE,
+            until_ns=stored.seen_ns + CLOCK_TOLERANCE,
+            owner_of=lambda cid: owner if cid == claim.result else "",
+        )
+        outcome: asyncio.Future[Judgement | None] = asyncio.get_running_loop().create_future()
+        if self._waiting.put(stored.liability.promisor, _Judging(case, objective, recording, outcome)):
+            self._parts.drops.count("judgements", stored.liability.promisor)
+            return None
+        return await outcome
+
+    async def _judge(self, work: _Judging) -> None:
+        began, policies = time.monotonic(), self._parts.terms.policies
+        work_in_thread = partial(
+            judge, work.case, objective=work.objective, recording=work.recording, policies=policies
+        )
+        found = None
+        try:
+            found = await asyncio.to_thread(work_in_thread)
+        except Exception as error:
+            facts = log_event("judging-failed", liability=work.case.liability.address, error=type(error).__name__)
+            log.exception("judging failed; the liability is judged again after a restart", extra=facts)
+        self.seconds += time.monotonic() - began
+        if not work.outcome.done():
+            work.outcome.set_result(found)
+
+    async def _fetch(self, stored: StoredVerdict, recording: str) -> tuple[Path, Path] | None:
+        """The files of objective and recording; None if nobody served them until the liability can be refunded.
+
+        Raises `ContentTooLarge`.
+        """
+        liability, backoff = stored.liability, Backoff(FETCH_AGAIN)
+        until = await self._refundable_from(liability.address)
+        of_promisor = self._fetching_of.setdefault(liability.promisor, asyncio.Semaphore(FETCHES_OF_PROMISOR))
+        while True:
+            try:
+                async with of_promisor, self._fetching, asyncio.timeout(FETCH_SECONDS):
+                    return (
+                        await self._file(liability.objective, liability.address),
+                        await self._file(recording, liability.address),
+                    )
+            except (ContentUnavailable, ContentCorrupt, StoreFull, TimeoutError) as error:
+                if until is not None and self._parts.chain_head.head >= until:
+                    facts = log_event("files-missing", error=type(error).__name__)
+                    log.warning("not judged, it can be refunded now: %s", error, extra=facts)
+                    return None
+                level = logging.WARNING if not backoff.failures else logging.DEBUG
+                log.log(level, "looking for the files again: %s", error, extra=log_event("files-awaited"))
+            await backoff.wait()
+
+    async def _file(self, cid: str, label: str) -> Path:
+        """A file from the store or from others, pinned with the label."""
+        settings, store = self._parts.settings, self._parts.store
+        await asyncio.to_thread(store.pin, cid, label, sync=False)
+        limit, timeout = settings.objective_size_limit, settings.fetch_timeout
+        return await self._parts.exchange.fetch(cid, size_limit=limit, timeout=timeout, sync=False)
+
+    async def _refundable_from(self, address: str) -> int | None:
+        """The block from which anybody may refund the liability; None if the contracts don't say."""
+        chain = self._parts.chain
+        with suppress(NotOffered, NotALiability, NoContracts):
+            ask = partial(chain.liabilities.refundable_from, address)
+            return await chain.retrying(ask, outages=self._parts.outages)
+        return None
+
+    def _report(self, stored: StoredVerdict, result: str, *, claimed: bool, judgement: Judgement) -> ValidatorReport:
+        signer = self._parts.signer
+        return ValidatorReport(
+            liability=stored.liability.address,
+            objective=stored.liability.objective,
+            result=result,
+            validator=stored.liability.validator,
+            juror=signer.address,
+            claimed=claimed,
+            success=claimed and judgement.success,
+            findings=judgement.findings,
+            judged_at=int(time.time()),
+        ).signed_by(signer)
+
+
+def _failed(policy: str, code: str, detail: str) -> Judgement:
+    """A judgement without a look into the recording."""
+    return Judgement(False, (ReportFinding(policy=policy, code=code, holds=False, detail=detail),))

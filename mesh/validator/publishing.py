@@ -1,0 +1,139 @@
+"""What a validator answers on its market: how it judges, and how it judged."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import zenoh
+
+from mesh.background import call_in_loop
+from mesh.errors import ChainError
+from mesh.flood import Rate, RateLimiter
+from mesh.log_context import log_event
+from schemas import ReportKey, parse_address
+from schemas.errors import InvalidAddress
+from schemas.keys import ValidatorKey
+from schemas.selectors import LIABILITY, market_selector
+from schemas.verdicts import ValidatorAnnouncement
+
+if TYPE_CHECKING:
+    from mesh.validator.components import ValidatorComponents
+
+log = logging.getLogger(__name__)
+
+REFRESH: Final = 60.0
+"""Seconds after which the jurors of the contract are read again."""
+ANSWERS: Final = Rate(per_second=100.0, burst=1000)
+"""Answers to queries. Zenoh does not say who asks, so that all share this."""
+PENDING: Final = 64
+"""Queries for reports that may be pending; further ones are dropped."""
+
+
+class Announcements:
+    """Answers queries of `ValidatorKey` with a signed announcement for each of the addresses that it judges for."""
+
+    def __init__(self, parts: ValidatorComponents) -> None:
+        self._parts = parts
+        self._rate = RateLimiter(per_sender=ANSWERS)
+        self._encoded: dict[str, bytes] = {}
+        """By the key's text."""
+        self._queryables: list[Any] = []
+
+    async def __aenter__(self) -> Self:
+        self._sign(self._parts.bench.quorum, self._parts.bench.jurors)
+        session = self._parts.network.session
+        for key in self._encoded:
+            self._queryables.append(session.declare_queryable(key, partial(self._answer, key), complete=True))
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        if not self._parts.network.session.is_closed():
+            for queryable in self._queryables:
+                queryable.undeclare()
+
+    async def run(self) -> None:
+        """Follow the contract's jurors, until cancelled."""
+        contract = self._parts.bench.contract
+        while True:
+            await asyncio.sleep(REFRESH)
+            with suppress(ChainError):  # asked again soon
+                jury = await self._parts.chain.validators.jury(contract) if contract else None
+                if jury is not None:
+                    self._sign(jury.quorum, len(jury.jurors))
+                if contract and not await self._parts.chain.validators.accepts(contract, self._parts.signer.address):
+                    facts = log_event("juror-dismissed", contract=contract)
+                    log.error("the contract %s does not accept this account any more", contract, extra=facts)
+
+    def _sign(self, quorum: int, jurors: int) -> None:
+        bench, terms, signer = self._parts.bench, self._parts.terms, self._parts.signer
+        for validator in bench.validators:
+            is_contract = validator == bench.contract
+            announcement = ValidatorAnnouncement(
+                validator=validator,
+                juror=signer.address,
+                title=terms.title,
+                policies=tuple(policy.note for policy in terms.policies),
+                fee=terms.fee,
+                quorum=quorum if is_contract else 1,
+                jurors=jurors if is_contract else 1,
+                made_at=int(time.time()),
+            )
+            key = str(ValidatorKey(self._parts.channel.lighthouse, validator))
+            self._encoded[key] = announcement.signed_by(signer).encode()
+
+    def _answer(self, key: str, query: zenoh.Query) -> None:
+        """Answer on Zenoh's thread: the announcement is ready."""
+        with query:
+            if self._rate.allow(""):
+                query.reply(key, self._encoded[key], encoding="application/json")
+            else:
+                self._parts.drops.count("recall")
+
+
+class ReportService:
+    """Answers queries of `ReportKey` for a liability (`?liability=ADDRESS`) with the report in the ledger."""
+
+    def __init__(self, parts: ValidatorComponents) -> None:
+        self._parts = parts
+        self._rate = RateLimiter(per_sender=ANSWERS)
+        self._answers: set[asyncio.Task[None]] = set()
+
+    async def __aenter__(self) -> Self:
+        loop, session = asyncio.get_running_loop(), self._parts.network.session
+        selector = market_selector(self._parts.channel.lighthouse, "report", "*")
+        self._queryable: Any = session.declare_queryable(
+            selector, lambda query: call_in_loop(loop, self._received, query), complete=True
+        )
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        if not self._parts.network.session.is_closed():
+            self._queryable.undeclare()
+        for answer in self._answers:
+            answer.cancel()
+
+    def _received(self, query: zenoh.Query) -> None:
+        if len(self._answers) >= PENDING or not self._rate.allow(""):
+            self._parts.drops.count("recall")
+            query.drop()  # type: ignore[no-untyped-call]
+            return
+        answer = asyncio.get_running_loop().create_task(self._answer(query), name="report")
+        self._answers.add(answer)
+        answer.add_done_callback(self._answers.discard)
+
+    async def _answer(self, query: zenoh.Query) -> None:
+        with query:  # leaving it ends the answer
+            with suppress(InvalidAddress):
+                liability = parse_address(query.parameters.get(LIABILITY) or "")
+                stored = await self._parts.ledger.verdict(liability)
+                if stored is None or not stored.report:
+                    return
+                for party in {stored.liability.promisee, stored.liability.promisor}:
+                    key = str(ReportKey(self._parts.channel.lighthouse, party))
+                    if query.key_expr.intersects(zenoh.KeyExpr(key)):
+                        query.reply(key, stored.report, encoding="application/json")
