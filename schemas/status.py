@@ -70,7 +70,8 @@ class ValidationStatus(Record, frozen=True, kw_only=True, rename="camel", forbid
 class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
     """The status of an agent, a provider or a validator (service `status`).
 
-    Agents report `work`, providers `market`, validators `validation`. One account may run several of them: then each one answers.
+    Agents report `work`, providers `market`, validators `validation`. One account may run several of them: then each
+    one answers.
     """
 
     role: str

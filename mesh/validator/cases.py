@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from mesh.chain import NodeUnreachable, NoContracts, NotALiability, RequestRefused, Reverted
+from mesh.chain import NoContracts, NodeUnreachable, NotALiability, RequestRefused, Reverted
 from mesh.content import StoreFull
 from mesh.errors import ChainError
 from mesh.flood import Rate, RateLimiter
@@ -76,8 +76,6 @@ class Cases:
         self._open: dict[str, OpenCase] = {}
         self._of_promisor: Counter[str] = Counter()
         self._rate = RateLimiter(per_sender=RESEND_RATE)
-        self.verdicts: Counter[str] = Counter()
-        """What was decided since the start: `success`, `no-success`, `refused`."""
 
     async def open(self, liability: Liability, *, since_ns: int) -> None:
         """A liability names this validator: begin, or continue with what the ledger has of it."""
@@ -161,17 +159,18 @@ class Cases:
         ledger, address = self._parts.ledger, case.stored.liability.address
         if (refusal := self._judge.refusal(case.stored)) is not None:
             await ledger.refuse(address, report=refusal.encode())
-            self.verdicts["refused"] += 1
+            self._judge.verdicts["refused"] += 1
             facts = log_event("case-refused", fee=case.stored.liability.validator_fee)
             log.warning("%s", refusal.findings[0].detail, extra=facts)
         else:
             while not case.stored.result:
                 await case.wait()
-            if (report := await self._judge.decide(case.stored)) is None:
+            if (decision := await self._judge.decide(case.stored)) is None:
                 return False
+            report = decision.report
             signed = Result(liability=address, result=report.result, success=report.success)
-            await ledger.sign(signed, report=report.encode())
-            self.verdicts["success" if report.success else "no-success"] += 1
+            await ledger.sign(signed, report=report.encode(), marks=decision.marks)
+            self._judge.verdicts["success" if report.success else "no-success"] += 1
             codes = ",".join(finding.code for finding in report.failures)
             facts = log_event("verdict-signed", success=report.success, result=report.result, findings=codes)
             log.info("judged: %s", "success" if report.success else f"no success ({codes})", extra=facts)
@@ -209,5 +208,3 @@ class Cases:
             log.info("finalized, gas %d", settled.gas_used, extra=facts)
             return True
         return False
-
-

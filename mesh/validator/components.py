@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mesh.flood import Drops
     from mesh.network import Channel, Network
     from mesh.settings import Settings
-    from mesh.validator.policies import Policy
+    from mesh.validator.policy import Policy
     from schemas import Signer
 
 log = logging.getLogger(__name__)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import Counter
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -16,11 +17,15 @@ from weakref import WeakValueDictionary
 from mesh.amounts import XRT
 from mesh.chain import NoContracts, NotALiability, NotOffered
 from mesh.content import ContentCorrupt, ContentTooLarge, ContentUnavailable, StoreFull
-from mesh.flood import FairQueue
+from mesh.flood import BoundedDict, FairQueue
 from mesh.log_context import log_event
+from mesh.recording import Limits
 from mesh.retry import Backoff, RetryPolicy
 from mesh.validator.judging import Case, Judgement, judge
+from mesh.validator.policies import COMPLETE
+from mesh.work.models import Models
 from schemas import Result, decode
+from schemas.model import InvalidDescription
 from schemas.verdicts import ReportFinding, ValidatorReport
 
 if TYPE_CHECKING:
@@ -28,6 +33,7 @@ if TYPE_CHECKING:
 
     from mesh.validator.components import ValidatorComponents
     from mesh.validator.ledger import StoredVerdict
+    from schemas.model import ModelDescription
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +49,13 @@ JUDGED_OF_PROMISOR: Final = 512
 """Recordings of one promisor that wait to be judged."""
 CLOCK_TOLERANCE: Final = 60 * 10**9
 """Nanoseconds by which the clocks of robot, chain and validator may differ."""
+
+
+class Decision(NamedTuple):
+    """The report on a case, and the marks that identify its recording if it is a success."""
+
+    report: ValidatorReport
+    marks: tuple[str, ...] = ()
 
 
 class _Judging(NamedTuple):
@@ -64,6 +77,11 @@ class CaseJudge:
         self._waiting: FairQueue[_Judging] = FairQueue(
             per_sender=JUDGED_OF_PROMISOR, total=JUDGED_OF_PROMISOR * FETCHES
         )
+        self._succeeded: BoundedDict[str, str] = BoundedDict(JUDGED_OF_PROMISOR * FETCHES)
+        """The liabilities of successes by the marks of their recordings, before the ledger has them."""
+        self._models = Models(parts.store, parts.exchange)
+        self.verdicts: Counter[str] = Counter()
+        """What was decided since the start: `success`, `no-success`, `refused`."""
         self.seconds = 0.0
         """Seconds that judging took since the start."""
 
@@ -81,54 +99,79 @@ class CaseJudge:
             return None
         detail = f"not judged: the liability pays {XRT.show(pays)}, and the validator asks for {XRT.show(asks)}"
         finding = ReportFinding(policy="fee", code="fee-too-low", holds=False, detail=detail)
-        return self._report(stored, stored.liability.objective, claimed=False, judgement=Judgement(False, (finding,)))
+        return self._report(
+            stored, stored.liability.objective, claimed=False, judgement=Judgement(success=False, findings=(finding,))
+        )
 
-    async def decide(self, stored: StoredVerdict) -> ValidatorReport | None:
-        """Decide a case whose Result has arrived; its report, None if its files or the judgement never came."""
+    async def decide(self, stored: StoredVerdict) -> Decision | None:
+        """Decide a case whose Result has arrived; None if its files or the judgement never came."""
         claim = decode(stored.result)
         assert isinstance(claim, Result)
         if not claim.success:
-            judgement = _failed("claim", "no-success-claimed", "the promisor itself claims no success")
-            return self._report(stored, claim.result, claimed=False, judgement=judgement)
+            judgement = _failed("claimed", "the promisor does not claim success")
+            return Decision(self._report(stored, claim.result, claimed=False, judgement=judgement))
         try:
             files = await self._fetch(stored, claim.result)
         except ContentTooLarge as error:
-            judgement = _failed("files", error.code, "a file is larger than this validator takes")
-            return self._report(stored, claim.result, claimed=True, judgement=judgement)
+            judgement = _failed(error.code, "a file is larger than this validator takes")
+            return Decision(self._report(stored, claim.result, claimed=True, judgement=judgement))
         found = None if files is None else await self._judged_in_turn(stored, claim, *files)
-        return None if found is None else self._report(stored, claim.result, claimed=True, judgement=found)
+        if found is None:
+            return None
+        report = self._report(stored, claim.result, claimed=True, judgement=found)
+        return Decision(report, found.marks if report.success else ())
 
     async def _judged_in_turn(
         self, stored: StoredVerdict, claim: Result, objective: Path, recording: Path
     ) -> Judgement | None:
-        address = stored.liability.address
-        owner = await self._parts.ledger.owner_of(claim.result, other_than=address)
+        loop, address = asyncio.get_running_loop(), stored.liability.address
         case = Case(
             liability=stored.liability,
             claimed=claim.success,
             message=stored.result,
             since_ns=stored.since_ns - CLOCK_TOLERANCE,
             until_ns=stored.seen_ns + CLOCK_TOLERANCE,
-            owner_of=lambda cid: owner if cid == claim.result else "",
+            owner_of=lambda mark: asyncio.run_coroutine_threadsafe(self._owner_of(mark, address), loop).result(),
+            model=await self._model(stored.liability.model),
+            objective_cid=stored.liability.objective,
+            recording_cid=claim.result,
         )
-        outcome: asyncio.Future[Judgement | None] = asyncio.get_running_loop().create_future()
+        outcome: asyncio.Future[Judgement | None] = loop.create_future()
         if self._waiting.put(stored.liability.promisor, _Judging(case, objective, recording, outcome)):
             self._parts.drops.count("judgements", stored.liability.promisor)
             return None
         return await outcome
 
+    async def _owner_of(self, mark: str, liability: str) -> str:
+        """Another liability that a recording with this mark succeeded for; its verdict may not be signed yet."""
+        owner = self._succeeded.get(mark, liability)
+        return await self._parts.ledger.owner_of(mark, other_than=liability) if owner == liability else owner
+
+    async def _model(self, cid: str) -> ModelDescription | None:
+        with suppress(InvalidDescription):
+            return await self._models.find(cid)
+        return None
+
     async def _judge(self, work: _Judging) -> None:
-        began, policies = time.monotonic(), self._parts.terms.policies
-        work_in_thread = partial(
-            judge, work.case, objective=work.objective, recording=work.recording, policies=policies
+        settings, began, found = self._parts.settings, time.monotonic(), None
+        judge_in_thread = partial(
+            judge,
+            work.case,
+            objective=work.objective,
+            recording=work.recording,
+            policies=self._parts.terms.policies,
+            limits=Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit),
         )
-        found = None
+        address = work.case.liability.address
         try:
-            found = await asyncio.to_thread(work_in_thread)
+            found = await asyncio.to_thread(judge_in_thread)
         except Exception as error:
-            facts = log_event("judging-failed", liability=work.case.liability.address, error=type(error).__name__)
+            facts = log_event("judging-failed", liability=address, error=type(error).__name__)
             log.exception("judging failed; the liability is judged again after a restart", extra=facts)
         self.seconds += time.monotonic() - began
+        if found is not None and found.success:
+            for mark in found.marks:
+                self._succeeded[mark] = address
         if not work.outcome.done():
             work.outcome.set_result(found)
 
@@ -186,6 +229,7 @@ class CaseJudge:
         ).signed_by(signer)
 
 
-def _failed(policy: str, code: str, detail: str) -> Judgement:
+def _failed(code: str, detail: str) -> Judgement:
     """A judgement without a look into the recording."""
-    return Judgement(False, (ReportFinding(policy=policy, code=code, holds=False, detail=detail),))
+    finding = ReportFinding(policy=COMPLETE.name, code=code, holds=False, detail=detail)
+    return Judgement(success=False, findings=(finding,))

@@ -15,6 +15,7 @@ from mesh.work.database import Database
 from schemas import Liability, Result, decode, encode
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from schemas import Signer
@@ -27,7 +28,6 @@ CREATE TABLE IF NOT EXISTS verdicts (
     record BLOB NOT NULL,
     since INTEGER NOT NULL,
     result BLOB NOT NULL DEFAULT x'',
-    recording TEXT NOT NULL DEFAULT '',
     seen INTEGER NOT NULL DEFAULT 0,
     signed BLOB NOT NULL DEFAULT x'',
     report BLOB NOT NULL DEFAULT x'',
@@ -35,7 +35,7 @@ CREATE TABLE IF NOT EXISTS verdicts (
     aside INTEGER NOT NULL DEFAULT 0,
     changed REAL NOT NULL
 );
-CREATE INDEX IF NOT EXISTS recordings ON verdicts (recording);
+CREATE TABLE IF NOT EXISTS marks (mark TEXT NOT NULL, liability TEXT NOT NULL, PRIMARY KEY (mark, liability));
 CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL, history BLOB NOT NULL DEFAULT x'');
 """
 COLUMNS: Final = "record, since, result, seen, signed, report, ended"
@@ -101,21 +101,26 @@ class VerdictLedger:
     async def take(self, liability: str, result: Result, *, seen_ns: int) -> bool:
         """Keep the Result that the promisor has signed. False if there is one already: the first one counts."""
         return await self._database.run(
-            "UPDATE verdicts SET result = ?, recording = ?, seen = ?, changed = ? WHERE liability = ? AND result = x''",
-            (encode(result), result.result, seen_ns, time.time(), liability),
+            "UPDATE verdicts SET result = ?, seen = ?, changed = ? WHERE liability = ? AND result = x''",
+            (encode(result), seen_ns, time.time(), liability),
         )
 
-    async def sign(self, result: Result, *, report: bytes) -> StoredVerdict:
+    async def sign(self, result: Result, *, report: bytes, marks: Iterable[str] = ()) -> StoredVerdict:
         """Sign the Result as the juror judged it, and keep it with its encoded report; what is stored then.
 
-        If the juror has signed one for the liability already, that one stays, whatever `result` says.
+        If the juror has signed one for the liability already, that one stays, whatever `result` says. `marks` identify
+        the recording of a success; see `owner_of`.
         """
-        signed = encode(self._signer.sign(result))
-        await self._database.run(
-            "UPDATE verdicts SET signed = ?, report = ?, changed = ? WHERE liability = ? AND signed = x''",
-            (signed, report, time.time(), result.liability),
+        signed, address = encode(self._signer.sign(result)), result.liability
+        is_new = "WHERE EXISTS (SELECT 1 FROM verdicts WHERE liability = ? AND signed = x'')"
+        await self._database.run_together(
+            *((f"INSERT OR IGNORE INTO marks SELECT ?, ? {is_new}", (mark, address, address)) for mark in marks),
+            (
+                "UPDATE verdicts SET signed = ?, report = ?, changed = ? WHERE liability = ? AND signed = x''",
+                (signed, report, time.time(), address),
+            ),
         )
-        found = await self.verdict(result.liability)
+        found = await self.verdict(address)
         assert found is not None, "the liability was opened"
         return found
 
@@ -145,13 +150,10 @@ class VerdictLedger:
         statement = f"SELECT {COLUMNS} FROM verdicts WHERE NOT ended AND NOT aside ORDER BY rowid"
         return [_stored(row) for row in await self._database.rows(statement)]
 
-    async def owner_of(self, recording: str, *, other_than: str) -> str:
-        """The first liability for which this recording (CID) was judged, `other_than` one; empty if there is none."""
-        statement = (
-            "SELECT liability FROM verdicts WHERE recording = ? AND liability != ? AND signed != x''"
-            " ORDER BY rowid LIMIT 1"
-        )
-        rows = await self._database.rows(statement, (recording, other_than))
+    async def owner_of(self, mark: str, *, other_than: str) -> str:
+        """The first liability that a recording with this mark succeeded for, `other_than` one; empty without one."""
+        statement = "SELECT liability FROM marks WHERE mark = ? AND liability != ? ORDER BY rowid LIMIT 1"
+        rows = await self._database.rows(statement, (mark, other_than))
         return str(rows[0][0]) if rows else ""
 
     async def stages(self) -> dict[str, int]:

@@ -127,13 +127,11 @@ class ReportService:
         answer.add_done_callback(self._answers.discard)
 
     async def _answer(self, query: zenoh.Query) -> None:
-        with query:  # leaving it ends the answer
-            with suppress(InvalidAddress):
-                liability = parse_address(query.parameters.get(LIABILITY) or "")
-                stored = await self._parts.ledger.verdict(liability)
-                if stored is None or not stored.report:
-                    return
-                for party in {stored.liability.promisee, stored.liability.promisor}:
-                    key = str(ReportKey(self._parts.channel.lighthouse, party))
-                    if query.key_expr.intersects(zenoh.KeyExpr(key)):
-                        query.reply(key, stored.report, encoding="application/json")
+        with query, suppress(InvalidAddress):  # leaving it ends the answer
+            stored = await self._parts.ledger.verdict(parse_address(query.parameters.get(LIABILITY) or ""))
+            if stored is None or not stored.report:
+                return
+            for party in {stored.liability.promisee, stored.liability.promisor}:
+                key = str(ReportKey(self._parts.channel.lighthouse, party))
+                if query.key_expr.intersects(zenoh.KeyExpr(key)):
+                    query.reply(key, stored.report, encoding="application/json")

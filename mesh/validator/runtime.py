@@ -180,9 +180,7 @@ class ValidatorRuntime(Role):
         return [liability for liability, _ in await self.parts.chain.retrying(read, outages=self.parts.outages)]
 
     def _is_named(self, liability: Liability) -> bool:
-        return (
-            liability.validator in self.parts.bench.validators and liability.lighthouse == self.parts.channel.address
-        )
+        return liability.validator in self.parts.bench.validators and liability.lighthouse == self.parts.channel.address
 
     async def _time_of(self, block: int) -> int:
         """When a block was made, in nanoseconds of this machine's clock; never in the future."""

@@ -64,7 +64,7 @@ class ValidatorStatus:
         """The metrics now."""
         parts, runtime = self._parts, self._runtime
         usage = await asyncio.to_thread(parts.store.usage)
-        verdicts = {"success": 0.0, "no-success": 0.0, "refused": 0.0} | dict(runtime.verdicts)
+        verdicts = {"success": 0.0, "no-success": 0.0, "refused": 0.0} | dict(runtime.judge.verdicts)
         stages = {stage: float(count) for stage, count in (await parts.ledger.stages()).items()}
         families = (
             *message_families([runtime.results]),

@@ -30,10 +30,10 @@ def result_of(name: str = "one", *, success: bool = True, recording: str = RECOR
     return ROBOT.sign(Result(liability=liability(name).address, result=recording, success=success))
 
 
-async def judged(ledger: VerdictLedger, name: str = "one", *, success: bool = True) -> None:
+async def judged(ledger: VerdictLedger, name: str = "one", *, marks: tuple[str, ...] = ()) -> None:
     await ledger.open(liability(name), since_ns=1)
     await ledger.take(liability(name).address, result_of(name), seen_ns=2)
-    await ledger.sign(result_of(name, success=success), report=b"{}")
+    await ledger.sign(result_of(name), report=b"{}", marks=marks)
 
 
 async def test_the_first_result_of_the_promisor_counts(ledger: VerdictLedger) -> None:
@@ -83,13 +83,15 @@ async def test_a_reverted_liability_is_set_aside_with_what_was_signed(ledger: Ve
     assert (back.since_ns, signed_result(back).success) == (1, True)
 
 
-async def test_it_knows_for_which_liability_a_recording_was_judged_before(ledger: VerdictLedger) -> None:
+async def test_it_knows_for_which_liability_a_recording_succeeded(ledger: VerdictLedger) -> None:
+    one, two = liability("one").address, liability("two").address
     await ledger.open(liability("two"), since_ns=1)
-    await ledger.take(liability("two").address, result_of("two"), seen_ns=2)
-    assert await ledger.owner_of(RECORDING, other_than=liability("two").address) == ""
-    await judged(ledger)
-    assert await ledger.owner_of(RECORDING, other_than=liability("two").address) == liability("one").address
-    assert await ledger.owner_of(RECORDING, other_than=liability("one").address) == ""
+    assert await ledger.owner_of(RECORDING, other_than=two) == ""
+    await judged(ledger, "one", marks=(RECORDING, "hash"))
+    assert await ledger.owner_of("hash", other_than=two) == one
+    assert await ledger.owner_of(RECORDING, other_than=one) == ""
+    await ledger.sign(result_of("one"), report=b"{}", marks=("late",))  # the verdict stands already
+    assert await ledger.owner_of("late", other_than=two) == ""
 
 
 async def test_stages(ledger: VerdictLedger) -> None:
