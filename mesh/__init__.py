@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from mesh.ros import RosTypes, UnknownRosType
     from mesh.running import fail, run_to_end, run_until_stopped
     from mesh.settings import Settings
+    from mesh.validator.evidence import Evidence
+    from mesh.validator.validator import Validator
     from mesh.work.ledger import WrongPhase
     from mesh.work.objectives import ObjectiveUnfit
     from schemas import (
@@ -90,6 +92,8 @@ _NAMES: Final = {
     "mesh.ros": "RosTypes UnknownRosType",
     "mesh.running": "fail run_to_end run_until_stopped",
     "mesh.settings": "Settings",
+    "mesh.validator.evidence": "Evidence",
+    "mesh.validator.validator": "Validator",
     "mesh.work.job": "Job JobFailed",
     "mesh.work.ledger": "Phase WrongPhase",
     "mesh.work.objectives": "ObjectiveUnfit",
@@ -137,6 +141,7 @@ __all__ = [
     "Declined",
     "Demand",
     "Empty",
+    "Evidence",
     "InputError",
     "InsufficientTokens",
     "InvalidDescription",
@@ -177,6 +182,7 @@ __all__ = [
     "String",
     "Unanswered",
     "UnknownRosType",
+    "Validator",
     "ValidatorAnnouncement",
     "ValidatorReport",
     "ValidatorSilent",

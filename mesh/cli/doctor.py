@@ -63,6 +63,7 @@ MARK: Final = 6
     "keyfile",
     "keyfile_password_file",
     *options_of(ChainSettings),
+    "validator_contract",
     "content_limit",
     "ipfs_http_provider",
     "ipfs_authorization_file",

@@ -11,6 +11,7 @@ from mesh.cli.options import FILE, with_json, with_settings
 from mesh.cli.output import format_size, plural, print_facts, print_json, print_table, printable
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from mesh.settings import Settings
@@ -124,14 +125,15 @@ def _print_inventory(found: Inventory) -> None:
                 account.address,
                 chain.chain,
                 "-" if chain.block is None else chain.block,
-                ", ".join(f"{count} {phase}" for phase, count in chain.jobs.items()) or "none",
+                _counted(chain.jobs),
+                _counted(chain.verdicts),
                 chain.waiting,
                 chain.recordings,
             )
             for chain in account.chains
         ]
     if rows:
-        print_table(("ACCOUNT", "CHAIN", "BLOCK", "JOBS", "TO SEND", "RECORDING"), rows)
+        print_table(("ACCOUNT", "CHAIN", "BLOCK", "JOBS", "VERDICTS", "TO SEND", "RECORDING"), rows)
     print_facts(
         {
             account.address: f"{plural(account.files, 'file')}, {format_size(account.bytes)}"
@@ -140,6 +142,10 @@ def _print_inventory(found: Inventory) -> None:
         }
     )
     print_facts({"pending transactions": found.transactions})
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
 
 
 def _print_archive(found: ArchiveContents) -> None:

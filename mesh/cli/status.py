@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from mesh.settings import Settings
     from mesh.watching import PresentPeer, RoleStatus
-    from schemas.status import ContentMetrics, DirectionStatus, MarketStatus, Work
+    from schemas.status import ContentMetrics, DirectionStatus, MarketStatus, StoreUse, ValidationStatus, Work
 
 
 @click.command("status")
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract")
 async def status(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
-    """Show the status of the agent, provider or bridge with ADDRESS: the health of its parts, the last block read, and
-    its jobs or its market.
+    """Show the status of the agent, provider, validator or bridge with ADDRESS: the health of its parts, the last block
+    read, and its jobs, its market or its cases.
 
     Without ADDRESS, show one line for each peer on the lighthouse's channel; with --json one object for all.
     """
@@ -192,6 +192,9 @@ def summarize_status(how: RoleStatus | None) -> str:
             words.append(plural(_open_jobs(how.work), "open job"))
         if how.market is not None:
             words += [plural(how.market.open_orders, "open order"), plural(how.market.created, "contract")]
+        if how.validation is not None:
+            cases = how.validation.cases
+            words.append(plural(sum(cases.values()) - cases.get("ended", 0), "open case"))
     return printable(", ".join(words))
 
 
@@ -204,6 +207,7 @@ def _describe_participant(how: Status) -> dict[str, str]:
     }
     facts |= {} if how.work is None else _describe_work(how.work)
     facts |= {} if how.market is None else _describe_market(how.market)
+    facts |= {} if how.validation is None else _describe_validation(how.validation)
     return facts | {
         "uptime": format_duration(int(how.uptime) * 10**9),
         "version": how.version,
@@ -213,13 +217,29 @@ def _describe_participant(how: Status) -> dict[str, str]:
 
 def _describe_work(work: Work) -> dict[str, str]:
     open_jobs = ", ".join(f"{work.jobs[phase]:,} {phase}" for phase in PHASES if work.jobs.get(phase))
-    store, quota = work.store, work.store.quota
-    room = "" if quota is None else f" of {format_size(quota)}"
     return {
         "open jobs": open_jobs or "none",
         "done": f"{work.jobs.get('finalized', 0):,}",
         "to send": plural(work.outbox, "message"),
-        "store": f"{plural(store.files, 'file')}, {format_size(store.bytes)}{room}",
+        "store": _describe_store(work.store),
+    }
+
+
+def _describe_store(store: StoreUse) -> str:
+    room = "" if store.quota is None else f" of {format_size(store.quota)}"
+    return f"{plural(store.files, 'file')}, {format_size(store.bytes)}{room}"
+
+
+def _describe_validation(validation: ValidationStatus) -> dict[str, str]:
+    cases = dict(validation.cases)
+    ended = cases.pop("ended", 0)
+    return {
+        "judges for": ", ".join(validation.validators),
+        "policies": ", ".join(validation.policies),
+        "fee": XRT.show(validation.fee),
+        "open cases": ", ".join(f"{count:,} {stage}" for stage, count in cases.items() if count) or "none",
+        "done": f"{ended:,}",
+        "store": _describe_store(validation.store),
     }
 
 

@@ -80,6 +80,8 @@ class AccountChecks:
                 code="no-gas",
                 hint="send it ETH if it should approve fees or cancel jobs; working and being paid needs none",
             )
+        if self._context.role == "validator" and self._context.settings.validator_contract:
+            return passed(f"{shown}: judging for a contract needs none")
         return failed(
             f"{shown}: not enough gas for a transaction",
             code="no-gas",
@@ -142,6 +144,16 @@ class AccountChecks:
         active = active if state.keep_alive_block else "not active yet"
         may = "may send now" if await chain.lighthouses.is_turn(state.address, self.address) else "waits for its turn"
         return passed(f"{state.current} ({place}), {active}; this account {may}", code="other-turn")
+
+    async def check_validator(self) -> CheckResult:
+        """Whether the account may judge for the contract of the settings. Raises `NotAValidator`, `NotAJuror`."""
+        from mesh.validator.components import bench_of
+
+        contract = self._context.settings.validator_contract
+        if not contract:
+            return passed(f"{self.address} judges for itself (generation 3)", code="own-account")
+        bench = await bench_of(self._chain_checks.chain, self.address, contract)
+        return passed(f"{self.address} is a juror of {bench.contract}: {bench.quorum} of {bench.jurors} must agree")
 
     async def _coin(self) -> Currency:
         token = await self._chain_checks.chain.tokens.info(self._context.settings.erc20_token)

@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from mesh.doctor.certificate import CertificateInfo
     from mesh.settings import Settings
 
-Role: TypeAlias = Literal["agent", "provider", "person", "edge", "bridge", "router", "operator"]
-Area: TypeAlias = Literal["network", "roster", "chain", "account", "spending", "stake", "disk"]
+Role: TypeAlias = Literal["agent", "provider", "validator", "person", "edge", "bridge", "router", "operator"]
+Area: TypeAlias = Literal["network", "roster", "chain", "account", "spending", "stake", "judging", "disk"]
 
 AREAS: Final[Mapping[Role, frozenset[Area]]] = {
     "agent": frozenset({"network", "chain", "account", "disk"}),
     "provider": frozenset({"network", "chain", "account", "stake", "disk"}),
+    "validator": frozenset({"network", "chain", "account", "judging", "disk"}),
     "person": frozenset({"network", "chain", "account", "spending", "disk"}),
     "edge": frozenset({"network"}),
     "bridge": frozenset({"network", "chain", "disk"}),

@@ -180,6 +180,8 @@ def _account_checks(context: DoctorContext, chain_checks: ChainChecks, chain: Ch
     ]
     if "spending" in context.areas:
         money.append(Check("allowance", account.check_allowance, needs=_all_of(keyfile, contracts)))
+    if "judging" in context.areas:
+        money.append(Check("validator", account.check_validator, needs=_all_of(keyfile, contracts)))
     if "stake" in context.areas:
         stake = Check("stake", account.check_stake, needs=_all_of(keyfile, contracts))
         money += [stake, Check("turn", account.check_turn, needs=_all_of(stake))]

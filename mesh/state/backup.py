@@ -27,6 +27,7 @@ from mesh.state.layout import (
     LEDGER,
     RECORDINGS,
     STAGES,
+    VERDICTS,
     NoState,
     StateChanging,
     account_folders,
@@ -120,6 +121,10 @@ class _BackupWriter:
         """Add all of an account except its transactions."""
         wanted: set[str] = set()
         for chain in home.chains:
+            if (chain / VERDICTS).is_file():
+                await asyncio.to_thread(self._add_verdicts, home.folder.parent, chain / VERDICTS)
+            if not (chain / LEDGER).is_file():
+                continue
             with ExitStack() as opened:
                 facts, files = await self._consistent(chain, opened)
                 for file in files:
@@ -148,6 +153,13 @@ class _BackupWriter:
                     opened.enter_context(stack.pop_all())
                     return facts, files
         raise StateChanging(chain)
+
+    def _add_verdicts(self, folder: Path, ledger: Path) -> None:
+        """Add a validator's ledger. The files that it needs are pinned."""
+        copy = self._scratch / VERDICTS
+        copy_ledger(ledger, copy)
+        with copy.open("rb") as file:
+            self._add(folder, ledger, file)
 
     def _add_content(self, home: AccountFolder, needed: set[str]) -> None:
         with Store(home.content) as store:

@@ -8,7 +8,7 @@ import sqlite3
 import tempfile
 from collections import Counter
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -17,7 +17,18 @@ import msgspec
 from mesh.content import Store
 from mesh.content.recovery import is_in_use
 from mesh.state.archive import read_archive
-from mesh.state.layout import LEDGER, PINS, RECORDINGS, NoState, StateInUse, account_folders, parts_in, transactions_in
+from mesh.state.layout import (
+    LEDGER,
+    PINS,
+    RECORDINGS,
+    VERDICTS,
+    NoState,
+    StateInUse,
+    account_folders,
+    parts_in,
+    transactions_in,
+)
+from mesh.validator.ledger import VerdictLedger
 from mesh.work import Ledger
 from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
 from mesh.work.ledger import UNFINISHED
@@ -30,7 +41,7 @@ if TYPE_CHECKING:
     from mesh.state.layout import AccountFolder
     from mesh.work import JobRecord
 
-_KINDS: Final = {LEDGER: "ledgers", "mcap": "recordings", "jsonl": "transactions"}
+_KINDS: Final = {LEDGER: "ledgers", VERDICTS: "verdicts", "mcap": "recordings", "jsonl": "transactions"}
 ACTIVE: Final = (
     "SELECT CASE type WHEN 'table' THEN 'virtual table' ELSE type END FROM sqlite_master"
     " WHERE type IN ('view', 'trigger') OR sql LIKE 'CREATE VIRTUAL%'"
@@ -42,25 +53,26 @@ ACTIVE: Final = (
 class LedgerFacts:
     """The content of a ledger at one moment. `block` is the last one handled, None before the first."""
 
-    jobs: Mapping[str, JobRecord]
+    jobs: Mapping[str, JobRecord] = field(default_factory=dict)
     """Jobs that are not finalized, by the address of their liability."""
-    phases: Mapping[str, int]
-    block: int | None
-    waiting: int
+    phases: Mapping[str, int] = field(default_factory=dict)
+    block: int | None = None
+    waiting: int = 0
     """Messages in the outbox."""
-    ordered: frozenset[str]
+    ordered: frozenset[str] = frozenset()
     """CIDs of the objectives of the orders in the outbox."""
 
 
 class ChainState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     """An account's state on one chain. `block` is the last one handled, None before the first; `waiting` messages are
-    in the outbox, and `recordings` are being written."""
+    in the outbox, and `recordings` are being written. `verdicts` are a validator's, by stage."""
 
     chain: str
     block: int | None
     jobs: dict[str, int]
     waiting: int
     recordings: int
+    verdicts: dict[str, int] = {}
 
 
 class AccountState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
@@ -218,16 +230,25 @@ async def _account(home: AccountFolder) -> AccountState:
 
 
 async def _chain(folder: Path) -> ChainState:
+    facts, verdicts, judged = LedgerFacts(), {}, None
     with tempfile.TemporaryDirectory(prefix="aira-state-") as scratch:
-        copy = Path(scratch) / LEDGER
-        await asyncio.to_thread(copy_ledger, folder / LEDGER, copy)
-        facts = await read_ledger(copy)
+        if (folder / LEDGER).is_file():
+            copy = Path(scratch) / LEDGER
+            await asyncio.to_thread(copy_ledger, folder / LEDGER, copy)
+            facts = await read_ledger(copy)
+        if (folder / VERDICTS).is_file():
+            copy = Path(scratch) / VERDICTS
+            await asyncio.to_thread(copy_ledger, folder / VERDICTS, copy)
+            async with VerdictLedger(copy) as ledger:
+                verdicts = {stage: count for stage, count in (await ledger.stages()).items() if count}
+                judged, _ = await ledger.cursor()
     return ChainState(
         chain=folder.name,
-        block=facts.block,
+        block=judged if facts.block is None else facts.block,
         jobs=dict(facts.phases),
         waiting=facts.waiting,
         recordings=len(list((folder / RECORDINGS).glob("*.mcap*"))),
+        verdicts=verdicts,
     )
 
 

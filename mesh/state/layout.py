@@ -1,6 +1,7 @@
 """Which files of a data folder are the state of its agents, and the errors of the commands on it.
 
     0x…/1-5f3a…/ledger.sqlite               jobs, outbox and cursor of an account on one chain
+    0x…/1-5f3a…/verdicts.sqlite             what a validator judged and signed, and its cursor
     0x…/1-5f3a…/recordings/0x….mcap.part    recordings of running jobs
     0x…/content/Qm…                         files by their CID, and `.pins` beside them
     transactions/1-5f3a…/0x…/….jsonl        pending transactions
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LEDGER: Final = "ledger.sqlite"
+VERDICTS: Final = "verdicts.sqlite"
 RECORDINGS: Final = "recordings"
 CONTENT: Final = "content"
 PINS: Final = ".pins"
@@ -33,7 +35,7 @@ _ADDRESS: Final = r"0x[0-9a-fA-F]{40}"
 _CHAIN: Final = r"[0-9]{1,20}-[0-9a-f]{8,64}"
 _CID: Final = r"Qm[1-9A-HJ-NP-Za-km-z]{44}"
 _ACCOUNT_FILE: Final = re.compile(
-    rf"(?P<part>{_ADDRESS})/(?:{_CHAIN}/(?:ledger\.sqlite|recordings/{_ADDRESS}\.mcap(?:\.part|\.cut)?)"
+    rf"(?P<part>{_ADDRESS})/(?:{_CHAIN}/(?:(?:ledger|verdicts)\.sqlite|recordings/{_ADDRESS}\.mcap(?:\.part|\.cut)?)"
     rf"|content/(?:{_CID}|\.pins/{_CID}/[A-Za-z0-9_-]{{1,64}}))"
 )
 _TRANSACTION: Final = re.compile(rf"(?P<part>transactions/{_CHAIN}/{_ADDRESS})/[0-9]{{12}}\.jsonl")
@@ -133,9 +135,8 @@ class AccountFolder:
     @property
     def chains(self) -> tuple[Path, ...]:
         """The folders of the chains on which the account has a ledger."""
-        return tuple(
-            path for path in _folders(self.folder) if _CHAIN_NAME.fullmatch(path.name) and (path / LEDGER).is_file()
-        )
+        named = (path for path in _folders(self.folder) if _CHAIN_NAME.fullmatch(path.name))
+        return tuple(path for path in named if any((path / name).is_file() for name in (LEDGER, VERDICTS)))
 
 
 def account_folders(folder: Path) -> tuple[AccountFolder, ...]:

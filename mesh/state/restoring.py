@@ -24,6 +24,7 @@ from mesh.state.layout import (
     CONTENT,
     LEDGER,
     TRANSACTIONS,
+    VERDICTS,
     ArchiveUnusable,
     DataFolderUnwritable,
     StateExists,
@@ -81,6 +82,8 @@ async def restore(archive: Path, folder: Path, *, existing: ExistingState = Exis
         for ledger in sorted(staging.glob(f"*/*/{LEDGER}")):
             await asyncio.to_thread(check_ledger, ledger)
             jobs += (await read_ledger(ledger)).jobs.values()
+        for ledger in sorted(staging.glob(f"*/*/{VERDICTS}")):
+            await asyncio.to_thread(check_ledger, ledger)
         await asyncio.to_thread(_sync, staging)
         replaced = _check_free(folder, parts, existing, locks=locks)
         aside = _exchange(staging, folder, parts, replaced)
@@ -150,7 +153,7 @@ def _check_free(
 
 
 def _lock(part: Path, held: ExitStack) -> None:
-    for ledger in sorted(part.glob(f"*/{LEDGER}")):
+    for ledger in sorted((*part.glob(f"*/{LEDGER}"), *part.glob(f"*/{VERDICTS}"))):
         held.enter_context(locked_ledger(ledger))
     if (part / CONTENT).is_dir() and is_in_use(part / CONTENT):
         raise StateInUse(part / CONTENT)

@@ -67,11 +67,11 @@ class StoredVerdict(msgspec.Struct, frozen=True, kw_only=True):
 class VerdictLedger:
     """The ledger in the file at `path`, created if missing: `async with VerdictLedger(path, signer) as ledger`.
 
-    A file belongs to one juror, whose key `signer` has. Calls run in order, in a thread of their own. Every call raises
-    `LedgerUnusable`.
+    A file belongs to one juror, whose key `signer` has; without a signer it is only read. Calls run in order, in a
+    thread of their own. Every call raises `LedgerUnusable`.
     """
 
-    def __init__(self, path: Path, signer: Signer) -> None:
+    def __init__(self, path: Path, signer: Signer | None = None) -> None:
         self._database = Database(path, SCHEMA)
         self._signer = signer
 
@@ -111,6 +111,7 @@ class VerdictLedger:
         If the juror has signed one for the liability already, that one stays, whatever `result` says. `marks` identify
         the recording of a success; see `owner_of`.
         """
+        assert self._signer is not None, "it was opened to be read"
         signed, address = encode(self._signer.sign(result)), result.liability
         is_new = "WHERE EXISTS (SELECT 1 FROM verdicts WHERE liability = ? AND signed = x'')"
         await self._database.run_together(

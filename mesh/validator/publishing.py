@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
 from contextlib import suppress
 from functools import partial
@@ -12,9 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import zenoh
 
 from mesh.background import call_in_loop
-from mesh.errors import ChainError
 from mesh.flood import Rate, RateLimiter
-from mesh.log_context import log_event
 from schemas import ReportKey, parse_address
 from schemas.errors import InvalidAddress
 from schemas.keys import ValidatorKey
@@ -24,10 +21,6 @@ from schemas.verdicts import ValidatorAnnouncement
 if TYPE_CHECKING:
     from mesh.validator.components import ValidatorComponents
 
-log = logging.getLogger(__name__)
-
-REFRESH: Final = 60.0
-"""Seconds after which the jurors of the contract are read again."""
 ANSWERS: Final = Rate(per_second=100.0, burst=1000)
 """Answers to queries. Zenoh does not say who asks, so that all share this."""
 PENDING: Final = 64
@@ -45,7 +38,7 @@ class Announcements:
         self._queryables: list[Any] = []
 
     async def __aenter__(self) -> Self:
-        self._sign(self._parts.bench.quorum, self._parts.bench.jurors)
+        self._sign()
         session = self._parts.network.session
         for key in self._encoded:
             self._queryables.append(session.declare_queryable(key, partial(self._answer, key), complete=True))
@@ -56,20 +49,7 @@ class Announcements:
             for queryable in self._queryables:
                 queryable.undeclare()
 
-    async def run(self) -> None:
-        """Follow the contract's jurors, until cancelled."""
-        contract = self._parts.bench.contract
-        while True:
-            await asyncio.sleep(REFRESH)
-            with suppress(ChainError):  # asked again soon
-                jury = await self._parts.chain.validators.jury(contract) if contract else None
-                if jury is not None:
-                    self._sign(jury.quorum, len(jury.jurors))
-                if contract and not await self._parts.chain.validators.accepts(contract, self._parts.signer.address):
-                    facts = log_event("juror-dismissed", contract=contract)
-                    log.error("the contract %s does not accept this account any more", contract, extra=facts)
-
-    def _sign(self, quorum: int, jurors: int) -> None:
+    def _sign(self) -> None:
         bench, terms, signer = self._parts.bench, self._parts.terms, self._parts.signer
         for validator in bench.validators:
             is_contract = validator == bench.contract
@@ -79,8 +59,8 @@ class Announcements:
                 title=terms.title,
                 policies=tuple(policy.note for policy in terms.policies),
                 fee=terms.fee,
-                quorum=quorum if is_contract else 1,
-                jurors=jurors if is_contract else 1,
+                quorum=bench.quorum if is_contract else 1,
+                jurors=bench.jurors if is_contract else 1,
                 made_at=int(time.time()),
             )
             key = str(ValidatorKey(self._parts.channel.lighthouse, validator))

@@ -56,13 +56,12 @@ class ValidatorRuntime(Role):
     def __init__(self, parts: ValidatorComponents, *, resend: RetryPolicy = RESEND) -> None:
         self.parts = parts
         self.judge = CaseJudge(parts)
-        self.announcements = Announcements(parts)
         self._resend = resend
 
     async def _open(self, stack: AsyncExitStack) -> None:
         parts = self.parts
         self.results = await stack.enter_async_context(parts.channel.subscribe(Result))
-        await stack.enter_async_context(self.announcements)
+        await stack.enter_async_context(Announcements(parts))
         await stack.enter_async_context(ReportService(parts))
         self.status = ValidatorStatus(parts, self)
         parts.services.offer("status", self.status.status)
@@ -76,7 +75,6 @@ class ValidatorRuntime(Role):
             tasks.create_task(self.judge.run(), name="validator judge")
             tasks.create_task(self._follow_chain(), name="validator listener")
             tasks.create_task(self._take_results(), name="validator results")
-            tasks.create_task(self.announcements.run(), name="validator announcements")
             tasks.create_task(self._send_on_return(), name="validator after network loss")
             self.parts.channel.watch_presence(lambda _provider: self.cases.send_again(), role="provider")
 

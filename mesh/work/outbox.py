@@ -175,7 +175,8 @@ class Outbox:
     async def run(self) -> None:
         """Send messages when they are due, until cancelled."""
         appeared = asyncio.Event()
-        self._channel.watch_presence(lambda _provider: appeared.set(), role="provider")
+        for role in ("provider", "validator"):
+            self._channel.watch_presence(lambda _key: appeared.set(), role=role)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._send_on_return(), name="outbox after network loss")
             tasks.create_task(self._send_to_providers(appeared), name="outbox to new providers")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from mesh.agent import Agent, Job, Phase
+from mesh.agent import Agent, Job
 from mesh.chain import Account, Chain
 from mesh.validator.validator import Validator
-from schemas import ReportKey, Result, encode
-from schemas.verdicts import ValidatorReport
-from tests.support.market import MODEL, QUICK, QUICK_RESEND, Place, in_phase, offering_unseen
+from mesh.watching.queries import query_all
+from schemas import Result
+from schemas.keys import ValidatorKey
+from schemas.selectors import report_selector
+from schemas.verdicts import ValidatorAnnouncement, ValidatorReport
+from tests.support.market import MODEL, QUICK, QUICK_RESEND, Place, offering_unseen
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -26,7 +29,7 @@ FEE = 3
 class Court:
     """The market of a test in one generation, with any number of jurors. Enter with `async with`."""
 
-    def __init__(self, place: Place, generation: int = 3) -> None:
+    def __init__(self, place: Place, generation: Literal[3, 5] = 3) -> None:
         self.place = place
         self.generation = generation
         self._stack = AsyncExitStack()
@@ -93,11 +96,32 @@ class Court:
         return await person.demand(job, validator=validator, **options)
 
 
-def claim_success(robot: Agent, contract: Contract, recording: str) -> Result:
-    """Sign, as the robot, that a recording shows a success."""
-    result = robot.parts.signer.sign(Result(liability=contract.address, result=recording, success=True))
-    robot.parts.channel.publish(result)
-    return result
+async def liar(court: Court) -> Agent:
+    """A robot that offers for every demand and then does nothing."""
+    robot = await court.agent("robot")
+    robot.settings = dataclasses.replace(robot.settings, enable_executor=False)
+    return offering_unseen(robot)
 
 
-__all__ = ["FEE", "PRICE", "Court", "Phase", "ReportKey", "ValidatorReport", "claim_success", "encode", "in_phase"]
+async def claim(robot: Agent, contract: Contract, recording: str, *, success: bool = True) -> None:
+    """Say as the robot that a recording shows that the job was done, until the contract has ended."""
+    result = Result(liability=contract.address, result=recording, success=success)
+    await robot.parts.outbox.post(robot.parts.signer.sign(result))
+
+
+async def asked(agent: Agent, selector: str) -> list[bytes]:
+    """What others reply to a query."""
+    replies = await query_all(agent.network.session, [selector], timeout=2.0)
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+
+async def reports_on(agent: Agent, contract: Contract) -> list[ValidatorReport]:
+    """The reports that validators have on a contract of the agent's."""
+    selector = report_selector(agent.channel.lighthouse, agent.address, contract.address)
+    return [ValidatorReport.decode(payload) for payload in await asked(agent, selector)]
+
+
+async def announcements_of(agent: Agent, validator: str) -> list[ValidatorAnnouncement]:
+    """What the jurors of a validator announce."""
+    selector = str(ValidatorKey(agent.channel.lighthouse, validator))
+    return [ValidatorAnnouncement.decode(payload) for payload in await asked(agent, selector)]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.validator.courts import FEE, PRICE, Court
+from mesh.chain import XRT
+from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on
+from tests.support.objectives import objective
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from tests.support.market import Place
@@ -14,10 +18,110 @@ if TYPE_CHECKING:
 
 async def test_a_validated_job_is_paid_in_generation_3(place: Place) -> None:
     async with Court(place) as court:
+        validator, robot = await court.validator(title="A judge", policies=("acknowledged",)), await court.robot()
+        async with court.at_work(validator, robot) as person:
+            tokens = place.chains["person"].tokens
+            before, earned = await place.balance("robot"), await tokens.balance(validator.address)
+            contract = await court.demand(person, validator.address)
+            assert (await contract.outcome()).success
+            assert await place.balance("robot") == before + PRICE
+            assert await tokens.balance(validator.address) == earned + FEE
+
+            (report,) = await reports_on(person, contract)
+            assert report.is_signed
+            assert (report.juror, report.success, report.failures) == (validator.address, True, ())
+            assert {finding.policy for finding in report.findings} == {"complete", "acknowledged"}
+            assert await reports_on(robot, contract) == [report]
+
+            (announcement,) = await announcements_of(person, validator.address)
+            assert announcement.is_signed
+            assert (announcement.title, announcement.fee, announcement.quorum) == ("A judge", FEE, 1)
+            assert [policy.name for policy in announcement.policies] == ["complete", "acknowledged"]
+
+
+async def test_undone_work_is_refunded_with_the_reason(place: Place) -> None:
+    async with Court(place) as court:
+        validator, robot = await court.validator(), await liar(court)
+        async with court.at_work(validator, robot) as person:
+            contract = await court.demand(person, validator.address)
+            recording = await robot.add(place.save(objective(("/go", "nowhere")), "lie.mcap"))
+            await claim(robot, contract, recording)
+            outcome = await contract.outcome()
+            assert (outcome.success, outcome.result) == (False, recording)
+            (report,) = await reports_on(person, contract)
+            assert report.claimed
+            assert not report.success
+            assert report.failures
+
+
+async def test_a_claim_of_failure_needs_no_recording(place: Place) -> None:
+    async with Court(place) as court:
+        validator, robot = await court.validator(), await liar(court)
+        async with court.at_work(validator, robot) as person:
+            contract = await court.demand(person, validator.address)
+            await claim(robot, contract, contract.liability.objective, success=False)
+            assert not (await contract.outcome()).success
+            (report,) = await reports_on(person, contract)
+            assert [finding.code for finding in report.failures] == ["claimed"]
+
+
+async def test_a_liability_that_pays_too_little_is_not_judged(place: Place) -> None:
+    async with Court(place) as court:
+        validator, robot = await court.validator(fee="1 XRT"), await court.robot()
+        async with court.at_work(validator, robot) as person:
+            contract = await court.demand(person, validator.address, validator_fee=XRT - 1)
+            await until_found(lambda: reports_on(person, contract), what="a refusal")
+            (report,) = await reports_on(person, contract)
+            assert [finding.code for finding in report.failures] == ["fee-too-low"]
+            stored = await validator.runtime.parts.ledger.verdict(contract.address)
+            assert stored is not None
+            assert stored.signed == b""
+
+
+async def test_a_validator_that_comes_late_judges_what_it_missed(place: Place) -> None:
+    async with Court(place) as court:
+        validator, robot = await court.validator(), await court.robot()
+        async with court.at_work(robot) as person:
+            contract = await court.demand(person, court.account().address)
+            await asyncio.sleep(0.3)
+            async with validator:
+                assert (await contract.outcome()).success
+
+
+async def test_a_reverted_verdict_is_sent_again(place: Place) -> None:
+    async with Court(place) as court:
         validator, robot = await court.validator(), await court.robot()
         async with court.at_work(validator, robot) as person:
             before = await place.balance("robot")
             contract = await court.demand(person, validator.address)
-            outcome = await contract.outcome()
-            assert outcome.success
+            assert (await contract.outcome()).success
+            await place.forget_blocks(1)
+            assert not (await place.chains["person"].liabilities.get(contract.address)).is_finalized
+            await until_found(lambda: _is_paid(place, contract.address), what="a second payment")
             assert await place.balance("robot") == before + PRICE
+
+
+async def _is_paid(place: Place, address: str) -> bool:
+    return (await place.chains["person"].liabilities.get(address)).is_success
+
+
+async def test_it_shows_its_status_and_metrics(place: Place) -> None:
+    async with Court(place) as court:
+        validator, robot = await court.validator(), await court.robot()
+        async with court.at_work(validator, robot) as person:
+            contract = await court.demand(person, validator.address)
+            await contract.outcome()
+            await until(lambda: validator.runtime.judge.verdicts["success"])
+            names = {family.name for family in await validator.runtime.measure()}
+            assert {"aira_validator_cases", "aira_verdicts_total", "aira_account_eth_wei"} <= names
+            assert set(validator.runtime.health().values()) == {"alive"}
+
+
+@pytest.mark.parametrize("name", ["nonsense", "rate:min=-1"])
+def test_unknown_policies_are_refused(name: str) -> None:
+    from mesh.settings import Settings
+    from mesh.validator.policy import InvalidPolicy
+    from mesh.validator.validator import Validator
+
+    with pytest.raises(InvalidPolicy):
+        Validator(settings=Settings(validator_policies=(name,)))
