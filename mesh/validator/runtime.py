@@ -63,7 +63,7 @@ class ValidatorRuntime(Role):
         self.results = await stack.enter_async_context(parts.channel.subscribe(Result))
         await stack.enter_async_context(Announcements(parts))
         await stack.enter_async_context(ReportService(parts))
-        self.status = ValidatorStatus(parts, self)
+        self.status = ValidatorStatus(parts, self.judge, self.results)
         parts.services.offer("status", self.status.status)
         parts.services.offer("logs", LogService("validator", parts.signer.address).logs)
         parts.channel.announce("validator", parts.signer.address)

@@ -13,18 +13,21 @@ from mesh.telemetry.metrics import by_label, counter, gauge, labelled
 from schemas.status import ALIVE, Status, StoreUse, ValidationStatus
 
 if TYPE_CHECKING:
+    from mesh.network import Subscription
     from mesh.telemetry.metrics import MetricFamily
     from mesh.validator.components import ValidatorComponents
-    from mesh.validator.runtime import ValidatorRuntime
+    from mesh.validator.decisions import CaseJudge
+    from schemas import Result
     from schemas.rpc import Nothing
 
 
 class ValidatorStatus:
     """The metrics, the health and the service `status` of a validator. Nothing here asks the network."""
 
-    def __init__(self, parts: ValidatorComponents, runtime: ValidatorRuntime) -> None:
+    def __init__(self, parts: ValidatorComponents, judge: CaseJudge, results: Subscription[Result]) -> None:
         self._parts = parts
-        self._runtime = runtime
+        self._judge = judge
+        self._results = results
         self._started = time.monotonic()
 
     async def status(self, _request: Nothing) -> Status:
@@ -62,16 +65,16 @@ class ValidatorStatus:
 
     async def measure(self) -> tuple[MetricFamily, ...]:
         """The metrics now."""
-        parts, runtime = self._parts, self._runtime
+        parts, judge = self._parts, self._judge
         usage = await asyncio.to_thread(parts.store.usage)
-        verdicts = {"success": 0.0, "no-success": 0.0, "refused": 0.0} | dict(runtime.judge.verdicts)
+        verdicts = {"success": 0.0, "no-success": 0.0, "refused": 0.0} | dict(judge.verdicts)
         stages = {stage: float(count) for stage, count in (await parts.ledger.stages()).items()}
         families = (
-            *message_families([runtime.results]),
+            *message_families([self._results]),
             drop_family(parts.drops),
             by_label("aira_validator_cases", "gauge", "Liabilities that name the validator, by stage", "stage", stages),
             by_label("aira_verdicts_total", "counter", "Cases that the validator decided", "verdict", verdicts),
-            counter("aira_judging_seconds_total", "Seconds that judging recordings took", runtime.judge.seconds),
+            counter("aira_judging_seconds_total", "Seconds that judging recordings took", judge.seconds),
             gauge("aira_content_files", "Files in the content store", usage.files),
             gauge("aira_content_bytes", "Bytes of the content store", usage.bytes),
             *reading_families(head=parts.chain_head.head, read_at=parts.chain_head.advanced_at),
