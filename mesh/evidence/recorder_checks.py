@@ -38,14 +38,12 @@ class _Faults:
 
 @dataclass(slots=True)
 class _ChannelCount:
-    """What was read of one channel; `last` is the payload of its last message."""
+    """What was read of one channel."""
 
     topic: str
     role: str
     count: int = 0
     next: int = 0
-    last_time: int = -1
-    last: bytes = b""
 
 
 @dataclass
@@ -56,25 +54,32 @@ class SequenceCheck:
     gaps: _Faults = field(default_factory=_Faults)
     steps_back: _Faults = field(default_factory=_Faults)
     copies: _Faults = field(default_factory=_Faults)
-    last_time: int = 0
+    last: ChannelMessage | None = None
 
     def add(self, written: ChannelMessage) -> None:
         """Check the next message."""
-        message, time = written.message, written.message.log_time_ns
+        message = written.message
         channel = self.channels.get(written.channel)
         if channel is None:
             channel = self.channels[written.channel] = _ChannelCount(message.topic, message.role)
         if message.sequence != channel.next:
             self.gaps.add(_gap(message.topic, message.sequence, channel.next))
-        if time < self.last_time:
-            name, earlier = f"message {message.sequence} on {message.topic}", self.last_time - time
-            self.steps_back.add(f"{name} was recorded {earlier / MILLISECOND:g} ms before the previous one")
-        elif time == channel.last_time and message.payload == channel.last:
-            self.copies.add(f"message {message.sequence} on {message.topic} has the previous one's time and content")
         channel.count += 1
         channel.next = message.sequence + 1
-        channel.last_time, channel.last = time, message.payload
-        self.last_time = time
+        if self.last is not None:
+            self._compare(written, self.last)
+        self.last = written
+
+    def _compare(self, written: ChannelMessage, last: ChannelMessage) -> None:
+        """Compare a message with the one before it."""
+        message, earlier = written.message, last.message.log_time_ns - written.message.log_time_ns
+        if earlier < 0:
+            return
+        name = f"message {message.sequence} on {message.topic}"
+        if earlier > 0:
+            self.steps_back.add(f"{name} was recorded {earlier / MILLISECOND:g} ms before the previous one")
+        elif written.channel == last.channel and message.payload == last.message.payload:
+            self.copies.add(f"{name} has the time and content of the one before it")
 
 
 def check_completeness(recording: Objective, sequence: SequenceCheck) -> Iterator[Finding]:

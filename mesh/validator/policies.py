@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from hashlib import blake2b
+from itertools import chain
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.evidence import Finding
 from mesh.validator.policy import InvalidPolicy, Policy, PolicyCheck, PolicyOptions
@@ -19,8 +21,6 @@ if TYPE_CHECKING:
 _SECOND: Final = 10**9
 _WITHIN: Final = _SECOND
 _GAP: Final = 10 * _SECOND
-_REPEATED: Final = 64
-"""Open commands among which one that is played again after a crash is looked for."""
 
 COMPLETE: Final = Policy(
     "complete",
@@ -52,6 +52,15 @@ class Acknowledged(Policy):
         return _AnswerCheck(self)
 
 
+class _Command(NamedTuple):
+    """A command: when it was played, in nanoseconds and in seconds of the recording, and what identifies it."""
+
+    time_ns: int
+    time: float
+    topic: str
+    digest: bytes
+
+
 class _AnswerCheck(PolicyCheck):
     """Waits for the answer to each command.
 
@@ -62,19 +71,20 @@ class _AnswerCheck(PolicyCheck):
 
     def __init__(self, policy: Acknowledged) -> None:
         self._policy = policy
-        self._waiting: deque[JudgedMessage] = deque()
-        self._interrupted: list[JudgedMessage] = []
-        """Commands that were open at a crash."""
+        self._waiting: deque[_Command] = deque()
+        self._interrupted: dict[bytes, list[_Command]] = {}
+        """Commands that were open at a crash, by what identifies them."""
         self._part = 0
         self._last = self._answered = self._resumed = 0
         """When the last message came, when the last answer, and when the agent continued."""
         self._commands = self._unanswered = 0
-        self._first: JudgedMessage | None = None
+        self._first: _Command | None = None
 
     def add(self, message: JudgedMessage) -> None:
         if message.part != self._part:
             self._expire(self._last)
-            self._interrupted += self._waiting
+            for command in self._waiting:
+                self._interrupted.setdefault(command.digest, []).append(command)
             self._waiting.clear()
             self._part, self._resumed = message.part, message.time_ns
         self._last = message.time_ns
@@ -84,7 +94,7 @@ class _AnswerCheck(PolicyCheck):
             self._answer(message.time_ns)
 
     def findings(self) -> Iterator[Finding]:
-        for command in (*self._interrupted, *self._waiting):
+        for command in (*chain.from_iterable(self._interrupted.values()), *self._waiting):
             self._miss(command)
         within = self._policy.within_ns / _SECOND
         if self._first is None:
@@ -94,15 +104,15 @@ class _AnswerCheck(PolicyCheck):
         yield Finding("answers", False, f"{said}: {self._unanswered} of {self._commands} commands were not")
 
     def _command(self, message: JudgedMessage) -> None:
+        self._expire(message.time_ns)
+        digest = blake2b(message.topic.encode() + b"\0" + message.payload, digest_size=16).digest()
         self._commands += 1
-        self._waiting.append(message)
-        for number, command in enumerate(self._interrupted[:_REPEATED]):
-            if command.topic == message.topic and command.payload == message.payload:
-                del self._interrupted[number]
-                return
+        self._waiting.append(_Command(message.time_ns, message.time, message.topic, digest))
+        if interrupted := self._interrupted.get(digest):
+            interrupted.pop()
 
     def _answer(self, now: int) -> None:
-        if self._interrupted and now <= self._resumed + self._policy.within_ns:
+        if now <= self._resumed + self._policy.within_ns:
             self._interrupted.clear()
         self._expire(now)
         if self._waiting and self._policy.answer:
@@ -116,7 +126,7 @@ class _AnswerCheck(PolicyCheck):
         while self._waiting and max(self._waiting[0].time_ns, self._answered) + self._policy.within_ns < now:
             self._miss(self._waiting.popleft())
 
-    def _miss(self, command: JudgedMessage) -> None:
+    def _miss(self, command: _Command) -> None:
         self._unanswered += 1
         self._first = self._first or command
 

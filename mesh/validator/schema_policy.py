@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _MOST_VALUES: Final = 5_000_000
 """Values in arrays and objects of one recording that are checked, which takes about five seconds."""
-_LONGEST_SCHEMA: Final = 256 << 10
+_LONGEST_SCHEMA: Final = 64 << 10
 _NUMBERS: Final = frozenset({"minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum"})
 _OF_TYPE: Final = {
     "null": frozenset[str](),
@@ -71,6 +71,8 @@ class _SchemaCheck(PolicyCheck):
             found = self._fault(message)
         except TooManyValues as error:
             found = "limits", str(error)
+        except RecursionError:
+            found = "types", "it is nested too deep"
         if found is not None:
             name, why = found
             first, count = self.faults.get(name, (f"a message on {message.topic} at {message.time:.3f} s: {why}", 0))
@@ -131,7 +133,7 @@ def _json_schema(kind: PayloadType) -> ValueSchema | None:
         return None
     try:
         return msgspec.convert(_understood(msgspec.json.decode(kind.schema_data)), ValueSchema)
-    except (msgspec.MsgspecError, ValueError, RecursionError):
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError):
         return None
 
 

@@ -188,7 +188,7 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
             liability = json.loads(capsys.readouterr().out.splitlines()[-1])["liability"]
             assert await verify_job(nobody, liability, nothing, offline=False, as_json=True)
             said = json.loads(capsys.readouterr().out)
-            assert [finding["holds"] for finding in said["findings"]] == [True] * 14
+            assert [finding["holds"] for finding in said["findings"]] == [True] * 17
             with zenoh.open(client_config(endpoint)) as session:
                 listener = Listener(session)
                 await replay(nobody, ReplayOptions(source=liability))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import shutil
+import time
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -52,7 +53,7 @@ ROBOT: Final = Signer(b"\x01" * 32)
 THIEF: Final = Signer(b"\x02" * 32)
 LIGHTHOUSE: Final = "0x" + "2" * 40
 VALIDATOR: Final = "0x" + "4" * 40
-SLACK_NS: Final = 300 * 10**9
+SLACK_NS: Final = 60 * 10**9
 """How wrong a robot's clock may be."""
 LEVELS: Final = tuple(number / 20 for number in range(20))
 MODEL: Final = ModelDescription(
@@ -72,7 +73,11 @@ class LampState(msgspec.Struct):
 
 
 class Crashed(Exception):
-    """The robot's process ends here, as by `kill -9`."""
+    """The robot's process ends here, as by `kill -9`, and is started again."""
+
+
+class Stopped(Exception):
+    """The robot's process is stopped here in order, and started again."""
 
 
 def follows_levels(evidence: Evidence) -> Iterator[str]:
@@ -180,19 +185,30 @@ class LampRobot:
         self._robot = robot
         self._clock = clock
         self.folder = folder
+        self.before_end: Callable[[], Awaitable[object]] | None = None
+        """Is awaited between the last command and the end of a job."""
 
     async def work(
-        self, name: str, objective: Path, handler: Handler = shine, *, topics: str = "", playback: str = "recorded"
+        self,
+        name: str,
+        objective: Path,
+        handler: Handler | None = shine,
+        *,
+        topics: str = "",
+        playback: str = "recorded",
     ) -> FinishedJob:
-        """Do the job called `name`, and continue after each `Crashed` that the handler raises."""
-        liability, since = contract(name, objective, robot=self._robot), self._clock.time_ns()
+        """Do the job called `name`, and continue it after each `Crashed` and `Stopped` that the handler raises.
+
+        What an earlier call has left in the folder is continued, too.
+        """
+        liability, since = contract(name, objective, robot=self._robot), time.time_ns()
         self.folder.mkdir(parents=True, exist_ok=True)
         settings: Any = Settings(recording_topics=topics, playback=playback)  # type: ignore[arg-type]
         async with Ledger(self.folder / "ledger.sqlite") as ledger:
             await ledger.add_job(liability)
             recording = None
             while recording is None:
-                with suppress(Crashed):
+                with suppress(Crashed, Stopped):
                     recording = await self._run(ledger, settings, liability, objective, handler)
         return FinishedJob(
             liability=liability,
@@ -200,11 +216,11 @@ class LampRobot:
             recording=recording,
             message=signed_by(self._robot, liability.address, cid_of_file(recording)),
             since_ns=since - SLACK_NS,
-            until_ns=self._clock.time_ns() + SLACK_NS,
+            until_ns=time.time_ns() + SLACK_NS,
         )
 
     async def _run(
-        self, ledger: Ledger, settings: Any, liability: Liability, objective: Path, handler: Handler
+        self, ledger: Ledger, settings: Any, liability: Liability, objective: Path, handler: Handler | None
     ) -> Path:
         """One run from the ledger's position. Raises `Crashed` with the files as a killed process leaves them."""
         job = await ledger.job(liability.address)
@@ -216,12 +232,17 @@ class LampRobot:
             async with asyncio.TaskGroup() as tasks:
                 await playbacks.begin(job, played, play=lambda run: playbacks.play_and_save(run, handler), tasks=tasks)
         except ExceptionGroup as group:
+            if group.subgroup(Stopped) is not None:
+                await playbacks.suspend(liability.address)
+                raise Stopped from None
             if group.subgroup(Crashed) is None:
                 raise
             await self._crash(playbacks, liability.address)
             raise Crashed from None
         run = await playbacks.stop(liability.address)
         assert run is not None
+        if self.before_end is not None:
+            await self.before_end()
         return (await run.close(sync=False)).path
 
     async def _crash(self, playbacks: Playbacks, address: str) -> None:
