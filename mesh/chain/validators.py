@@ -14,6 +14,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from mesh.chain.answers import InvalidAnswer
 from mesh.chain.artifacts import is_code_of
 from mesh.chain.contracts import OriginalContracts
 from mesh.chain.errors import InsufficientTokens, NoContracts, Reverted
@@ -175,6 +176,11 @@ class Validators:
         jury = await self._jury(validator)
         return 1 if jury is None else jury.quorum
 
+    async def jurors(self, validator: str) -> tuple[str, ...] | None:
+        """The jurors of a jury; None for another validator. Raises `ChainError`; a jury is asked once."""
+        jury = await self._jury(validator) if (await self._verdict(validator)).has_code else None
+        return None if jury is None else jury.jurors
+
     async def accepts(self, validator: str, signer: str) -> bool:
         """Whether `signer` is one who judges for the validator: a juror, or whom another contract accepts.
 
@@ -185,13 +191,13 @@ class Validators:
             return False
         if not (await self._verdict(validator)).has_code:
             return signer == validator
-        jury = await self._jury(validator)
-        if jury is not None:
-            return signer in jury.jurors
+        jurors = await self.jurors(validator)
+        if jurors is not None:
+            return signer in jurors
         try:
             call = self._contracts.node.contract("Jury", validator).isValidator(signer)
             return bool(await self._contracts.node.read(call))
-        except (Reverted, NoContracts):
+        except (Reverted, NoContracts, InvalidAnswer):
             return False
 
     async def jury(self, validator: str) -> JuryState | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 from schemas import Demand, address_bytes
 
@@ -62,8 +62,8 @@ class Added:
     evicted: tuple[Verified[Order], ...] = ()
 
 
-def order_id(order: Verified[Order]) -> bytes:
-    """The identity of an order in a book: hash and signer, as in generation 3 two people may sign equal terms."""
+def order_id(order: Verified[Any]) -> bytes:
+    """The identity of an order or result: hash and signer, as several people may sign the same."""
     return order.hash + address_bytes(order.signer)
 
 

@@ -215,7 +215,7 @@ class Provider(Role):
     async def _take_results(self) -> None:
         async for result in self.results:
             await self.queue.has_room()
-            await self.settlement.add_result(result)
+            await self.settlement.results.add(result)
 
 
 class Arrivals:

@@ -1,4 +1,4 @@
-"""Settlement: creates liabilities from matching orders, and finalizes them by results.
+"""Settlement: creates liabilities from matching orders; `judgements` finalizes them by results.
 
 Other providers do the same, and the chain may replace its last blocks, so a receipt settles nothing. A match or result
 stays under settlement (`Unconfirmed`) until its event was read on the followed chain and is `Timing.confirmations`
@@ -18,10 +18,11 @@ from mesh.flood import UNFUNDED_POLLS
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import Added, Match, Refusal, order_id
 from mesh.market.funding import Commitments, UnfundedOrders, creation_stakes
+from mesh.market.judgements import ResultSettlement
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
 from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
 from mesh.market.withdrawals import withdrawn_id
-from schemas import ZERO_ADDRESS, Result
+from schemas import Result
 
 if TYPE_CHECKING:
     import asyncio
@@ -90,12 +91,24 @@ class Settlement:
             open_limit=open_limit,
         )
         self._commitments = Commitments(self._funding, waiting=queue.counted)
+        self.results: Final = ResultSettlement(
+            chain,
+            channel.address,
+            queue=queue,
+            earnings=earnings,
+            events=self.events,
+            commitments=self._commitments,
+            rejections=self.rejections,
+            forget=forget,
+            drops=drops,
+        )
         self._pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
         self._unfunded = UnfundedOrders(book, self.shortages, funded=self.add, interval=chain.node.timing.poll_interval)
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
         """Follow the chain, and from now on settle what is added, in tasks of this group."""
         self._tasks = tasks
+        self.results.start(tasks)
         tasks.create_task(self.events.follow(self._settle_again), name="provider chain")
         tasks.create_task(self._unfunded.run(), name="provider unfunded orders")
 
@@ -134,7 +147,7 @@ class Settlement:
 
     def _settle_again(self, message: Verified[Any]) -> None:
         if isinstance(message.message, Result):
-            self._tasks.create_task(self.add_result(message))
+            self._tasks.create_task(self.results.add(message))
         else:
             self.add(message)
 
@@ -174,20 +187,6 @@ class Settlement:
     def _drop_blocked(self, order: Verified[Order]) -> None:
         self._drops.count("blocked", order.signer)
         self._forget(order)
-
-    async def add_result(self, result: Verified[Result]) -> None:
-        """Finalize the liability that a result names, if the result may do that."""
-        with liability_context(result.message.liability):
-            liability = await self.events.liability(result.message.liability)
-            if result in self.events.unconfirmed:
-                return
-            if liability is None or liability.is_finalized:  # which may not be confirmed either
-                self._forget(result)
-            elif result.signer != liability.promisor and liability.validator == ZERO_ADDRESS:
-                self.rejections.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
-            else:
-                self.events.unconfirmed.begin(result)
-                self._tasks.create_task(self._finalize(result, priority=self._chain.costs.worth(liability)))
 
     async def _create(self, match: Match) -> None:
         demand, offer = match
@@ -277,24 +276,3 @@ class Settlement:
                 self._forget(order)
             else:
                 self.add(order)
-
-    async def _finalize(self, result: Verified[Result], *, priority: int) -> None:
-        message = result.message
-        with liability_context(message.liability):
-            try:
-                async with self._commitments.take({message.liability: 1}):
-                    finalize = partial(self._chain.liabilities.finalize, self._lighthouse, message)
-                    finalized = await self._queue.send(finalize, priority=priority)
-            except (Reverted, NodeUnreachable, RequestRefused) as error:
-                if not isinstance(error, Reverted) or error.reason != "AlreadyFinalized":
-                    self.rejections.reject(result, reason_of(error), str(error))
-                if not self.events.unconfirmed.end(result):
-                    self._forget(result)
-            else:
-                self._earnings.finalized(finalized)
-                event = log_event("contract-finalized", success=message.success, gas=finalized.gas_used)
-                log.info("finalized, success %s, gas %d", message.success, finalized.gas_used, extra=event)
-                if not await self.events.is_confirmed((result,), finalized.tx):
-                    self._earnings.reverted(finalized.tx)
-                if not self.events.unconfirmed.end(result):
-                    await self.add_result(result)

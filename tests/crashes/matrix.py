@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 from tests.crashes.points import Point
 
 BOOK, SETTLEMENT = "mesh.market.book:OrderBook", "mesh.market.settlement:Settlement"
+RESULTS = "mesh.market.judgements:ResultSettlement"
 QUEUE, SENDER = "mesh.market.transaction_queue:TransactionQueue", "mesh.chain.transactions:TransactionSender"
 STORE, CONFIRMATION = "mesh.chain.transaction_store:TransactionStore", "mesh.chain.confirmation:Confirmation"
 TRADER, OUTBOX = "mesh.agent.trade:Trader", "mesh.work.outbox:Outbox"
@@ -27,11 +28,11 @@ POINTS: Final = {
         Point("before", f"{CONFIRMATION}.wait"),
         Point("after", f"{CONFIRMATION}.wait"),
         Point("after", f"{SETTLEMENT}._create"),
-        Point("before", f"{SETTLEMENT}.add_result"),
-        Point("before", f"{SETTLEMENT}._finalize"),
+        Point("before", f"{RESULTS}.add"),
+        Point("before", f"{RESULTS}._finalize"),
         Point("after", f"{SENDER}._send_numbered", 2),
         Point("after", f"{CONFIRMATION}.wait", 2),
-        Point("after", f"{SETTLEMENT}._finalize"),
+        Point("after", f"{RESULTS}._finalize"),
     ),
     "robot": (
         Point("before", f"{TRADER}.post"),

@@ -334,8 +334,8 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "a result under settlement is settled again",
-        "mesh.market.settlement:Settlement.add_result",
-        "if result in self.events.unconfirmed:",
+        "mesh.market.judgements:ResultSettlement.add",
+        "if result in self._events.unconfirmed:",
         "if False:",
         "duplicate,replay",
     ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mesh.market.book import order_id
-from mesh.market.liability_events import Unconfirmed
+from mesh.market.unconfirmed import Unconfirmed
 from schemas import Demand, Offer, Result, verify_message
 from tests.support.orders import CONTRACT, result, verified_demand, verified_offer
 
