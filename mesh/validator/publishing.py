@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 ANSWERS: Final = Rate(per_second=100.0, burst=1000)
 """Answers to queries. Zenoh does not say who asks, so that all share this."""
+REFRESH: Final = 600.0
+"""Seconds after which announcements are signed again: parties ignore old ones."""
 PENDING: Final = 64
 """Queries for reports that may be pending; further ones are dropped."""
 
@@ -35,6 +37,7 @@ class Announcements:
         self._rate = RateLimiter(per_sender=ANSWERS)
         self._encoded: dict[str, bytes] = {}
         """By the key's text."""
+        self._signed_at = 0.0
         self._queryables: list[Any] = []
 
     async def __aenter__(self) -> Self:
@@ -51,6 +54,7 @@ class Announcements:
 
     def _sign(self) -> None:
         bench, terms, signer = self._parts.bench, self._parts.terms, self._parts.signer
+        self._signed_at = time.time()
         for validator in bench.validators:
             is_contract = validator == bench.contract
             announcement = ValidatorAnnouncement(
@@ -61,15 +65,17 @@ class Announcements:
                 fee=terms.fee,
                 quorum=bench.quorum if is_contract else 1,
                 jurors=bench.jurors if is_contract else 1,
-                made_at=int(time.time()),
+                made_at=int(self._signed_at),
             )
             key = str(ValidatorKey(self._parts.channel.lighthouse, validator))
             self._encoded[key] = announcement.signed_by(signer).encode()
 
     def _answer(self, key: str, query: zenoh.Query) -> None:
-        """Answer on Zenoh's thread: the announcement is ready."""
+        """Answer on Zenoh's thread: the announcement is ready, and at most `REFRESH` old."""
         with query:
             if self._rate.allow(""):
+                if time.time() > self._signed_at + REFRESH:
+                    self._sign()
                 query.reply(key, self._encoded[key], encoding="application/json")
             else:
                 self._parts.drops.count("recall")

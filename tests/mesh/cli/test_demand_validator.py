@@ -11,9 +11,9 @@ import pytest
 from mesh.chain import UnsafeValidator
 from mesh.cli.demand import demand
 from mesh.cli.errors import DoubtfulValidator, JobNotDone
-from schemas import Demand, Result
+from schemas import Demand, Result, Verified
 from tests.mesh.operations.site import MODEL, Site, settings_of
-from tests.support.commands import aira
+from tests.support.commands import AIRA, Serving, aira
 from tests.support.jurors import COMPLETE, MISSING, Juror
 
 if TYPE_CHECKING:
@@ -126,3 +126,45 @@ async def test_a_doubtful_validator_is_named_before_anything_is_signed(
     waiting.cancel()
     await asyncio.wait([waiting])
     assert (posted.validator, posted.validator_fee) == (validator, 99 if who == "cheap" else 0)
+
+
+@pytest.mark.parametrize("lies", [False, True])
+async def test_a_whole_job_by_commands_under_a_real_validator(site: Site, lies: bool) -> None:
+    """`aira provider`, `aira validator` and `aira demand` are processes."""
+    variables = site.variables("rival", log_format="json", validator_title="Word inspectors", validator_fee="100wn")
+    serving = Serving(*AIRA, "validator", says='"validator-started"', variables=variables)
+    robot = lying(site) if lies else site.robot([])
+    options = ("--model", MODEL, "--objective", site.job("word"), "--cost", "7wn", "--validator", site.address("rival"))
+    with serving:
+        async with site.provider(), robot:
+            done = await asyncio.to_thread(aira, "demand", *options, **site.variables("person"))
+            lines = done.stdout.splitlines()
+            address = next(line for line in lines if line.startswith("contract ")).split()[1]
+            shown = await asyncio.to_thread(aira, "liability", "show", address, **site.variables("person"))
+    assert f"validator Word inspectors, {site.address('rival')}" in lines
+    assert any(line.startswith("  judges by complete: ") for line in lines)
+    judged = next(line for line in lines if line.startswith(f"juror {site.address('rival')} judged: the work "))
+    verdict = judged.split(" judged: ")[1]
+    assert verdict in shown.stdout
+    if lies:
+        assert (done.returncode, verdict.startswith("the work does not count: ")) == (1, True)
+        assert f"the validator judged: {verdict}" in done.stderr
+    else:
+        assert (done.returncode, verdict) == (0, "the work counts"), done.stderr
+
+
+def lying(site: Site) -> Agent:
+    """A robot that claims success at once, with the objective as its recording."""
+    robot = site.agent("robot", enable_executor=False)
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand)
+
+    @robot.every(0.5)
+    async def claim() -> None:
+        for _, address in await robot.parts.ledger.contracts("offer"):
+            liability = await robot.parts.chain.liabilities.get(address)
+            robot.send(Result(liability=address, result=liability.objective, success=True))
+
+    return robot

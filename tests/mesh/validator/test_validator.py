@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT
+from mesh.validator import publishing
 from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
@@ -37,6 +38,22 @@ async def test_a_validated_job_is_paid_in_generation_3(place: Place) -> None:
             assert announcement.is_signed
             assert (announcement.title, announcement.fee, announcement.quorum) == ("A judge", FEE, 1)
             assert [policy.name for policy in announcement.policies] == ["complete", "acknowledged"]
+
+
+async def test_an_announcement_is_signed_again_so_that_parties_believe_it(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publishing, "REFRESH", 0)
+    async with Court(place) as court:
+        validator = await court.validator()
+        async with court.at_work(validator) as person:
+            (first,) = await announcements_of(person, validator.address)
+
+            async def is_renewed() -> bool:
+                (again,) = await announcements_of(person, validator.address)
+                return again.is_signed and again.made_at > first.made_at
+
+            await until_found(is_renewed, what="a later announcement")
 
 
 async def test_undone_work_is_refunded_with_the_reason(place: Place) -> None:
