@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from mesh.content import Progress
     from mesh.recording import Objective, Played
     from mesh.validator.policy import Policy, PolicyCheck
     from schemas import Liability
@@ -90,17 +91,13 @@ def judge(
 
     Use a thread. Raises `OSError` if a file can't be read; whatever is in the files is a finding.
     """
-    others = [policy for policy in policies if policy.name != COMPLETE.name]
-    trial = _Trial(case, others)
+    trial = _Trial(Evidence(case.liability, model=case.model, keep=_has_own(policies)), policies)
     cid = case.recording_cid or cid_of_file(recording)
     signed = _result_in(case.message)
+    result = "" if signed is None else signed.result
+    claim = Claim.of_contract(case.liability)
     verdict = verify(
-        msgspec.structs.replace(
-            Claim.of_contract(case.liability),
-            result="" if signed is None else signed.result,
-            success=case.claimed,
-            finalized=None,
-        ),
+        msgspec.structs.replace(claim, result=result, success=case.claimed, finalized=None),
         objective=objective,
         result=recording,
         message=case.message,
@@ -115,36 +112,62 @@ def judge(
     marks = trial.marks(cid)
     found.append(_check_replayed(case, marks))
     reported = [_reported(COMPLETE.name, finding) for finding in found]
-    reported += trial.findings()
+    reported += [_reported(policy, _decided(finding)) for policy, finding in trial.findings()]
     success = case.claimed and all(finding.holds is not False for finding in reported)
     return Judgement(success=success, findings=_bounded(reported), marks=marks)
+
+
+def examine(
+    liability: Liability,
+    *,
+    objective: Path,
+    recording: Path,
+    policies: Sequence[Policy],
+    message: bytes | None = None,
+    model: ModelDescription | None = None,
+    progress: Progress | None = None,
+) -> tuple[ReportFinding, ...]:
+    """What a validator would find in a recording that nobody has handed in: `aira validator check`.
+
+    The `liability` is what own checks get. Findings for which there is nothing to compare with stay undecided. Use a
+    thread. Raises `OSError` if a file can't be read.
+    """
+    trial = _Trial(Evidence(liability, model=model, keep=_has_own(policies)), policies)
+    verdict = verify(Claim(), objective=objective, result=recording, message=message, observer=trial, progress=progress)
+    found = [(COMPLETE.name, finding) for finding in verdict.findings if finding.name not in _NOT_JUDGED]
+    return tuple(_reported(policy, finding) for policy, finding in [*found, *trial.findings()])
+
+
+def _has_own(policies: Sequence[Policy]) -> bool:
+    return any(isinstance(policy, OwnPolicy) for policy in policies)
 
 
 class _Trial:
     """Shows the recording to all policies while it is verified, and computes its hash."""
 
-    def __init__(self, case: Case, policies: Sequence[Policy]) -> None:
-        own = any(isinstance(policy, OwnPolicy) for policy in policies)
-        self._evidence = Evidence(case.liability, model=case.model, keep=own)
+    def __init__(self, evidence: Evidence, policies: Sequence[Policy]) -> None:
+        self._evidence = evidence
         self._policies = policies
         self._checks: list[PolicyCheck] = []
         self._hash = blake2b(digest_size=32)
+        self._topics: dict[str, bytes] = {}
         self._count = 0
         self._last = 0
 
     def open(self, recording: Objective) -> None:
         self._evidence.open(recording)
         self._checks = [policy.begin(self._evidence) for policy in self._policies]
+        self._last = recording.start_ns
+        self._topics = {topic.name: topic.name.encode() for topic in recording.topics}
 
     def add(self, message: Played, part: int) -> None:
         judged = self._evidence.add(message, part)
         for check in self._checks:
             check.add(judged)
-        topic, since = message.topic.encode(), message.log_time_ns - self._last if self._count else 0
-        self._hash.update(_MESSAGE.pack(since, len(topic), len(message.payload)))
-        self._hash.update(topic)
-        self._hash.update(message.payload)
-        self._last = message.log_time_ns
+        topic, payload, time = self._topics[message.topic], message.payload, message.log_time_ns
+        self._hash.update(_MESSAGE.pack(time - self._last, len(topic), len(payload)) + topic)
+        self._hash.update(payload)
+        self._last = time
         self._count += 1
 
     def open_objective(self, objective: Objective) -> None:
@@ -154,11 +177,11 @@ class _Trial:
         """What identifies the recording. Two messages at least, since the times between them make the hash unique."""
         return (cid, self._hash.hexdigest()) if self._count > 1 else (cid,)
 
-    def findings(self) -> Iterator[ReportFinding]:
-        """What the policies have found; nothing if the recording is not readable."""
+    def findings(self) -> Iterator[tuple[str, Finding]]:
+        """What the policies have found, with their names; nothing if the recording is not readable."""
         for policy, check in zip(self._policies, self._checks, strict=False):
             for finding in check.findings():
-                yield _reported(policy.name, _decided(finding))
+                yield policy.name, finding
 
 
 def _result_in(message: bytes) -> Result | None:
