@@ -59,6 +59,8 @@ for router in $routers; do
 done
 member operator operator --address "$(some_address)"
 member bridge bridge --address "$(some_address)"
+aira account new "$work/validator/account.json" --password-file "$work/validator/password" > /dev/null
+member validator validator --keyfile "$work/validator/account.json"
 member page person --role operator --host page --host localhost --host 127.0.0.1 --address "$(some_address)"
 od -An -tx1 -N16 /dev/urandom | tr -d ' \n' > "$work/page/browser.token"
 
@@ -82,7 +84,7 @@ done
 for router in $routers; do
     cp "$work/roster.toml" "$work/$router/"
 done
-for one in authority $routers provider agent person edge bridge page operator; do
+for one in authority $routers provider agent person edge bridge validator page operator; do
     hand_over "$one"
 done
 date -u +"made %Y-%m-%d %H:%M:%S UTC, certificates for 90 days" > "$made"

@@ -191,7 +191,7 @@ class ValidatorSettings:
     validator_policies: tuple[str, ...] = option(
         ("complete",), "policies to judge by: complete (always on), acknowledged, schema, rate"
     )
-    validator_fee: str = option("0", "least fee for a verdict, in XRT (0.1) or wn (100wn); who pays less gets none")
+    validator_fee: str = option("0", "least fee, in XRT (0.1) or wn (100wn); a job that pays less never counts")
     validator_title: str = option("", "the validator's title in its announcement, for people")
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from mesh.flood import Rate, RateLimiter
 from mesh.log_context import liability_context, log_event
 from mesh.retry import Backoff, RetryPolicy
 from mesh.validator.ledger import signed_result
+from mesh.validator.times import arrived_ns
 from mesh.work.outbox import RESEND
 from schemas import ReportKey, Result, decode
 
@@ -100,7 +100,7 @@ class Cases:
         address, ledger = case.stored.liability.address, self._parts.ledger
         is_promisors = result.signer == case.stored.liability.promisor
         if is_promisors and not case.stored.result:
-            await ledger.take(address, result.message, seen_ns=time.time_ns())
+            await ledger.take(address, result.message, seen_ns=await arrived_ns(self._parts.chain))
             case.stored = await ledger.verdict(address) or case.stored
             case.changed.set()
         return True
@@ -145,7 +145,7 @@ class Cases:
         """Do what is left to do for a case, until it ends."""
         address = case.stored.liability.address
         with liability_context(address):
-            if not case.stored.report and not await self._decide(case):
+            if not case.stored.signed and not await self._decide(case):
                 return
             backoff, is_settled = Backoff(self._resend), False
             while True:
@@ -155,37 +155,31 @@ class Cases:
                     backoff.reset()
 
     async def _decide(self, case: OpenCase) -> bool:
-        """Sign what was decided, or refuse to decide. False if the case can't be decided."""
+        """Sign what was decided. False if the case can't be decided."""
         ledger, address = self._parts.ledger, case.stored.liability.address
-        if (refusal := self._judge.refusal(case.stored)) is not None:
-            await ledger.refuse(address, report=refusal.encode())
-            self._judge.verdicts["refused"] += 1
-            facts = log_event("case-refused", fee=case.stored.liability.validator_fee)
-            log.warning("%s", refusal.findings[0].detail, extra=facts)
-        else:
-            while not case.stored.result:
-                await case.wait()
-            if (decision := await self._judge.decide(case.stored)) is None:
-                return False
-            report = decision.report
-            signed = Result(liability=address, result=report.result, success=report.success)
-            await ledger.sign(signed, report=report.encode(), marks=decision.marks)
-            self._judge.verdicts["success" if report.success else "no-success"] += 1
-            codes = ",".join(finding.code for finding in report.failures)
-            facts = log_event("verdict-signed", success=report.success, result=report.result, findings=codes)
-            log.info("judged: %s", "success" if report.success else f"no success ({codes})", extra=facts)
-        case.stored = await ledger.verdict(address) or case.stored
+        if why := self._judge.underpaid(case.stored.liability):
+            facts = log_event("case-underpaid", fee=case.stored.liability.validator_fee)
+            log.warning("%s; its result will not count", why, extra=facts)
+        while not case.stored.result:
+            await case.wait()
+        if (decision := await self._judge.decide(case.stored)) is None:
+            return False
+        report = decision.report
+        signed = Result(liability=address, result=report.result, success=report.success)
+        case.stored = await ledger.sign(signed, report=report.encode(), marks=decision.marks)
+        self._judge.verdicts["success" if report.success else "no-success"] += 1
+        codes = ",".join(finding.code for finding in report.failures)
+        facts = log_event("verdict-signed", success=report.success, result=report.result, findings=codes)
+        log.info("judged: %s", "success" if report.success else f"no success ({codes})", extra=facts)
         return True
 
     async def _send(self, case: OpenCase, *, is_settled: bool) -> bool:
-        """Send the report to both parties and, if one was signed, the verdict; whether it is on the chain."""
+        """Send the report to both parties, and the verdict; whether this account has settled it on the chain."""
         stored, channel = case.stored, self._parts.channel
         with suppress(StoreFull):
             await asyncio.to_thread(self._parts.store.put_bytes, stored.report, pin=stored.liability.address)
         for party in {stored.liability.promisee, stored.liability.promisor}:
             channel.put(str(ReportKey(channel.lighthouse, party)), stored.report)
-        if not stored.signed:
-            return False
         if stored.liability.validator != self._parts.signer.address:
             channel.publish(signed_result(stored))
             return False

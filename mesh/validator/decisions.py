@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from mesh.validator.components import ValidatorComponents
     from mesh.validator.ledger import StoredVerdict
+    from schemas import Liability
     from schemas.model import ModelDescription
 
 log = logging.getLogger(__name__)
@@ -81,7 +82,7 @@ class CaseJudge:
         """The liabilities of successes by the marks of their recordings, before the ledger has them."""
         self._models = Models(parts.store, parts.exchange)
         self.verdicts: Counter[str] = Counter()
-        """What was decided since the start: `success`, `no-success`, `refused`."""
+        """What was decided since the start: `success`, `no-success`."""
         self.seconds = 0.0
         """Seconds that judging took since the start."""
 
@@ -92,34 +93,34 @@ class CaseJudge:
             if not work.outcome.done():
                 await self._judge(work)
 
-    def refusal(self, stored: StoredVerdict) -> ValidatorReport | None:
-        """The report on a liability that pays too little to be judged; None for one that pays enough."""
-        pays, asks = stored.liability.validator_fee, self._parts.terms.fee
+    def underpaid(self, liability: Liability) -> str:
+        """Why the liability is not judged because of the fee that it pays; empty if it pays enough."""
+        pays, asks = liability.validator_fee, self._parts.terms.fee
         if pays >= asks:
-            return None
-        detail = f"not judged: the liability pays {XRT.show(pays)}, and the validator asks for {XRT.show(asks)}"
-        finding = ReportFinding(policy="fee", code="fee-too-low", holds=False, detail=detail)
-        return self._report(
-            stored, stored.liability.objective, claimed=False, judgement=Judgement(success=False, findings=(finding,))
-        )
+            return ""
+        return f"not judged: the liability pays {XRT.show(pays)}, and this validator asks for {XRT.show(asks)}"
 
     async def decide(self, stored: StoredVerdict) -> Decision | None:
         """Decide a case whose Result has arrived; None if its files or the judgement never came."""
         claim = decode(stored.result)
         assert isinstance(claim, Result)
+        judgement = await self._judgement(stored, claim)
+        if judgement is None:
+            return None
+        report = self._report(stored, claim, judgement)
+        return Decision(report, judgement.marks if report.success else ())
+
+    async def _judgement(self, stored: StoredVerdict, claim: Result) -> Judgement | None:
+        """The judgement on a claim. A failure that is certain needs no files."""
         if not claim.success:
-            judgement = _failed("claimed", "the promisor does not claim success")
-            return Decision(self._report(stored, claim.result, claimed=False, judgement=judgement))
+            return _failed(COMPLETE.name, "claimed", "the promisor does not claim success")
+        if why := self.underpaid(stored.liability):
+            return _failed("fee", "fee-too-low", why)
         try:
             files = await self._fetch(stored, claim.result)
         except ContentTooLarge as error:
-            judgement = _failed(error.code, "a file is larger than this validator takes")
-            return Decision(self._report(stored, claim.result, claimed=True, judgement=judgement))
-        found = None if files is None else await self._judged_in_turn(stored, claim, *files)
-        if found is None:
-            return None
-        report = self._report(stored, claim.result, claimed=True, judgement=found)
-        return Decision(report, found.marks if report.success else ())
+            return _failed(COMPLETE.name, error.code, "a file is larger than this validator takes")
+        return None if files is None else await self._judged_in_turn(stored, claim, *files)
 
     async def _judged_in_turn(
         self, stored: StoredVerdict, claim: Result, objective: Path, recording: Path
@@ -214,22 +215,22 @@ class CaseJudge:
             return await chain.retrying(ask, outages=self._parts.outages)
         return None
 
-    def _report(self, stored: StoredVerdict, result: str, *, claimed: bool, judgement: Judgement) -> ValidatorReport:
+    def _report(self, stored: StoredVerdict, claim: Result, judgement: Judgement) -> ValidatorReport:
         signer = self._parts.signer
         return ValidatorReport(
             liability=stored.liability.address,
             objective=stored.liability.objective,
-            result=result,
+            result=claim.result,
             validator=stored.liability.validator,
             juror=signer.address,
-            claimed=claimed,
-            success=claimed and judgement.success,
+            claimed=claim.success,
+            success=claim.success and judgement.success,
             findings=judgement.findings,
             judged_at=int(time.time()),
         ).signed_by(signer)
 
 
-def _failed(code: str, detail: str) -> Judgement:
+def _failed(policy: str, code: str, detail: str) -> Judgement:
     """A judgement without a look into the recording."""
-    finding = ReportFinding(policy=COMPLETE.name, code=code, holds=False, detail=detail)
+    finding = ReportFinding(policy=policy, code=code, holds=False, detail=detail)
     return Judgement(success=False, findings=(finding,))

@@ -40,12 +40,11 @@ CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NUL
 """
 COLUMNS: Final = "record, since, result, seen, signed, report, ended"
 STAGE: Final = (
-    "CASE WHEN ended THEN 'ended' WHEN signed != x'' THEN 'signed' WHEN report != x'' THEN 'refused'"
-    " WHEN result != x'' THEN 'judging' ELSE 'waiting' END"
+    "CASE WHEN ended THEN 'ended' WHEN signed != x'' THEN 'signed' WHEN result != x'' THEN 'judging' ELSE 'waiting' END"
 )
-STAGES: Final = ("waiting", "judging", "refused", "signed", "ended")
-"""Where a verdict is: it waits for the promisor's Result; the result is fetched and judged; the validator does not
-judge it; the verdict is signed; the chain has the end."""
+STAGES: Final = ("waiting", "judging", "signed", "ended")
+"""Where a verdict is: it waits for the promisor's Result; the result is fetched and judged; the verdict is signed;
+the chain has the end."""
 
 
 class StoredVerdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -124,13 +123,6 @@ class VerdictLedger:
         found = await self.verdict(address)
         assert found is not None, "the liability was opened"
         return found
-
-    async def refuse(self, liability: str, *, report: bytes) -> None:
-        """Keep the report on a liability that the juror does not judge. Nothing is signed."""
-        await self._database.run(
-            "UPDATE verdicts SET report = ?, changed = ? WHERE liability = ? AND report = x''",
-            (report, time.time(), liability),
-        )
 
     async def end(self, liability: str, *, ended: bool = True) -> None:
         """The chain has the end of a liability; or not any more, after a reorganisation."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from contextlib import aclosing
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -27,6 +26,7 @@ from mesh.validator.cases import Cases
 from mesh.validator.decisions import CaseJudge
 from mesh.validator.publishing import Announcements, ReportService
 from mesh.validator.status import ValidatorStatus
+from mesh.validator.times import created_ns
 from mesh.work.outbox import RESEND
 from schemas import Result
 
@@ -167,7 +167,7 @@ class ValidatorRuntime(Role):
         created = [event.liability for event in block.events if isinstance(event, NewLiability)]
         named = [one for one in await self._read(created) if not one.is_finalized and self._is_named(one)]
         if named:
-            since_ns = await self._time_of(block.block_number)
+            since_ns = await created_ns(self.parts.chain, block.block_number)
             for liability in named:
                 await self.cases.open(liability, since_ns=since_ns)
 
@@ -179,16 +179,6 @@ class ValidatorRuntime(Role):
 
     def _is_named(self, liability: Liability) -> bool:
         return liability.validator in self.parts.bench.validators and liability.lighthouse == self.parts.channel.address
-
-    async def _time_of(self, block: int) -> int:
-        """When a block was made, in nanoseconds of this machine's clock; never in the future."""
-        node = self.parts.chain.node
-        header, head = await node.header(block), await node.header("latest")
-        now = time.time_ns()
-        if header is None or head is None:
-            return now
-        ahead = max(0, head.timestamp * 10**9 - now)
-        return min(now, header.timestamp * 10**9 - ahead)
 
     async def _revert(self, event: ChainEvent) -> None:
         match event:

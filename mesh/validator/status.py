@@ -67,7 +67,7 @@ class ValidatorStatus:
         """The metrics now."""
         parts, judge = self._parts, self._judge
         usage = await asyncio.to_thread(parts.store.usage)
-        verdicts = {"success": 0.0, "no-success": 0.0, "refused": 0.0} | dict(judge.verdicts)
+        verdicts = {"success": 0.0, "no-success": 0.0} | dict(judge.verdicts)
         stages = {stage: float(count) for stage, count in (await parts.ledger.stages()).items()}
         families = (
             *message_families([self._results]),

@@ -45,7 +45,7 @@ class Validator(Lifecycle):
 
     In generation 5 it is a juror of the `contract` (ENS name or address), in generation 3 the account itself. It judges
     by the shipped `policies`, of which `complete` is always one, and by its own checks (see `check`). A liability that
-    pays less than `fee` (`"0.1 XRT"`, or wn) is not judged. What is not given is taken from the settings, which are
+    pays less than `fee` (`"0.1 XRT"`, or wn) does not count. What is not given is taken from the settings, which are
     loaded if they are not given either. It opens nothing before `run` or `async with`. `account` and `chain` (open)
     are used instead of those that the settings name; `resend` is how often verdicts without effect are sent again.
     Raises `InvalidPolicy`, `InvalidAmount`.

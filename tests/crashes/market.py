@@ -17,7 +17,7 @@ import pytest
 from mesh.chain import NewLiability
 from mesh.chain.reader import list_created
 from tests.crashes.points import GO, REACHED
-from tests.crashes.process import CONTROL, COST, OBJECTIVE, POINT, WORDS
+from tests.crashes.process import CONTROL, COST, OBJECTIVE, POINT, VALIDATOR, WORDS
 from tests.mesh.operations.site import Site
 from tests.support.commands import Serving, invoke
 from tests.support.content import ROOT
@@ -41,7 +41,13 @@ CLOCK_JUMP: Final = -3_600.0
 REORGANISED: Final = 3
 """Blocks that a reorganisation drops with their transactions."""
 DISK_BYTES: Final = 16 << 20
-READY: Final = {"provider": "provider-started", "robot": "agent-started", "person": "person-started"}
+READY: Final = {
+    "provider": "provider-started",
+    "robot": "agent-started",
+    "validator": "validator-started",
+    "person": "person-started",
+}
+"""What each role logs when it has started, in the order in which they start."""
 STEP_NS: Final = 10**8
 
 
@@ -101,10 +107,14 @@ class CrashMarket:
     def _start_for(self, cell: Cell, control: Path, work: Path, disk: Path | None) -> None:
         """Start the process that reaches the point, and those that are not running; the person at last."""
         self._stop(cell.at)
-        for role in ("provider", "robot", "person"):
+        for role in _roles_of(cell):
             if role not in self._running:
                 armed = {POINT: str(cell.point), CONTROL: str(control)} if role == cell.at else {}
-                self._start(role, work, disk if role == cell.victim else None, **armed)
+                self._start(role, work, disk if role == cell.victim else None, **self._validator(cell), **armed)
+
+    def _validator(self, cell: Cell) -> dict[str, str]:
+        """The validator of a cell's job, as a variable of the person."""
+        return {VALIDATOR: self.site.address("validator")} if "validator" in _roles_of(cell) else {}
 
     def _start(self, role: str, work: Path, disk: Path | None, **armed: str) -> None:
         options = {"log_format": "json", "playback": "recorded"}
@@ -164,14 +174,14 @@ class CrashMarket:
 
     def _revive(self, work: Path, cell: Cell) -> None:
         disk = self.folder / "disk" if cell.fault == "disk" else None
-        for role in READY:
+        for role in _roles_of(cell):
             process = self._running.get(role)
             is_over = process is not None and role == "person" and "person-done" in process.log()
             if process is None or not (is_over or process.is_running):
                 if process is not None:
                     self._ended_logs.append((f"{role}, which ended", process.log()))
                 self._stop(role)
-                self._start(role, work, disk if role == cell.victim else None)
+                self._start(role, work, disk if role == cell.victim else None, **self._validator(cell))
 
     def _check(self, cell: Cell, work: Path, liability: Liability, before: dict[str, int]) -> None:
         """Paid once or refunded, and `aira verify` holds. Only a full disk may end a job without success."""
@@ -229,6 +239,11 @@ class CrashMarket:
     def _stop_all(self) -> None:
         for role in list(self._running):
             self._stop(role, how="kill")
+
+
+def _roles_of(cell: Cell) -> list[str]:
+    """The processes that a cell needs, in the order in which they start. Only its own cells have a validator."""
+    return [role for role in READY if role != "validator" or cell.victim == role]
 
 
 def _fill(filler: Path) -> None:

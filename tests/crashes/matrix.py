@@ -15,6 +15,8 @@ TRADER, OUTBOX = "mesh.agent.trade:Trader", "mesh.work.outbox:Outbox"
 LEDGER, LISTENER = "mesh.work.ledger:Ledger", "mesh.agent.listener:ChainListener"
 PLAYBACKS, RUN = "mesh.work.playbacks:Playbacks", "mesh.work.run:JobRun"
 EXECUTOR, CONTENT = "mesh.work.executor:Executor", "mesh.content.store:Store"
+CASES, JUDGE = "mesh.validator.cases:Cases", "mesh.validator.decisions:CaseJudge"
+VERDICTS = "mesh.validator.ledger:VerdictLedger"
 
 POINTS: Final = {
     "provider": (
@@ -53,6 +55,23 @@ POINTS: Final = {
         Point("before", f"{LISTENER}.finalized"),
         Point("after", f"{LISTENER}.finalized"),
     ),
+    "validator": (
+        Point("before", f"{CASES}.open"),
+        Point("after", f"{VERDICTS}.open"),
+        Point("before", f"{VERDICTS}.take"),
+        Point("after", f"{VERDICTS}.take"),
+        Point("before", f"{JUDGE}._fetch"),
+        Point("before", f"{JUDGE}._judge"),
+        Point("after", f"{JUDGE}._judge"),
+        Point("before", f"{VERDICTS}.sign"),
+        Point("after", f"{VERDICTS}.sign"),
+        Point("before", f"{CASES}._settle"),
+        Point("after", f"{SENDER}._send_numbered"),
+        Point("after", f"{CONFIRMATION}.wait"),
+        Point("after", f"{CASES}._settle"),
+        Point("before", f"{CASES}.end"),
+        Point("after", f"{CASES}.end"),
+    ),
     "person": (
         Point("before", f"{TRADER}.post"),
         Point("after", f"{TRADER}.post"),
@@ -81,6 +100,7 @@ SHARED: Final = (
 FAULTS: Final = {
     "provider": ("kill", "stop", "disk", "clock"),
     "robot": ("kill", "stop", "disk", "clock"),
+    "validator": ("kill", "stop", "disk", "clock"),
     "person": ("kill", "stop", "disk", "clock"),
     "router": ("kill", "stop"),
     "node": ("stop", "reorganise"),

@@ -24,6 +24,8 @@ RESEND: Final = RetryPolicy(initial=0.3, ceiling=1.0)
 POINT: Final = "CRASH_POINT"
 CONTROL: Final = "CRASH_CONTROL"
 OBJECTIVE: Final = "CRASH_OBJECTIVE"
+VALIDATOR: Final = "CRASH_VALIDATOR"
+"""The validator that the person's demand names, if any."""
 
 
 def provider() -> None:
@@ -31,6 +33,13 @@ def provider() -> None:
     from mesh.cli import main
 
     main(["provider"])
+
+
+def validator() -> None:
+    """`aira validator`, for its own account."""
+    from mesh.cli import main
+
+    main(["validator"])
 
 
 def robot() -> None:
@@ -58,7 +67,9 @@ async def _demand(objective: Path) -> None:
     async with Agent(MODEL, resend=RESEND) as agent:
         print("person-started", flush=True)
         cid = await agent.add(objective)
-        contract = await _demanded(agent, cid) or await agent.demand(cid, cost=COST)
+        contract = await _demanded(agent, cid) or await agent.demand(
+            cid, cost=COST, validator=os.environ.get(VALIDATOR, "")
+        )
         outcome = await contract.outcome()
         if outcome.success:
             await contract.recording()
@@ -75,7 +86,7 @@ async def _demanded(agent: Agent, objective: str) -> Contract | None:
     return None
 
 
-ROLES: Final = {"provider": provider, "robot": robot, "person": person}
+ROLES: Final = {"provider": provider, "validator": validator, "robot": robot, "person": person}
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ SAMPLE: Final = (
     "provider-disk-",
     "robot-kill-",
     "robot-clock-",
+    "validator-kill-",
     "person-kill-",
     "node-reorganise-",
 )

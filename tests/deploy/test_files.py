@@ -109,7 +109,7 @@ def test_a_service_gets_only_its_own_secrets_and_read_only() -> None:
             if "secrets" in mount and name != "setup":
                 assert mount.endswith("-secrets}:/secrets:ro"), f"{name}: {mount}"
                 assert seen.setdefault(mount, name) == name
-    assert len(seen) == 8
+    assert len(seen) == 9
 
 
 def test_no_port_is_open_to_other_machines_by_default() -> None:

@@ -23,8 +23,10 @@ from schemas import (
     PresenceKey,
     ReadingKey,
     RejectKey,
+    ReportKey,
     ResultKey,
     RpcKey,
+    ValidatorKey,
     WithdrawalKey,
 )
 from tests.support.sites import MARKET
@@ -32,13 +34,14 @@ from tests.support.sites import MARKET
 ADDRESSES = {
     name: "0x" + f"{number:02x}" * 20
     for number, name in enumerate(
-        ("arm", "crane", "ann", "miner", "boss", "board", "bridge", "screen", "stranger", "gone", "witness"), 1
+        ("arm", "crane", "ann", "miner", "boss", "board", "bridge", "screen", "stranger", "gone", "witness", "judge"), 1
     )
 }
 MEMBERS = (
     Member(name="arm", address=ADDRESSES["arm"], roles=("agent",)),
     Member(name="ann", address=ADDRESSES["ann"], roles=("person",)),
     Member(name="miner", address=ADDRESSES["miner"], roles=("provider",)),
+    Member(name="judge", address=ADDRESSES["judge"], roles=("validator",)),
     Member(name="boss", address=ADDRESSES["boss"], roles=("operator",)),
     Member(name="board", address=ADDRESSES["board"], roles=("edge",), agent=ADDRESSES["arm"]),
     Member(name="bridge", address=ADDRESSES["bridge"], roles=("bridge",)),
@@ -46,7 +49,7 @@ MEMBERS = (
     Member(name="gone", address=ADDRESSES["gone"], roles=("agent", "provider"), revoked=True),
     Member(name="witness", address=ADDRESSES["witness"], roles=("router",)),
 )
-WHO = ("arm", "ann", "miner", "boss", "board", "bridge", "screen", "stranger", "gone")
+WHO = ("arm", "ann", "miner", "judge", "boss", "board", "bridge", "screen", "stranger", "gone")
 """The identities of the matrix. The stranger has a certificate of the site and is not in the roster."""
 
 MODEL = "QmWATWQ7fVPP2EFGu71UkfnqhYXDYH566qy47CnJDgvs8u"
@@ -70,7 +73,17 @@ def space(agent: str, device: str) -> dict[str, str]:
 def keys_of(who: str) -> dict[str, str]:
     """A key of each family: the own ones, those of a robot that the board serves, and those of others."""
     own, other = ADDRESSES[who], ADDRESSES["crane"]
-    roles = ("agent", "person", "provider", "operator", "edge", "bridge", "bridge-turn-0-00000000000000ff", "watcher")
+    roles = (
+        "agent",
+        "person",
+        "provider",
+        "validator",
+        "operator",
+        "edge",
+        "bridge",
+        "bridge-turn-0-00000000000000ff",
+        "watcher",
+    )
     keys: dict[str, Any] = {
         "demand": DemandKey(MARKET, MODEL),
         "offer": OfferKey(MARKET, MODEL),
@@ -82,6 +95,9 @@ def keys_of(who: str) -> dict[str, str]:
         "other reject": RejectKey(MARKET, other),
         "decline": DeclineKey(MARKET, own),
         "other decline": DeclineKey(MARKET, other),
+        "report": ReportKey(MARKET, own),
+        "other report": ReportKey(MARKET, other),
+        "validator": ValidatorKey(MARKET, other),
         "other market": DemandKey("elsewhere.lighthouse.3.robonomics.eth", MODEL),
         "other presence": PresenceKey(MARKET, "agent", other),
         "nowhere": "aira/nowhere",
@@ -110,6 +126,9 @@ OTHER = {
 MARKETS = {"demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "other reject"} | {
     "decline",
     "other decline",
+    "report",
+    "other report",
+    "validator",
 }
 PRESENCES = {name for name in KEYS["arm"] if name.startswith("as ")} | {"other presence"}
 NOBODY: dict[str, set[str]] = {who: set() for who in WHO}
@@ -118,15 +137,17 @@ PUT = NOBODY | {
     "arm": OWN | {"offer", "withdrawal", "result", "decline", "other decline"},
     "ann": OWN | {"demand", "withdrawal"},
     "miner": OWN | {"feedback", "pending", "reject", "other reject"},
+    "judge": OWN | {"result", "report", "other report"},
     "boss": OWN,
     "board": {"robot topic", "robot device"},
     "bridge": OWN | {"demand", "offer", "withdrawal", "result", "feedback", "pending"},
 }
-DELETE = NOBODY | dict.fromkeys(("arm", "ann", "miner", "boss", "bridge"), OWN)
+DELETE = NOBODY | dict.fromkeys(("arm", "ann", "miner", "judge", "boss", "bridge"), OWN)
 SERVE = NOBODY | {
     "arm": OWN,
     "ann": OWN,
     "miner": OWN | MARKETS,
+    "judge": OWN | {"report", "other report", "validator"},
     "boss": OWN,
     "board": {"robot topic", "robot device"},
     "bridge": OWN,
@@ -135,6 +156,7 @@ TOKEN = NOBODY | {
     "arm": OWN | {"as agent"},
     "ann": OWN | {"as agent", "as person"},
     "miner": OWN | {"as provider"},
+    "judge": OWN | {"as validator"},
     "boss": OWN | {"as operator"},
     "board": {"robot device"},
     "bridge": OWN | {"as bridge", "as bridge-turn-0-00000000000000ff"},
@@ -143,6 +165,7 @@ GET = NOBODY | {
     "arm": OWN | MARKETS | {"other cid"},
     "ann": OWN | MARKETS | {"other cid"},
     "miner": OWN | MARKETS,
+    "judge": OWN | MARKETS | {"other cid"},
     "boss": OWN | OTHER | MARKETS,
     "board": {"robot device"},
     "bridge": OWN | MARKETS | {"other cid"},
@@ -152,6 +175,7 @@ SUBSCRIBE = NOBODY | {
     "arm": OWN | MARKETS | {"other reading"},
     "ann": OWN | MARKETS | {"other reading"},
     "miner": OWN | MARKETS,
+    "judge": OWN | MARKETS,
     "boss": OWN | OTHER | MARKETS,
     "board": {"robot topic", "robot device", "robot event", "robot objective"},
     "bridge": OWN | MARKETS,
@@ -161,6 +185,7 @@ PRESENCE = NOBODY | {
     "arm": OWN | PRESENCES,
     "ann": OWN | PRESENCES,
     "miner": OWN | PRESENCES,
+    "judge": OWN | PRESENCES,
     "boss": OWN | OTHER | PRESENCES,
     "board": {"robot device"},
     "bridge": OWN | PRESENCES,

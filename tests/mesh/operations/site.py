@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from schemas import Demand, Verified
 
 MODEL: Final = cid_of_bytes(b"what the robots of the operated market can do")
-PEOPLE: Final = (*ROLES, "rival", "poor")
-"""The roles with an account; `rival` and `poor` have ETH only."""
+PEOPLE: Final = (*ROLES, "rival", "poor", "validator")
+"""The roles with an account; `rival`, `poor` and `validator` have ETH only."""
 FEE: Final = 5
 """The lighthouse fee of the robot's offers, wn."""
 PASSWORD: Final = "only for tests"

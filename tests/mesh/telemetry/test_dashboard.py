@@ -17,6 +17,7 @@ from mesh.network import Endpoints, Network
 from mesh.telemetry.health import health_metrics
 from mesh.telemetry.metrics import labelled
 from mesh.telemetry.server import render_metrics
+from mesh.validator.validator import Validator
 from schemas.status import ContentMetrics
 from tests.bridges.ipfs.statuses import direction, status
 from tests.support.scraping import Scrape
@@ -72,23 +73,30 @@ def bridge() -> tuple[MetricFamily, ...]:
 
 
 async def role_families(place: Place) -> list[MetricFamily]:
-    """Of a provider that has rejected and taken back something, and of an agent."""
+    """Of a provider that has rejected and taken back something, of an agent, and of a validator."""
     robot: Agent = place.agent("robot")
 
     @robot.on_demand
     async def hear(demand: object) -> None:
         """So that the agent hears something."""
 
+    account, chain = place.market.accounts["person"], place.chains["person"]
+    validator = Validator(settings=place.settings("judge"), account=account, chain=chain)
     async with (
         Network(Endpoints(connect=(place.endpoint,))) as network,
         Provider(network.session, place.chains["provider"], place.market.deployment.lighthouse_name) as provider,
         robot,
+        validator,
     ):
         provider.ledger.rejected("DeadlineReached")
         process = ProviderProcess(network, place.chains["provider"], [provider])
         # They tell nothing over HTTP here, and measure the same.
         of_provider = [*await process.measure(), health_metrics(process.health())]
-        return [*labelled(of_provider, role="provider"), *labelled(await robot.telemetry.measure(), role="agent")]
+        return [
+            *labelled(of_provider, role="provider"),
+            *labelled(await robot.telemetry.measure(), role="agent"),
+            *labelled(await validator.telemetry.measure(), role="validator"),
+        ]
 
 
 @pytest.fixture

@@ -54,6 +54,12 @@ class Court:
         )
         return await self._stack.enter_async_context(chain)
 
+    async def jury(self, *numbers: int, quorum: int = 1) -> str:
+        """The address of a validator contract with these jurors."""
+        keeper = await self.chain(self.place.market.accounts["person"])
+        made = await keeper.validators.deploy([self.account(number).address for number in numbers], quorum)
+        return made.address
+
     async def validator(self, number: int = 0, contract: str = "", **options: Any) -> Validator:
         """A juror, not yet running; always with the same ledger."""
         account = self.account(number)

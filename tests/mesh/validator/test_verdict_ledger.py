@@ -98,10 +98,9 @@ async def test_stages(ledger: VerdictLedger) -> None:
     await judged(ledger, "one")
     await judged(ledger, "two")
     await ledger.end(liability("two").address)
-    for name in ("three", "four", "five"):
+    for name in ("three", "four"):
         await ledger.open(liability(name), since_ns=1)
     await ledger.take(liability("four").address, result_of("four"), seen_ns=2)
-    await ledger.refuse(liability("five").address, report=b"{}")
-    assert await ledger.stages() == {"signed": 1, "ended": 1, "waiting": 1, "judging": 1, "refused": 1}
+    assert await ledger.stages() == {"signed": 1, "ended": 1, "waiting": 1, "judging": 1}
     await ledger.end(liability("two").address, ended=False)
     assert (await ledger.stages())["signed"] == 2

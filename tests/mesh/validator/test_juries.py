@@ -1,0 +1,95 @@
+"""Whole jobs of generation 5, which name a contract with jurors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.validator.components import NotAJuror, NotAValidator
+from schemas import Result
+from tests.mesh.validator.courts import PRICE, Court, announcements_of, claim, liar, reports_on
+from tests.support.objectives import objective
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from tests.support.market import Place
+
+
+async def test_a_validated_job_is_paid(place: Place) -> None:
+    async with Court(place, 5) as court:
+        jury = await court.jury(0)
+        validator, robot = await court.validator(0, jury), await court.robot()
+        async with court.at_work(validator, robot) as person:
+            before = await place.balance("robot")
+            contract = await court.demand(person, jury)
+            assert (await contract.outcome()).success
+            assert await place.balance("robot") == before + PRICE
+            assert [report.success for report in await reports_on(person, contract)] == [True]
+            (announcement,) = await announcements_of(person, jury)
+            assert (announcement.validator, announcement.juror) == (jury, validator.address)
+            assert (announcement.quorum, announcement.jurors) == (1, 1)
+
+
+async def test_undone_work_is_refunded(place: Place) -> None:
+    async with Court(place, 5) as court:
+        jury = await court.jury(0)
+        validator, robot = await court.validator(0, jury), await liar(court)
+        async with court.at_work(validator, robot) as person:
+            contract = await court.demand(person, jury)
+            recording = await robot.add(place.save(objective(("/go", "nowhere")), "lie.mcap"))
+            await claim(robot, contract, recording)
+            assert not (await contract.outcome()).success
+
+
+async def test_two_jurors_of_one_contract_may_both_answer(place: Place) -> None:
+    async with Court(place, 5) as court:
+        jury = await court.jury(0, 1)
+        members = await court.validator(0, jury), await court.validator(1, jury), await court.robot()
+        async with court.at_work(*members) as person:
+            assert {one.juror for one in await announcements_of(person, jury)} == {
+                members[0].address,
+                members[1].address,
+            }
+            for _ in range(2):
+                assert (await (await court.demand(person, jury)).outcome()).success
+
+
+async def test_a_quorum_must_agree(place: Place) -> None:
+    """Two of three: the third is silent."""
+    async with Court(place, 5) as court:
+        jury = await court.jury(0, 1, 2, quorum=2)
+        first, second, robot = await court.validator(0, jury), await court.validator(1, jury), await court.robot()
+        async with court.at_work(first, robot) as person:
+            contract = await court.demand(person, jury)
+            await until_found(lambda: reports_on(person, contract), what="the first report")
+            assert not (await place.chains["person"].liabilities.get(contract.address)).is_finalized
+            async with second:
+                assert (await contract.outcome()).success
+
+
+async def test_what_others_sign_counts_for_nothing(place: Place) -> None:
+    """A stranger's verdict, and nonsense: the job waits for the juror."""
+    async with Court(place, 5) as court:
+        jury = await court.jury(0)
+        validator, robot = await court.validator(0, jury), await court.robot()
+        async with court.at_work(robot) as person:
+            contract = await court.demand(person, jury)
+            for success in (True, False):
+                person.send(Result(liability=contract.address, result=contract.liability.objective, success=success))
+            async with validator:
+                outcome = await contract.outcome()
+            assert outcome.success
+            assert outcome.result != contract.liability.objective
+
+
+async def test_what_is_no_validator_of_this_account_is_refused_at_the_start(place: Place) -> None:
+    async with Court(place, 5) as court:
+        for contract, error in (
+            (await court.jury(1), NotAJuror),
+            (place.market.deployment.lighthouse, NotAValidator),
+            (place.address("robot"), NotAValidator),
+        ):
+            with pytest.raises(error):
+                async with await court.validator(0, contract):
+                    pass
