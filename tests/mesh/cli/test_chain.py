@@ -202,6 +202,8 @@ ON_A_CHAIN = [
     ("liability", "watch"),
     ("liability", "watch", "0x00000000000000000000000000000000000000AA"),
     ("liability", "cancel", "0x00000000000000000000000000000000000000AA"),
+    ("validator", "deploy"),
+    ("validator", "collect", "0x00000000000000000000000000000000000000AA"),
 ]
 
 
