@@ -22,7 +22,7 @@ class FileExists(InputError, code="file-exists"):
 
 
 class ProgramUnusable(InputError, code="program-unusable"):
-    """A Python program can't be run, or has no agent, or several."""
+    """A Python program can't be run, or has no agent (or validator), or several."""
 
 
 class FolderMissing(InputError, code="folder-missing"):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NoReturn
 
 import click
 import msgspec
@@ -22,6 +23,8 @@ from mesh.settings import ChainSettings, options_of
 from schemas import parse_address
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+
     from mesh.settings import Settings
 
 FILE: Final = click.Path(path_type=Path)
@@ -54,14 +57,18 @@ def command(
     recording fail it, unless the job is known to have ended without success. The exit code is 0 if no check fails, 1 if
     one fails, and 2 if the checks could not run.
     """
+    files = VerifiedFiles(objective=objective, result=result, message=message)
+    exit_by_outcome(partial(verify_job, settings, liability, files, offline=offline, as_json=as_json))
+
+
+def exit_by_outcome(check: Callable[[], Awaitable[bool]]) -> NoReturn:
+    """Exit with 0 if the check holds, with 1 if it does not, and with 2 if it could not run."""
     exit_code = 0
 
     async def main() -> None:
         nonlocal exit_code
-        files = VerifiedFiles(objective=objective, result=result, message=message)
         try:
-            holds = await verify_job(settings, liability, files, offline=offline, as_json=as_json)
-            exit_code = 0 if holds else 1
+            exit_code = 0 if await check() else 1
         except AiraError as error:  # of any kind: exit code 1 means that a check failed
             report(error)
             exit_code = 2
@@ -134,9 +141,13 @@ def _print(claim: Claim, verdict: Verdict) -> None:
             "result": claim.result or None,
         }
     )
-    rows = [(MARKS[finding.holds], finding.name, printable(finding.detail)) for finding in verdict.findings]
-    print_table(("", "check", "found"), rows)
-    failed = sum(finding.holds is False for finding in verdict.findings)
-    unknown = sum(finding.holds is None for finding in verdict.findings)
+    print_findings([(finding.holds, finding.name, finding.detail) for finding in verdict.findings])
+
+
+def print_findings(findings: Sequence[tuple[bool | None, str, str]]) -> None:
+    """Print what was found: whether it holds, the name of the check, and what it says."""
+    print_table(("", "check", "found"), [(MARKS[holds], name, printable(detail)) for holds, name, detail in findings])
+    failed = sum(holds is False for holds, _, _ in findings)
+    unknown = sum(holds is None for holds, _, _ in findings)
     open_checks = f", {unknown} stayed open" if unknown else ""
-    click.echo(f"{failed} of {plural(len(verdict.findings), 'check')} failed{open_checks}")
+    click.echo(f"{failed} of {plural(len(findings), 'check')} failed{open_checks}")

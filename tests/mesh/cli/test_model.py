@@ -231,7 +231,7 @@ async def main() -> None:
 run_to_end(main)
 """
     done = aira("model", "new", program(tmp_path, text))
-    refused(done, ProgramUnusable, "robot.py starts an agent", exit_code=2)
+    refused(done, ProgramUnusable, "robot.py starts its agent", exit_code=2)
 
 
 @pytest.mark.parametrize(
