@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         NetworkUnavailable,
         RemoteError,
     )
+    from mesh.evidence import Finding
     from mesh.network import Reading
     from mesh.recording import Objective, Played, Recorder, RecordingAbout, open_objective, pack, pack_values
     from mesh.ros import RosTypes, UnknownRosType
@@ -87,6 +88,7 @@ _NAMES: Final = {
     "mesh.errors": (
         "AiraError ChainError ClosedError ConfigurationError ContentError InputError NetworkUnavailable RemoteError"
     ),
+    "mesh.evidence": "Finding",
     "mesh.network": "Reading",
     "mesh.recording": "Objective Played Recorder RecordingAbout open_objective pack pack_values",
     "mesh.ros": "RosTypes UnknownRosType",
@@ -142,6 +144,7 @@ __all__ = [
     "Demand",
     "Empty",
     "Evidence",
+    "Finding",
     "InputError",
     "InsufficientTokens",
     "InvalidDescription",
