@@ -24,6 +24,7 @@ PLOT = EXAMPLES / "air_pollution" / "plot.py"
 VOLTS = {"dust": 0.5, "CO": 1.0, "LPG": 1.5, "methane": 2.0, "smoke": 2.5, "hydrogen": 3.0}
 
 
+@pytest.mark.full
 @pytest.mark.sample("protocol")
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_person_gets_the_measurements_of_the_sensors(protocol: str, market: dict[str, str], tmp_path: Path) -> None:

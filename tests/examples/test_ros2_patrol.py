@@ -6,6 +6,7 @@ import re
 import sys
 from typing import TYPE_CHECKING, Any
 
+import pytest
 from rosbags.highlevel import AnyReader
 
 from mesh.recording import open_objective
@@ -24,6 +25,7 @@ EXAMPLE = EXAMPLES / "ros2_patrol"
 PLACES = ((1.0, 0.0), (1.0, 1.0))
 
 
+@pytest.mark.full
 def test_a_ros_2_robot_drives_to_poses_for_money(market: dict[str, str], tmp_path: Path) -> None:
     ros = {"ROS2_CONNECT": f"tcp/127.0.0.1:{free_port()}"}
     robot, person = as_role("robot", market) | ros, as_role("person", market)

@@ -45,6 +45,7 @@ def test_the_docs_show_the_program() -> None:
     assert shown == (EXAMPLE / "robot.py").read_text()
 
 
+@pytest.mark.full
 def test_a_job_that_fits_is_paid_and_another_one_is_not_ordered(
     market: dict[str, str], objectives: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -76,6 +76,7 @@ def test_anvil_does_not_outlive_a_command_that_is_killed(tmp_path: Path) -> None
         wait_until(lambda: not is_running(anvil) and not answers(port), what="the end of anvil")
 
 
+@pytest.mark.full
 def test_a_crash_of_anvil_is_logged_and_ends_the_command(tmp_path: Path) -> None:
     with up(tmp_path, "--anvil", require("anvil"), port=free_port()) as server:
         os.kill(child_of(server.pid), signal.SIGKILL)
@@ -119,6 +120,7 @@ def test_the_embedded_chain_is_used_without_anvil(tmp_path: Path) -> None:
         assert json.loads(status.stdout)["factory"] == announced["factory"]
 
 
+@pytest.mark.full
 def test_the_embedded_chain_can_be_selected(tmp_path: Path, on_path: dict[str, str]) -> None:
     with up(tmp_path, "--engine", "embedded", port=0, **on_path) as server:
         assert columns(server.log())["engine"] == "embedded"

@@ -32,6 +32,7 @@ agent.run()
 """
 
 
+@pytest.mark.full
 @pytest.mark.sample("kept")
 @pytest.mark.parametrize("kept", [False, True], ids=["a new chain", "the same chain"])
 def test_a_running_robot_survives_a_restart_of_the_market(tmp_path: Path, kept: bool) -> None:

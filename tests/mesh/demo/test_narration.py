@@ -57,6 +57,7 @@ def test_the_text_has_the_steps_in_their_order() -> None:
         assert any(line.startswith(step) for line in lines), f"{step!r} is missing, or not in its place"
 
 
+@pytest.mark.full
 def test_messages_are_printed_without_control_characters(tmp_path: Path) -> None:
     """An objective may come from anyone; it must not control the terminal."""
     path = tmp_path / "odd.mcap"

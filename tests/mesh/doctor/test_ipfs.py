@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 from bridges.ipfs.check import checks
 from mesh.doctor import CheckStatus, DoctorContext
 from mesh.settings import Settings
@@ -39,6 +41,7 @@ async def test_a_daemon_with_pubsub_passes(js_ipfs: JsIpfs) -> None:
     assert found.one("ipfs pubsub").message.startswith("enabled; ")
 
 
+@pytest.mark.full
 async def test_a_daemon_without_pubsub_fails_and_one_without_peers_is_a_warning() -> None:
     with Mute() as mute:
         found = await found_at(mute.api)
