@@ -47,6 +47,9 @@ class OpenCase:
     stored: StoredVerdict
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     task: asyncio.Task[None] | None = None
+    is_settling: bool = False
+    """Whether a transaction is being sent, which is never cancelled halfway."""
+    has_ended: bool = False
 
     async def wait(self, seconds: float | None = None) -> bool:
         """Wait for a change, `seconds` at most; whether there was one."""
@@ -138,7 +141,9 @@ class Cases:
             return False
         self._of_promisor[case.stored.liability.promisor] -= 1
         self._of_promisor += Counter()  # forgets zeros
-        case.task.cancel()
+        case.has_ended = True
+        if not case.is_settling:
+            case.task.cancel()
         return True
 
     async def _work(self, case: OpenCase) -> None:
@@ -148,10 +153,10 @@ class Cases:
             if not case.stored.signed and not await self._decide(case):
                 return
             backoff, is_settled = Backoff(self._resend), False
-            while True:
+            while not case.has_ended:
                 if backoff.failures == 0 or self._rate.allow(""):
                     is_settled = await self._send(case, is_settled=is_settled)
-                if await case.wait(backoff.next_delay()):
+                if not case.has_ended and await case.wait(backoff.next_delay()):
                     backoff.reset()
 
     async def _decide(self, case: OpenCase) -> bool:
@@ -183,7 +188,11 @@ class Cases:
         if stored.liability.validator != self._parts.signer.address:
             channel.publish(signed_result(stored))
             return False
-        return is_settled or await self._settle(stored)
+        case.is_settling = True
+        try:
+            return is_settled or await self._settle(stored)
+        finally:
+            case.is_settling = False
 
     async def _settle(self, stored: StoredVerdict) -> bool:
         """Finalize a generation-3 liability, which names the account itself; whether that was mined."""
