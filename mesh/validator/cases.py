@@ -142,6 +142,7 @@ class Cases:
         self._of_promisor[case.stored.liability.promisor] -= 1
         self._of_promisor += Counter()  # forgets zeros
         case.has_ended = True
+        case.changed.set()
         if not case.is_settling:
             case.task.cancel()
         return True
@@ -152,11 +153,11 @@ class Cases:
         with liability_context(address):
             if not case.stored.signed and not await self._decide(case):
                 return
-            backoff, is_settled = Backoff(self._resend), False
+            backoff = Backoff(self._resend)
             while not case.has_ended:
                 if backoff.failures == 0 or self._rate.allow(""):
-                    is_settled = await self._send(case, is_settled=is_settled)
-                if not case.has_ended and await case.wait(backoff.next_delay()):
+                    await self._send(case)
+                if await case.wait(backoff.next_delay()):
                     backoff.reset()
 
     async def _decide(self, case: OpenCase) -> bool:
@@ -178,8 +179,8 @@ class Cases:
         log.info("judged: %s", "success" if report.success else f"no success ({codes})", extra=facts)
         return True
 
-    async def _send(self, case: OpenCase, *, is_settled: bool) -> bool:
-        """Send the report to both parties, and the verdict; whether this account has settled it on the chain."""
+    async def _send(self, case: OpenCase) -> None:
+        """Send the report to both parties, and the verdict to the providers or, in generation 3, to the chain."""
         stored, channel = case.stored, self._parts.channel
         with suppress(StoreFull):
             await asyncio.to_thread(self._parts.store.put_bytes, stored.report, pin=stored.liability.address)
@@ -187,15 +188,15 @@ class Cases:
             channel.put(str(ReportKey(channel.lighthouse, party)), stored.report)
         if stored.liability.validator != self._parts.signer.address:
             channel.publish(signed_result(stored))
-            return False
+            return
         case.is_settling = True
         try:
-            return is_settled or await self._settle(stored)
+            await self._settle(stored)
         finally:
             case.is_settling = False
 
-    async def _settle(self, stored: StoredVerdict) -> bool:
-        """Finalize a generation-3 liability, which names the account itself; whether that was mined."""
+    async def _settle(self, stored: StoredVerdict) -> None:
+        """Finalize a generation-3 liability, which names the account itself. One that has ended refuses it."""
         claim = decode(stored.result)
         assert isinstance(claim, Result)
         try:
@@ -209,5 +210,3 @@ class Cases:
         else:
             facts = log_event("verdict-settled", tx=settled.tx, gas=settled.gas_used)
             log.info("finalized, gas %d", settled.gas_used, extra=facts)
-            return True
-        return False
