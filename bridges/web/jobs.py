@@ -10,7 +10,7 @@ import msgspec
 
 from bridges.web.alerts import alerts_of, waiting_parts
 from bridges.web.views import liability_json, result_json
-from mesh.agent.judged_contract import code_of, verdict_words
+from mesh.agent.judged_contract import refusal
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
 from mesh.evidence import Claim, Verdict, check_end, verify
@@ -87,9 +87,8 @@ class Views:
             return None
         if not liability.result:
             return {"code": "no-result", "text": ""}
-        refused = next((one for one in job.reports.values() if one.claimed and not one.success), None)
-        if refused is not None:
-            return {"code": code_of(refused), "text": verdict_words(refused)}
+        if (refused := refusal(job.reports.values())) is not None:
+            return {"code": refused[1], "text": refused[0]}
         held = await asyncio.to_thread(self._parts.store.checked, liability.result)
         if held is None:
             return {"code": "recording-unavailable", "text": ""}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 
 from mesh.agent.errors import LiabilityReverted
-from mesh.agent.judged_contract import code_of, verdict_words
+from mesh.agent.judged_contract import refusal
 from mesh.agent.progress import Progress, followed_job, nothing, report
 from mesh.content import ContentUnavailable
 from mesh.errors import AiraError
@@ -130,13 +130,13 @@ class Contract:
 
     async def _reason(self, ended: Outcome) -> Reason:
         """Why the job failed, as its validator or its recording says."""
-        refused = next((one for one in ended.reports if one.claimed and not one.success), None)
+        refused = refusal(ended.reports)
         if not ended.result and self.liability.validator != ZERO_ADDRESS:
             return Reason("no result, or no verdict of the validator, came in time", "no-result")
         if not ended.result:
             return Reason("no result came in time", "no-result")
         if refused is not None:
-            return Reason(f"the validator judged: {verdict_words(refused)}", code_of(refused))
+            return Reason(*refused)
         try:
             timeout = min(REASON_TIMEOUT, self._parts.settings.fetch_timeout)
             return await asyncio.to_thread(read_reason, await self._fetch(ended.result, timeout))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from mesh.agent.progress import Progress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from schemas import Liability
     from schemas.verdicts import ValidatorReport
@@ -57,10 +57,22 @@ def verdict_words(report: ValidatorReport) -> str:
     """How a juror judged, and why, in one line. The reasons are the juror's own words."""
     if report.success:
         return "the work counts"
-    reasons = "; ".join(f"{one.detail} ({one.code})" if one.detail else one.code for one in report.failures)
-    return (
-        f"the work does not count: {reasons or ('no reason' if report.claimed else 'the promisor claims no success')}"
-    )
+    return f"the work does not count: {_reasons(report, with_codes=True)}"
+
+
+def refusal(reports: Iterable[ValidatorReport]) -> tuple[str, str] | None:
+    """Why a juror refused work that the promisor claims to have done: a line of text, and its first code."""
+    refused = next((one for one in reports if one.claimed and not one.success), None)
+    if refused is None:
+        return None
+    return f"the validator judged that the work does not count: {_reasons(refused)}", code_of(refused)
+
+
+def _reasons(report: ValidatorReport, *, with_codes: bool = False) -> str:
+    found = [
+        f"{one.detail} ({one.code})" if with_codes and one.detail else one.detail or one.code for one in report.failures
+    ]
+    return "; ".join(found) or ("no reason is given" if report.claimed else "the promisor claims no success")
 
 
 def code_of(report: ValidatorReport) -> str:

@@ -56,13 +56,14 @@ class _JudgedTerms:
         title = f"{printable(found.title)}, " if found.title else ""
         yield f"validator {title}{found.address}"
         if not found.is_silent:
-            answer = f"{len(found.announcements)} of {plural(found.jurors, 'juror')} answer"
-            yield f"  {answer}, {found.quorum} must judge alike; without that the work is not paid"
+            online = f"{len(found.announcements)} of its {plural(found.jurors, 'juror')} on the mesh"
+            yield f"  {online}, {found.quorum} must judge alike; without that the work is not paid"
             for policy in found.policies:
                 yield f"  judges by {policy.name}: {printable(policy.description)}"
             if not found.is_unanimous:
                 yield "  its jurors judge by different policies"
-        yield f"  fee {XRT.show(self.fee)}, on top of the cost, also if the work does not count"
+        low = " (what it wants is not known)" if found.is_silent else ""
+        yield f"  fee {XRT.show(self.fee)}{low}, on top of the cost, also if the work does not count"
         yield f"  if it is silent: {self._refund()}"
 
     def _refund(self) -> str:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
     from mesh.work.notes import Reason
     from schemas.records import Liability
+    from schemas.verdicts import ValidatorReport
 
 
 FETCH_TIMEOUT: Final = 10.0
@@ -131,7 +132,7 @@ async def print_liability(
     """Print all facts about a liability; of a failed job also why it failed, and how its validator judged."""
     refund = await refund_state(chain, liability)
     reports = await reports_on(settings, chain, liability)
-    failure = await _failure(settings, liability.result) if state_of(liability) == "failed" else None
+    failure = await _failure(settings, liability.result, reports or ()) if state_of(liability) == "failed" else None
     if as_json:
         facts = liability_json(liability) | {"refundableFrom": None if refund is None else refund.refundable_from}
         facts |= {} if liability.validator == ZERO_ADDRESS else {"reports": reports_json(reports)}
@@ -147,10 +148,13 @@ async def print_liability(
     print_facts(described | verdict_facts(reports or ()))
 
 
-async def _failure(settings: Settings, result: str) -> Reason:
-    """Why a job failed, as its recording says."""
+async def _failure(settings: Settings, result: str, reports: Sequence[ValidatorReport]) -> Reason:
+    """Why a job failed, as its validator or its recording says."""
+    from mesh.agent.judged_contract import refusal
     from mesh.work.notes import Reason, read_reason
 
+    if (refused := refusal(reports)) is not None:
+        return Reason(*refused)
     quick = replace(
         settings,
         connect_timeout=min(settings.connect_timeout, CONNECT_TIMEOUT),

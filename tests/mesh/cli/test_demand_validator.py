@@ -71,7 +71,7 @@ async def test_a_person_reads_what_the_validator_means_and_how_it_judged(
     lines = capsys.readouterr().out.splitlines()
     said = lines.index(f"validator {juror.title}, {juror.signer.address}")
     assert said < next(number for number, line in enumerate(lines) if line.startswith("posted "))
-    assert lines[said + 1].startswith("  1 of 1 juror answer, 1 must judge alike")
+    assert lines[said + 1].startswith("  1 of its 1 juror on the mesh, 1 must judge alike")
     assert lines[said + 2] == f"  judges by complete: {COMPLETE.description}"
     assert lines[said + 3].startswith("  fee 0.0000001 XRT, ")
     assert lines[said + 4].startswith("  if it is silent: cost and fee can be refunded 50,400 blocks")
@@ -148,7 +148,8 @@ async def test_a_whole_job_by_commands_under_a_real_validator(site: Site, lies: 
     assert verdict in shown.stdout
     if lies:
         assert (done.returncode, verdict.startswith("the work does not count: ")) == (1, True)
-        assert f"the validator judged: {verdict}" in done.stderr
+        assert "the validator judged that the work does not count: " in done.stderr
+        assert "the validator judged that the work does not count: " in shown.stdout
     else:
         assert (done.returncode, verdict) == (0, "the work counts"), done.stderr
 
