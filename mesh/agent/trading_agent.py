@@ -13,7 +13,7 @@ from mesh.agent.demands import current_buyer
 from mesh.agent.errors import NotAnObjective, OrderClosed
 from mesh.agent.orders import Order, OrderState
 from mesh.agent.progress import nothing
-from mesh.agent.validators import ValidatorSilent, check_named, require_accepted
+from mesh.agent.validators import ValidatorSilent, check_named
 from mesh.amounts import XRT
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.recording import pack_values
@@ -120,12 +120,13 @@ class TradingAgent(Lifecycle):
         to the provider.
 
         Raises `InsufficientTokens`, `InvalidAmount`, for an objective that can't be played `ObjectiveUnfit` or a
-        `ContentError`, and `Declined` for a demand whose validator the setting `accepted_validators` excludes.
+        `ContentError`, and `Declined` for a demand whose validator wants a higher fee, or is not one of the setting
+        `accepted_validators`.
         """
         trader = self.runtime.trader
         if demand is not None:
             wanted = demand.message if isinstance(demand, Verified) else demand
-            await require_accepted(self.parts.chain, wanted.validator, self.settings.accepted_validators)
+            await self.runtime.validators.require_accepted(wanted, self.settings.accepted_validators)
             await self.examine(wanted.objective)
             terms = trader.writer.terms_of(wanted)
         else:

@@ -124,6 +124,22 @@ class ValidatorDirectory:
                 self._found[validator] = found, time.monotonic() + kept
             return found
 
+    async def require_accepted(self, demand: Demand, accepted: str) -> None:
+        """Raise `Declined` for a demand under whose validator an agent should not work.
+
+        That is one that the setting (`accepted`) excludes, or one that wants a higher fee: it would refuse the work.
+        """
+        if demand.validator == ZERO_ADDRESS:
+            return
+        if accepted != "any":
+            names = [] if accepted == "none" else [name.strip() for name in accepted.split(",")]
+            if demand.validator not in [await self._chain.names.address(name) for name in names]:
+                raise Declined("validator-not-accepted", f"it does not accept the validator {demand.validator}")
+        wanted = (await self.find(demand.validator)).fee
+        if demand.validator_fee < wanted:
+            why = f"the demand pays {XRT.show(demand.validator_fee)} to its validator, which wants {XRT.show(wanted)}"
+            raise Declined("validator-underpaid", why)
+
     async def _ask(self, validator: str) -> AnnouncedValidator:
         key = str(ValidatorKey(self._channel.lighthouse, validator))
         replies = await query_all(self._session, [key], timeout=ANSWER_TIMEOUT)
@@ -159,15 +175,6 @@ async def refund_delay(chain: Chain) -> int | None:
     if not await chain.has_mesh_contracts():
         return None
     return int(await chain.node.read(chain.node.contract("Factory", chain.factory).refundDelay()))
-
-
-async def require_accepted(chain: Chain, validator: str, accepted: str) -> None:
-    """Raise `Declined` if an agent does not work under a validator (address) that the setting does not accept."""
-    if validator == ZERO_ADDRESS or accepted == "any":
-        return
-    names = [] if accepted == "none" else [name.strip() for name in accepted.split(",")]
-    if validator not in [await chain.names.address(name) for name in names]:
-        raise Declined("validator-not-accepted", f"it does not accept the validator {validator}")
 
 
 def _signed(replies: Iterable[zenoh.Reply], validator: str) -> dict[str, ValidatorAnnouncement]:

@@ -47,7 +47,7 @@ class _JudgedTerms:
             doubts["few-jurors"] = missing
         if self.fee < announced.fee:
             offered = f"the fee is {XRT.show(self.fee)}, but the validator wants {XRT.show(announced.fee)}"
-            doubts["low-fee"] = f"{offered}, so it may not judge"
+            doubts["low-fee"] = f"{offered}, so it may refuse the work"
         return doubts
 
     def lines(self) -> Iterator[str]:

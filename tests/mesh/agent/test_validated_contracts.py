@@ -179,6 +179,21 @@ async def test_a_fee_is_not_guessed_when_nobody_announces_one(place: Place) -> N
         assert order.message.validator_fee == 3
 
 
+async def test_a_robot_does_not_work_for_a_demand_that_pays_its_validator_too_little(place: Place) -> None:
+    """The validator would refuse the work."""
+    async with juror_of(place) as juror, place.agent("person") as person, working(place.agent("robot")) as robot:
+        for fee, works in ((juror.fee - 1, False), (juror.fee, True)):
+            order = await person.order(job(place), cost=1, validator=juror.signer.address, validator_fee=fee)
+            demand = order.message
+            assert isinstance(demand, Demand)
+            if works:
+                assert await robot.offer(demand)
+                continue
+            with pytest.raises(Declined) as caught:
+                await robot.offer(demand)
+            assert caught.value.reason == "validator-underpaid"
+
+
 @pytest.mark.parametrize(
     ("fields", "counts"),
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -152,6 +153,33 @@ async def test_a_whole_job_by_commands_under_a_real_validator(site: Site, lies: 
         assert "the validator judged that the work does not count: " in shown.stdout
     else:
         assert (done.returncode, verdict) == (0, "the work counts"), done.stderr
+
+
+async def test_a_whole_job_by_commands_under_a_jury_of_generation_5(site: Site) -> None:
+    """`aira validator deploy`, two jurors that must judge alike, and a demand that names their contract."""
+    names = dict.fromkeys(("xrt_contract", "erc20_token"), "xrt.3.robonomics.eth")
+    common = {"generation": "5", "factory_contract": "factory.3.robonomics.eth", "log_format": "json", **names}
+    jurors = [site.address(role) for role in ("rival", "poor")]
+    named = [word for juror in jurors for word in ("--juror", juror)]
+    person = site.variables("person", **common)
+    deployed = await asyncio.to_thread(aira, "validator", "deploy", *named, "--quorum", "2", "--json", **person)
+    jury = json.loads(deployed.stdout)["validator"]
+    options = ("--model", MODEL, "--objective", site.job("word"), "--cost", "7wn", "--validator", jury, "--json")
+    async with AsyncExitStack() as stack:
+        for role, fee in (("rival", "100wn"), ("poor", "50wn")):
+            variables = site.variables(role, validator_contract=jury, validator_fee=fee, **common)
+            serving = Serving(*AIRA, "validator", says='"validator-started"', variables=variables)
+            await stack.enter_async_context(serving)
+        for member in (site.provider(), site.robot([], **{**common, "generation": 5})):
+            await stack.enter_async_context(member)
+        done = await asyncio.to_thread(aira, "demand", *options, **person)
+    assert done.returncode == 0, done.stderr
+    *progress, end = map(json.loads, done.stdout.splitlines())
+    meant = next(one for one in progress if one["kind"] == "validator")
+    assert (sorted(meant["online"]), meant["quorum"], meant["fee"]) == (sorted(jurors), 2, "100")
+    judged = [one for one in progress if one["kind"] == "judged"]
+    assert [(one["votes"], one["needed"], one["code"]) for one in judged] == [(1, 2, ""), (2, 2, "")]
+    assert (end["success"], sorted(one["juror"] for one in end["reports"])) == (True, sorted(jurors))
 
 
 def lying(site: Site) -> Agent:
