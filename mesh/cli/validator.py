@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
 import click
@@ -23,13 +22,9 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 COMMANDS: Final = {
-    name: place
-    for name, place in {
-        "check": ("mesh.cli.validator_check:command", "judge a recording by hand"),
-        "collect": ("mesh.cli.validator_jury:collect", "pay out the fees of a validator contract"),
-        "deploy": ("mesh.cli.validator_jury:deploy", "create a validator contract and name its jurors"),
-    }.items()
-    if find_spec(place[0].partition(":")[0]) is not None
+    "check": ("mesh.cli.validator_check:command", "judge a recording by hand"),
+    "collect": ("mesh.cli.validator_jury:collect", "pay out the fees of a validator contract"),
+    "deploy": ("mesh.cli.validator_jury:deploy", "create a validator contract and name its jurors"),
 }
 
 
