@@ -57,6 +57,10 @@ def test_a_job_that_fits_is_paid_and_another_one_is_not_ordered(
     with Serving(sys.executable, EXAMPLE / "robot.py", says="account 0x", variables=as_role("robot", market)) as robot:
         done = demand("drive", out)
         assert "paid" in done.stdout, done.stderr + robot.log()
+        files = (out, "--objective", objectives["drive"], "--checks", EXAMPLE / "validator.py")
+        judged = aira("validator", "check", *files, "--data-dir", tmp_path / "data")
+        assert judged.returncode == 0, judged.stdout + judged.stderr
+        assert "holds  distance/check" in judged.stdout
         unfit = demand("too-fast", tmp_path / "other.mcap")
         assert unfit.returncode == 2
         assert "unfit-message" in unfit.stderr
