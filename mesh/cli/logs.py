@@ -60,7 +60,7 @@ async def command(
     timeout: float,
     as_json: bool,
 ) -> None:
-    """Show the latest log events of the agent, provider or bridge with ADDRESS.
+    """Show the latest log events of the agent, provider, validator or bridge with ADDRESS.
 
     Each keeps its last 2,000 events of its log_level or above. --json prints one object per line, in the format that
     log_format = "json" selects.

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LOOKBACK: Final = 7200
-"""Blocks that a validator reads at most of those before its start; liabilities that are older are not judged."""
+LOOKBACK: Final = 50_400
+"""Blocks that a validator reads at most of those before its start: after so many, liabilities can be refunded."""
 
 
 class NotAValidator(ChainError, code="not-a-validator"):

@@ -171,7 +171,7 @@ def panels() -> list[dict[str, Any]]:
 
 def test_the_dashboard_has_its_rows_and_panels_do_not_overlap() -> None:
     rows = [panel["title"] for panel in panels() if panel["type"] == "row"]
-    assert rows == ["Health", "Market", "Jobs", "Money", "Network", "Devices", "Bridge"]
+    assert rows == ["Health", "Market", "Jobs", "Money", "Network", "Devices", "Bridge", "Validators"]
     assert len({panel["id"] for panel in panels()}) == len(panels())
     taken: set[tuple[int, int]] = set()
     for panel in panels():

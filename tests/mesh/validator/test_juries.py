@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,6 +15,7 @@ from tests.support.objectives import objective
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
+    from mesh import Evidence
     from tests.support.market import Place
 
 
@@ -81,6 +84,64 @@ async def test_what_others_sign_counts_for_nothing(place: Place) -> None:
                 outcome = await contract.outcome()
             assert outcome.success
             assert outcome.result != contract.liability.objective
+
+
+async def test_a_juror_that_signs_nonsense_is_outvoted(place: Place) -> None:
+    """It says no, and then something else, about every job; two honest ones are the quorum."""
+    async with Court(place, 5) as court:
+        jury = await court.jury(0, 1, 2, quorum=2)
+        first, second, robot = await court.validator(0, jury), await court.validator(1, jury), await court.robot()
+        async with court.at_work(robot) as person:
+            contract = await court.demand(person, jury)
+            channel, signer = person.channel, court.account(2).signer
+            for success, result in ((False, contract.liability.objective), (True, contract.liability.model)):
+                nonsense = Result(liability=contract.address, result=result, success=success)
+                channel.publish(signer.sign(nonsense))
+            async with first, second:
+                outcome = await contract.outcome()
+            assert outcome.success
+            assert outcome.result not in (contract.liability.objective, contract.liability.model)
+
+
+async def test_a_reverted_end_is_repeated(place: Place) -> None:
+    async with Court(place, 5) as court:
+        jury = await court.jury(0)
+        validator, robot = await court.validator(0, jury), await court.robot()
+        async with court.at_work(validator, robot) as person:
+            before = await place.balance("robot")
+            contract = await court.demand(person, jury)
+            assert (await contract.outcome()).success
+            await place.forget_blocks(1)
+            liabilities = place.chains["person"].liabilities
+            assert not (await liabilities.get(contract.address)).is_finalized
+
+            async def is_paid() -> bool:
+                return (await liabilities.get(contract.address)).is_success
+
+            await until_found(is_paid, what="a second payment")
+            assert await place.balance("robot") == before + PRICE
+
+
+async def test_a_validator_that_stops_while_it_judges_judges_again(place: Place) -> None:
+    """As a crash would: what was judged is lost before it is signed."""
+    async with Court(place, 5) as court:
+        jury = await court.jury(0)
+        judging, stay = threading.Event(), threading.Event()
+        first, again, robot = await court.validator(0, jury), await court.validator(0, jury), await court.robot()
+
+        @first.check("slow", description="Takes its time.")
+        def slow(evidence: Evidence) -> bool:
+            judging.set()
+            stay.wait(30)
+            return False
+
+        async with court.at_work(robot) as person:
+            contract = await court.demand(person, jury)
+            async with first:
+                await asyncio.to_thread(judging.wait, 30)
+            async with again:
+                assert (await contract.outcome()).success
+            stay.set()
 
 
 async def test_what_is_no_validator_of_this_account_is_refused_at_the_start(place: Place) -> None:
