@@ -11,7 +11,7 @@ import mesh.agent.runtime  # noqa: F401 - loaded once, before histories fork
 from mesh.chain import XRT, Account, Chain, Timing
 from mesh.chain.deploy import DeploymentPlan
 from mesh.devchain.development import ALLOWANCE, DevelopmentMarket, deploy_market
-from schemas import cid_of_bytes
+from schemas import cid_of_bytes, keccak256
 from tests.simulation import loop, threads
 from tests.simulation.chain import EvmChain, NodeFaults, SimulatedChain, SimulatedNode
 from tests.simulation.model import ModelChain
@@ -45,6 +45,9 @@ LIFETIMES: Final = (4, 8, 60, 90, 90)
 """Blocks for which an order is valid: sometimes so few that it expires while it is matched."""
 
 
+JURORS: Final = 3
+VALIDATED: Final = 0.4
+"""How many markets of generation 5 have a validator."""
 PLAN: Final = DeploymentPlan(timeout_blocks=100, refund_delay=100)
 
 
@@ -55,6 +58,8 @@ class Deployed:
     chain: SimulatedChain
     market: DevelopmentMarket
     accounts: dict[str, Account]
+    validator: str = ""
+    """The address of the jury, if this market has one."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,8 @@ class MarketPlan:
     pause: float = PAUSES[0]
     step_ns: int = STEPS_NS[0]
     block_seconds: float = BLOCK_SECONDS
+    jurors: int = 0
+    """How many a validator has, which all demands name; a majority must agree."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -80,6 +87,7 @@ class MarketPlan:
             "more-people": self.people > PEOPLE,
             "long-pauses": self.pause > PAUSES[0],
             "long-jobs": self.step_ns > STEPS_NS[0],
+            "validated": self.jurors > 0,
         }
         return tuple(kind for kind, is_so in kinds.items() if is_so)
 
@@ -89,14 +97,16 @@ def market_plan(seed: int, jobs: int = JOBS) -> MarketPlan:
     chance, plan = random.Random(f"market {seed}"), MarketPlan()
     if chance.random() >= PLAIN:
         plan = MarketPlan(5 if chance.random() < 0.5 else 3, chance.choice((1, 2)), chance.choice((1, 2)))
+    if plan.generation == 5 and random.Random(f"validator {seed}").random() < VALIDATED:
+        plan = replace(plan, jurors=JURORS)
     if jobs <= JOBS:
         return plan
     people, pause, step_ns = chance.randint(PEOPLE, MOST_PEOPLE), chance.choice(PAUSES), chance.choice(STEPS_NS)
     return replace(plan, people=people, pause=pause, step_ns=step_ns, block_seconds=LONG_BLOCK_SECONDS)
 
 
-def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
-    """Deploy the contracts, and give people and robots their tokens."""
+def found(chain: SimulatedChain, scheduler: Scheduler, *, jurors: int = 0) -> Deployed:
+    """Deploy the contracts, and a jury if there are jurors, and give people and robots their tokens."""
     deployed: list[Deployed] = []
     keys = chain.evm.funded_keys
     names = [f"person-{number}" for number in range(PEOPLE)] + [f"robot-{number}" for number in range(ROBOTS)]
@@ -109,8 +119,9 @@ def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
         async with Chain(node, account=market.accounts["provider"], ens=market.deployment.ens, timing=TIMING) as client:
             for account in accounts.values():
                 await client.tokens.transfer(account.address, ALLOWANCE)
+            validator = await _found_jury(client, accounts, jurors) if jurors else ""
         accounts["provider"] = market.accounts["provider"]
-        deployed.append(Deployed(chain, market, accounts))
+        deployed.append(Deployed(chain, market, accounts, validator))
 
     errors: list[BaseException | None] = []
     loop.start(scheduler, Process(scheduler, "deployment"), main, errors.append)
@@ -121,25 +132,33 @@ def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
     return deployed[0]
 
 
+async def _found_jury(client: Chain, accounts: dict[str, Account], jurors: int) -> str:
+    """Deploy a jury of new accounts, and add these to the others; its address."""
+    judges = {f"juror-{number}": Account.from_key(keccak256(b"juror %d" % number)) for number in range(jurors)}
+    accounts.update(judges)
+    addresses = [account.address for account in judges.values()]
+    return (await client.validators.deploy(addresses, jurors // 2 + 1)).address
+
+
 class Deployments:
-    """The market on the model and on the EVM, each deployed once it is wanted; all of one kind if `only` names it."""
+    """The markets on the model and on the EVM, each deployed once it is wanted; all of one kind if `only` names it."""
 
     def __init__(self, only: str | None = None) -> None:
         self._only = only
-        self._evm = EvmChain()
-        self._found: dict[str, Deployed] = {}
+        self._found: dict[tuple[str, int], Deployed] = {}
 
     def kind(self, seed: int) -> str:
         """What runs the contracts in the history of a seed."""
         return self._only or (ON_EVM if random.Random(f"chain {seed}").randrange(EVM_EVERY) == 0 else ON_MODEL)
 
-    def market(self, kind: str) -> Deployed:
-        """The market on a chain of that kind."""
-        if kind not in self._found:
-            chain = self._evm if kind == ON_EVM else ModelChain(self._evm.funded_keys)
-            self._found[kind] = found(SimulatedChain(chain), threads.begin(0))
+    def market(self, kind: str, *, jurors: int = 0) -> Deployed:
+        """The market on a chain of that kind, with a validator if it has jurors."""
+        if (kind, jurors) not in self._found:
+            evm = EvmChain()
+            chain = evm if kind == ON_EVM else ModelChain(evm.funded_keys)
+            self._found[kind, jurors] = found(SimulatedChain(chain), threads.begin(0), jurors=jurors)
             # Histories run in forks of this process, without collections: what one runs would be chance.
             gc.collect()
             gc.freeze()
             gc.disable()
-        return self._found[kind]
+        return self._found[kind, jurors]

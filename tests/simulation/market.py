@@ -15,7 +15,7 @@ from schemas import EMPTY, cid_of_file
 from tests.simulation.chance import FaultDraw
 from tests.simulation.deployment import ROBOTS, Deployed, MarketPlan
 from tests.simulation.disk import SimulatedDisk
-from tests.simulation.roles import PersonRole, ProviderRole, RobotRole, Role
+from tests.simulation.roles import JurorRole, PersonRole, ProviderRole, RobotRole, Role
 from tests.simulation.router import Router
 from tests.simulation.scheduler import SECOND, Process, Scheduler
 from tests.simulation.steps import StepAudit
@@ -72,7 +72,8 @@ class Market:
         people = self.plan.people
         share = [self.jobs // people + (number < self.jobs % people) for number in range(people)]
         self.people = [PersonRole(self, f"person-{number}", jobs) for number, jobs in enumerate(share) if jobs]
-        self.roles: list[Role] = [*self.providers, *self.robots, *self.people]
+        self.jurors = [JurorRole(self, f"juror-{number}") for number in range(self.plan.jurors)]
+        self.roles: list[Role] = [*self.providers, *self.robots, *self.people, *self.jurors]
         self.steps = StepAudit(self)
         self.router.tap = self.steps.sent
         self.deployed.chain.on_block = self.steps.block

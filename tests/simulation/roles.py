@@ -16,6 +16,7 @@ from mesh.errors import AiraError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
+from mesh.validator.validator import Validator
 from schemas import String, decode, message_hash
 from tests.simulation import loop
 from tests.simulation.chain import NodeFaults, SimulatedNode
@@ -220,6 +221,16 @@ class RobotRole(Role):
             await agent.serve()
 
 
+class JurorRole(Role):
+    """One of the accounts that judge for the market's validator."""
+
+    async def main(self) -> None:
+        """Judge results."""
+        validator = self.market.deployed.validator
+        async with self.chain() as chain:
+            await Validator(validator, settings=self.settings(), account=self.account, chain=chain).serve()
+
+
 class PersonRole(Role):
     """A person who wants some jobs done, one after the other."""
 
@@ -277,7 +288,13 @@ class PersonRole(Role):
         chance = self.market.scheduler.random
         objective, lifetime = self.market.objective(chance.randint(2, 12)), chance.choice(LIFETIMES)
         self.market.trace(self.name, "demands", number=wanted.number, cost=wanted.cost)
-        order = await agent.order(objective, cost=wanted.cost, lifetime=lifetime)
+        order = await agent.order(
+            objective,
+            cost=wanted.cost,
+            lifetime=lifetime,
+            validator=self.market.deployed.validator,
+            validator_fee=0,
+        )
         wanted.order, wanted.told = order.hash, "ordered"
         wanted.posted, wanted.deadline = self.market.deployed.chain.evm.head, order.message.deadline
         if chance.random() < self.market.revoked:

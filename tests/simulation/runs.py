@@ -14,6 +14,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, NoReturn
 
 from tests.simulation import history
+from tests.simulation.deployment import market_plan
 from tests.simulation.history import Report
 from tests.simulation.mutations import planted
 
@@ -111,7 +112,7 @@ class Child:
     def __init__(self, deployments: Deployments, run: Run, *, trace: bool, switches: str | None) -> None:
         self.run = run
         self._kind = run.chain or deployments.kind(run.seed)
-        market = deployments.market(self._kind)
+        market = deployments.market(self._kind, jurors=market_plan(run.seed, run.jobs).jurors)
         self._pipe, writing = os.pipe()
         self._process = os.fork()
         if self._process == 0:

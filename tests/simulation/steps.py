@@ -10,7 +10,7 @@ from eth_utils.crypto import keccak
 from mesh.agent.orders import OrderState
 from mesh.chain import Finalized, NewLiability, Transfer
 from mesh.market.book import Refusal
-from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, Offer, address_bytes, decode
+from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, Offer, Result, address_bytes, decode
 from schemas.signing import Rejection
 from schemas.wire import message_hash
 from tests.simulation.scheduler import SECOND
@@ -49,6 +49,8 @@ class StepAudit:
         """All demands that were sent: by whom, as which of their orders."""
         self.orders: dict[str, Sample] = {}
         """All orders (hashes) that were published."""
+        self._verdicts: dict[tuple[str, str], tuple[str, bool]] = {}
+        """What each juror has signed of each liability: result and success."""
 
     def _forget(self) -> None:
         self._read = self._chain.began
@@ -161,6 +163,10 @@ class StepAudit:
             message = decode(payload)
         except InvalidMessage:
             return
+        if isinstance(message, Result) and role in self._market.jurors:
+            verdict = message.result, message.success
+            if self._verdicts.setdefault((role.name, message.liability), verdict) != verdict:
+                self._market.violated("signed-twice", f"{role.name} signed another result of {message.liability}")
         if isinstance(message, Demand | Offer):
             self.orders.setdefault(message_hash(message).hex(), sample)
         if isinstance(message, Demand):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.simulation.deployment import EVM_EVERY, ON_EVM, ON_MODEL, Deployments, MarketPlan, market_plan
+from tests.simulation.deployment import EVM_EVERY, JURORS, ON_EVM, ON_MODEL, Deployments, MarketPlan, market_plan
 from tests.simulation.test_simulation import simulate
 
 if TYPE_CHECKING:
@@ -21,6 +21,16 @@ def test_jobs_end_in_a_market_of_generation_5_with_two_providers_and_two_nodes()
     assert found["markets"] == {"generation-5": 1, "two-nodes": 1, "two-providers": 1}
     assert (found["violations"], found["lost"], found["paid_twice"]) == ([], 0, 0), said
     assert found["paid"] + found["refunded"] > 0
+
+
+@pytest.mark.parametrize("chain", [ON_MODEL, ON_EVM])
+def test_jobs_end_in_a_market_with_a_validator(chain: str) -> None:
+    """Two of three jurors must agree; they crash, too."""
+    seed = next(seed for seed in count() if market_plan(seed) == MarketPlan(generation=5, jurors=JURORS))
+    found, said = simulate("--seed", str(seed), "--jobs", "3", "--only", "crash_every", "--chain", chain)
+    assert found["markets"] == {"generation-5": 1, "validated": 1}
+    assert (found["violations"], found["lost"], found["paid_twice"]) == ([], 0, 0), said
+    assert found["paid"] > 0
 
 
 def test_a_job_ends_on_the_evm_too() -> None:
