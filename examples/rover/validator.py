@@ -9,11 +9,12 @@ validator = Validator(policies=["acknowledged:command=/drive:answer=/driven:with
 
 @validator.check("distance", description="Each drive is as long as it was commanded, to within 0.5 m.")
 def distance(evidence: Evidence) -> Iterator[str]:
-    due = [move.value["speed"] * move.value.get("seconds", 1.0) for move in evidence.played.on("/drive")]
     driven = [message.value for message in evidence.device.on("/driven")]
-    for number, (expected, found) in enumerate(zip(due, driven, strict=False)):
-        if abs(expected - found) > 0.5:
-            yield f"drive {number} was {found:.1f} m long, not {expected:.1f} m"
+    left = iter(driven)  # after a crash, a drive may be there twice
+    for number, move in enumerate(evidence.objective.on("/drive")):
+        due = move.value["speed"] * move.value.get("seconds", 1.0)
+        if not any(abs(due - metres) <= 0.5 for metres in left):
+            yield f"drive {number} was not {due:.1f} m long: the rover drove {driven} m"
 
 
 if __name__ == "__main__":

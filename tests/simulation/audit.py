@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from tests.simulation.roles import Role
 
 INVALID: Final = frozenset(
-    {"played", "sequence", "statistics", "readable", "result-file", "objective-file", "signature", "times"}
+    {
+        *("played", "sequence", "statistics", "readable", "result-file", "objective-file", "signature"),
+        *("times", "roles", "clock"),
+    }
 )
 """The findings of `aira verify` that no job of an honest robot may have."""
 MATCHED_WITHIN: Final = 40
