@@ -56,8 +56,9 @@ class _JudgedTerms:
         title = f"{printable(found.title)}, " if found.title else ""
         yield f"validator {title}{found.address}"
         if not found.is_silent:
-            online = f"{len(found.announcements)} of its {plural(found.jurors, 'juror')} on the mesh"
-            yield f"  {online}, {found.quorum} must judge alike; without that the work is not paid"
+            online = f"{len(found.announcements)} of its {found.jurors} jurors are on the mesh"
+            judges = "it is on the mesh" if found.jurors == 1 else f"{online}, {found.quorum} must judge alike"
+            yield f"  {judges}; nobody is paid for the work before it has judged"
             for policy in found.policies:
                 yield f"  judges by {policy.name}: {printable(policy.description)}"
             if not found.is_unanimous:

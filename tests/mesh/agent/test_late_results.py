@@ -77,7 +77,7 @@ async def _has_read(robot: Agent, place: Place) -> bool:
     return robot.parts.chain_head.head == await place.chains["person"].block_number()
 
 
-async def test_a_robot_whose_validator_is_silent_is_told_before_the_refund(
+async def test_the_parties_of_a_silent_validator_are_told_and_the_cost_is_refunded(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), []) as robot:
@@ -90,3 +90,8 @@ async def test_a_robot_whose_validator_is_silent_is_told_before_the_refund(
         refundable = await place.chains["person"].liabilities.refundable_from(contract.address)
         await place.node.mine(refundable - await place.chains["person"].block_number() - 2)
         await until(lambda: [one["code"] for one in logged_facts(caplog, "verdict-late")] == ["NotTheValidator"])
+        await place.node.mine(2)
+        await place.chains["person"].liabilities.refund(contract.address)
+        outcome = await contract.outcome()
+        assert (outcome.success, outcome.code, outcome.reports) == (False, "no-result", ())
+        assert "no verdict of the validator" in outcome.reason

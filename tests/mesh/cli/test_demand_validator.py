@@ -72,7 +72,7 @@ async def test_a_person_reads_what_the_validator_means_and_how_it_judged(
     lines = capsys.readouterr().out.splitlines()
     said = lines.index(f"validator {juror.title}, {juror.signer.address}")
     assert said < next(number for number, line in enumerate(lines) if line.startswith("posted "))
-    assert lines[said + 1].startswith("  1 of its 1 juror on the mesh, 1 must judge alike")
+    assert lines[said + 1].startswith("  it is on the mesh; nobody is paid ")
     assert lines[said + 2] == f"  judges by complete: {COMPLETE.description}"
     assert lines[said + 3].startswith("  fee 0.0000001 XRT, ")
     assert lines[said + 4].startswith("  if it is silent: cost and fee can be refunded 50,400 blocks")
