@@ -1,0 +1,52 @@
+"""What strangers can make a validator do is bounded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mesh.validator import cases
+from schemas import Result, cid_of_bytes
+from tests.mesh.validator.courts import Court, liar
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    import pytest
+
+    from tests.support.market import Place
+
+
+async def test_results_for_other_liabilities_cost_nothing(place: Place) -> None:
+    """A flood of a stranger's Results is dropped without a question to the chain, and a job is judged all the same."""
+    async with Court(place) as court:
+        validator, robot = await court.validator(), await court.robot()
+        async with court.at_work(validator, robot) as person:
+            stranger = court.account(3).signer
+            for number in range(300):
+                address = "0x" + f"{number + 1:040x}"
+                result = Result(liability=address, result=cid_of_bytes(address.encode()), success=True)
+                person.channel.publish(stranger.sign(result))
+            contract = await court.demand(person, validator.address)
+            assert (await contract.outcome()).success
+            await until(lambda: validator.runtime.results.received >= 300)
+            assert await validator.runtime.parts.ledger.unended() == []
+
+
+async def test_one_promisor_s_open_cases_are_limited(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "OPEN_OF_PROMISOR", 1)
+    async with Court(place) as court:
+        validator, robot = await court.validator(), await liar(court)
+        async with court.at_work(validator, robot) as person:
+            for _ in range(2):
+                await court.demand(person, validator.address)
+            await until(lambda: validator.drops.totals().get("cases") == 1)
+            assert len(await validator.runtime.parts.ledger.unended()) == 1
+
+
+async def test_files_that_are_too_large_fail_the_job(place: Place) -> None:
+    async with Court(place) as court:
+        validator, robot = await court.validator(), await court.robot()
+        validator.settings = place.settings("juror-0", objective_size_limit=600)
+        async with court.at_work(validator, robot) as person:
+            contract = await court.demand(person, validator.address)
+            outcome = await contract.outcome()
+            assert (outcome.success, outcome.code) == (False, "content-too-large")
