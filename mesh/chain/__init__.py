@@ -53,6 +53,7 @@ with needs_extra("chain", "the chain"):
     )
     from mesh.chain.following import BlockEvents, History, Reorganisation
     from mesh.chain.funds import Funding, Holding
+    from mesh.chain.juries import CollectedFees, DeployedJury, InvalidJury, JuryState, NoFees, NotAJury
     from mesh.chain.liabilities import Created, RefundState, Settled
     from mesh.chain.lighthouse_state import LighthouseState
     from mesh.chain.names import InvalidName, namehash
@@ -60,13 +61,4 @@ with needs_extra("chain", "the chain"):
     from mesh.chain.policy import GWEI, FeePolicy, Timing
     from mesh.chain.tokens import Token
     from mesh.chain.transactions import TransactionSender
-    from mesh.chain.validators import (
-        CollectedFees,
-        DeployedJury,
-        InvalidJury,
-        JuryState,
-        NoFees,
-        NotAJury,
-        UnsafeValidator,
-        ValidatorWithoutCode,
-    )
+    from mesh.chain.validators import UnsafeValidator, ValidatorWithoutCode

@@ -11,33 +11,30 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.chain.answers import InvalidAnswer
-from mesh.chain.artifacts import is_code_of
 from mesh.chain.contracts import OriginalContracts
-from mesh.chain.errors import InsufficientTokens, NoContracts, Reverted
+from mesh.chain.errors import InsufficientTokens, NoContracts, NotOffered, Reverted
+from mesh.chain.juries import CollectedFees, DeployedJury, NoFees, NotAJury, in_order, read_jury
 from mesh.chain.lighthouses import Lighthouses
-from mesh.chain.multicall import getters
 from mesh.chain.tokens import Tokens
-from mesh.errors import ChainError, InputError
+from mesh.errors import InputError
 from mesh.flood import BoundedDict
-from schemas.address import ZERO_ADDRESS, address_bytes
+from schemas.address import ZERO_ADDRESS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from mesh.chain.contracts import Contracts
+    from mesh.chain.juries import JuryState
     from schemas.messages import Order
 
 REMEMBERED: Final = 4096
 """Validators whose verdict is remembered, the latest ones."""
 RECHECK: Final = 60.0
 """Seconds after which a verdict is asked for again that a transaction can change."""
-MOST_JURORS: Final = 7
-"""Jurors of a jury: a finalization looks through all sets of its quorum's size."""
-JURY_GETTERS: Final = ("xrt", "keeper", "jurors", "quorum")
 
 
 class UnsafeValidator(InputError, code="validator-unsafe"):
@@ -60,66 +57,6 @@ class ValidatorWithoutCode(InputError, code="validator-without-code"):
             hint="in generation 5 name a contract (`aira validator deploy` makes one), or none",
         )
         self.validator = validator
-
-
-class InvalidJury(InputError, code="invalid-jury"):
-    """These accounts and this quorum can't be a jury."""
-
-
-class NotAJury(ChainError, code="not-a-jury"):
-    """An address is not one of our juries, so its jurors and fees are not known."""
-
-    def __init__(self, address: str) -> None:
-        super().__init__(
-            f"{address} is not a jury of this network", hint="name the address that `aira validator deploy` printed"
-        )
-        self.address = address
-
-
-class NoFees(ChainError, code="no-fees"):
-    """A jury holds no fees, so there is nothing to collect."""
-
-    def __init__(self, address: str) -> None:
-        super().__init__(
-            f"the validator {address} has no fees to collect", hint="it is paid when its jurors have judged a result"
-        )
-        self.address = address
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JuryState:
-    """A validator contract of ours: results count that `quorum` of its `jurors` have signed. Addresses are EIP-55.
-
-    The jurors are in ascending order. `keeper` may collect the `fees` (wn) that it holds. Only the fees change.
-    """
-
-    address: str
-    keeper: str
-    jurors: tuple[str, ...]
-    quorum: int
-    fees: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DeployedJury:
-    """A jury that a transaction deployed, the gas that it used, and what that cost in wei."""
-
-    address: str
-    jurors: tuple[str, ...]
-    quorum: int
-    tx: str
-    gas_used: int
-    wei: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CollectedFees:
-    """Fees (`value`, wn) that were paid out to a jury's keeper, the gas that it took, and what that cost in wei."""
-
-    value: int
-    tx: str
-    gas_used: int
-    wei: int
 
 
 class _Verdict(NamedTuple):
@@ -156,10 +93,15 @@ class Validators:
     async def check(self, order: Order) -> None:
         """Check before signing that the order may name its validator.
 
-        Raises `UnsafeValidator`; `ValidatorWithoutCode` in generation 5, where it must be a contract; `ChainError`.
+        Raises `UnsafeValidator`; `ValidatorWithoutCode` in generation 5, where it must be a contract; `NotOffered` for
+        a jury that needs several signatures, on the original contracts; `ChainError`.
         """
-        if order.validator != ZERO_ADDRESS:
-            _check(order, await self._verdict(order.validator))
+        if order.validator == ZERO_ADDRESS:
+            return
+        _check(order, await self._verdict(order.validator))
+        version = self._contracts.version
+        if isinstance(version, OriginalContracts) and await self.quorum(order.validator) > 1:
+            raise NotOffered("validator that needs several signatures", version.generation)
 
     def check_known(self, order: Order) -> None:
         """Like `check`, without asking the chain: a validator that is not known raises `UnsafeValidator`, too."""
@@ -211,17 +153,7 @@ class Validators:
 
         Raises `InvalidJury` before anything is sent.
         """
-        found = [await self._contracts.names.address(juror) for juror in jurors]
-        ordered = tuple(sorted(set(found), key=address_bytes))
-        if not 1 <= len(found) <= MOST_JURORS:
-            raise InvalidJury(f"a jury has 1 to {MOST_JURORS} jurors, not {len(found)}", hint="name fewer jurors")
-        if len(ordered) < len(found) or ZERO_ADDRESS in ordered:
-            raise InvalidJury("a juror is named twice, or is the zero address", hint="name each juror once")
-        if not 1 <= quorum <= len(ordered):
-            raise InvalidJury(
-                f"a quorum of {quorum} is not possible with {len(ordered)} jurors",
-                hint=f"the quorum is 1 to {len(ordered)}, the number of jurors",
-            )
+        ordered = in_order([await self._contracts.names.address(juror) for juror in jurors], quorum)
         code = self._contracts.node.creation_code("Jury", self._contracts.xrt, ordered, quorum)
         sent = await self._contracts.signing().send(to=None, data=code)
         assert sent.contract is not None
@@ -272,23 +204,8 @@ class Validators:
     async def _jury(self, contract: str) -> JuryState | None:
         """The jury at an address with code, without its fees; None if it is another contract."""
         if contract not in self._juries:
-            self._juries[contract] = await self._read_jury(contract)
+            self._juries[contract] = await read_jury(self._contracts, contract)
         return self._juries[contract]
-
-    async def _read_jury(self, contract: str) -> JuryState | None:
-        node = self._contracts.node
-        if not is_code_of("Jury", await node.code(contract)):
-            return None
-        try:
-            calls = getters("Jury", contract, JURY_GETTERS)
-            xrt, keeper, jurors, quorum = await node.read_all(calls, block="latest")
-        except Reverted:
-            return None
-        # A contract with this code may have been created with jurors that our constructor refuses.
-        is_sound = 1 <= quorum <= len(jurors) <= MOST_JURORS and xrt == self._contracts.xrt
-        if not is_sound or list(jurors) != sorted(set(jurors), key=address_bytes):
-            return None
-        return JuryState(address=contract, keeper=keeper, jurors=tuple(jurors), quorum=quorum, fees=0)
 
 
 def _check(order: Order, verdict: _Verdict | None) -> None:

@@ -11,7 +11,7 @@ import logging
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.chain import NoContracts, NodeUnreachable, RequestRefused, Reverted
+from mesh.chain import NoContracts, NodeUnreachable, NotOffered, RequestRefused, Reverted
 from mesh.clock import SYSTEM_CLOCK
 from mesh.flood import BoundedDict, Rate, RateLimiter
 from mesh.log_context import liability_context, log_event
@@ -45,6 +45,10 @@ ACCEPTED_SECONDS: Final = 60.0
 PER_VALIDATOR: Final = Rate(per_second=2.0, burst=40)
 """Questions to a validator that is no jury, which may answer anything at the node's expense."""
 ALL_VALIDATORS: Final = Rate(per_second=10.0, burst=200)
+WASTED: Final = Rate(per_second=1 / 60, burst=3)
+"""Finalizations that a validator which is no jury may let fail on the chain, at the provider's expense …"""
+SHUNNED_SECONDS: Final = 600.0
+"""… before it is not tried for so long: it may accept in a simulation what it refuses in a block."""
 VALIDATOR_FINALIZES: Final = "NotTheValidator"
 """The contracts' error in generation 3, where only the validator itself finalizes."""
 QUIET: Final = frozenset({"AlreadyFinalized", VALIDATOR_FINALIZES})
@@ -75,6 +79,9 @@ class Judgements:
         self._accepted: BoundedDict[tuple[str, str], tuple[bool, float]] = BoundedDict(SIGNERS_REMEMBERED)
         """By validator and signer: whether it was accepted, and until when that holds, on the monotonic clock."""
         self._budget = RateLimiter(per_sender=PER_VALIDATOR, total=ALL_VALIDATORS, clock=clock)
+        self._waste = RateLimiter(per_sender=WASTED, clock=clock)
+        self._shunned: BoundedDict[str, float] = BoundedDict(SIGNERS_REMEMBERED)
+        """Validators that let too many finalizations fail, and until when, on the monotonic clock."""
 
     async def add(self, result: Verified[Result], liability: Liability) -> Sequence[Verified[Result]]:
         """Hold a result of a validated liability, if a juror has signed it.
@@ -92,16 +99,32 @@ class Judgements:
             self._forget(result)
             return ()
         self._hold(result)
-        return self.agreeing(liability.address, needed)
+        return self.agreeing(liability, needed)
 
-    def agreeing(self, liability: str, needed: int) -> Sequence[Verified[Result]]:
+    def agreeing(self, liability: Liability, needed: int) -> Sequence[Verified[Result]]:
         """So many held results of a liability that say the same; empty if there are none, or some are being sent."""
-        held = self._events.unconfirmed.held(liability)
-        for one in held:
+        held = self._events.unconfirmed.held(liability.address)
+        for one in held if not self._is_shunned(liability.validator) else ():
             same = [other for other in held if other.hash == one.hash]
             if len(same) >= needed:
                 return same[:needed]
         return ()
+
+    async def wasted(self, liability: Liability) -> None:
+        """A finalization of a liability failed on the chain: for how much that may be its validator's fault."""
+        validator = liability.validator
+        try:
+            if validator == ZERO_ADDRESS or await self._ask(partial(self._chain.validators.jurors, validator)):
+                return
+        except (RequestRefused, NoContracts) as error:
+            log.debug("it is not known whether %s is a jury: %s", validator, error)
+        if not self._waste.allow(validator):
+            self._shunned[validator] = self._clock.monotonic() + SHUNNED_SECONDS
+            facts = log_event("validator-shunned", validator=validator, seconds=SHUNNED_SECONDS)
+            log.warning("the validator %s lets finalizations fail on the chain", validator, extra=facts)
+
+    def _is_shunned(self, validator: str) -> bool:
+        return self._clock.monotonic() < self._shunned.get(validator, 0.0)
 
     def _hold(self, result: Verified[Result]) -> None:
         """Keep a result: the last one of its signer for a liability, and no more than the limit in all."""
@@ -135,7 +158,7 @@ class Judgements:
         accepted, until = self._accepted.get((validator, signer), (False, 0.0))
         if self._clock.monotonic() >= until:
             accepted = False
-            if self._budget.allow(validator):
+            if not self._is_shunned(validator) and self._budget.allow(validator):
                 accepted = await self._ask(partial(self._chain.validators.accepts, validator, signer))
                 self._accepted[validator, signer] = accepted, self._clock.monotonic() + ACCEPTED_SECONDS
         if not accepted:
@@ -186,28 +209,30 @@ class ResultSettlement:
             if liability is None or liability.is_finalized:  # which may not be confirmed either
                 self._forget(result)
             elif liability.validator != ZERO_ADDRESS:
-                self._begin(await self._judgements.add(result, liability), self._chain.costs.worth(liability))
+                self._begin(await self._judgements.add(result, liability), liability)
             elif result.signer != liability.promisor:
                 self._rejections.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
             else:
-                self._begin((result,), self._chain.costs.worth(liability))
+                self._begin((result,), liability)
 
-    def _begin(self, results: Sequence[Verified[Result]], priority: int) -> None:
+    def _begin(self, results: Sequence[Verified[Result]], liability: Liability) -> None:
         """Finalize a liability by these results, which say the same."""
         if results:
             self._events.unconfirmed.begin(*results)
-            self._tasks.create_task(self._finalize(results, priority))
+            self._tasks.create_task(self._finalize(results, liability))
 
-    async def _finalize(self, results: Sequence[Verified[Result]], priority: int) -> None:
+    async def _finalize(self, results: Sequence[Verified[Result]], liability: Liability) -> None:
         message, *others = (result.message for result in results)
         with liability_context(message.liability):
             try:
                 async with self._commitments.take({message.liability: 1}):
                     finalize = partial(self._chain.liabilities.finalize, self._lighthouse, message, *others)
-                    finalized = await self._queue.send(finalize, priority=priority)
-            except (Reverted, NodeUnreachable, RequestRefused) as error:
+                    finalized = await self._queue.send(finalize, priority=self._chain.costs.worth(liability))
+            except (Reverted, NodeUnreachable, NotOffered, RequestRefused) as error:
+                if isinstance(error, Reverted) and error.gas_used:
+                    await self._judgements.wasted(liability)
                 self._not_finalized(results, error)
-                self._begin(self._judgements.agreeing(message.liability, len(results)), priority)
+                self._begin(self._judgements.agreeing(liability, len(results)), liability)
             else:
                 self._earnings.finalized(finalized)
                 event = log_event("contract-finalized", success=message.success, gas=finalized.gas_used)
@@ -221,8 +246,9 @@ class ResultSettlement:
     def _not_finalized(self, results: Sequence[Verified[Result]], error: AiraError) -> None:
         """Reject the results of a liability that they can't finalize, unless another way has ended or will end it."""
         reason = error.reason if isinstance(error, Reverted) else ""
+        is_final = reason == VALIDATOR_FINALIZES or isinstance(error, NotOffered)
         for result in results:
             if reason not in QUIET:
                 self._rejections.reject(result, reason_of(error), str(error))
-            if not self._events.unconfirmed.end(result) and reason != VALIDATOR_FINALIZES:
+            if not self._events.unconfirmed.end(result) and not is_final:
                 self._forget(result)

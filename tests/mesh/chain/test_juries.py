@@ -204,6 +204,17 @@ async def test_the_originals_take_one_signature(market: DeployedMarket) -> None:
         assert (await chain.liabilities.get(liability)).is_success
 
 
+async def test_an_order_on_the_originals_names_no_jury_that_needs_several(market: DeployedMarket) -> None:
+    """They take one signature, and never give the cost back."""
+    several, _ = await some_jury(market)
+    one, _ = await some_jury(market, quorum=1)
+    author: dict[str, Any] = {"nonce": 0, "sender": market.promisee.address}
+    async with market.chain(contracts="original", generation=5) as chain:
+        with pytest.raises(NotOffered):
+            await chain.validators.check(market.demand(cost=5, validator=several.address, **author))
+        await chain.validators.check(market.demand(cost=5, validator=one.address, **author))
+
+
 async def test_the_keeper_collects_the_fees(market: DeployedMarket) -> None:
     deployed, jurors = await some_jury(market, quorum=1, size=1)
     async with market.chain(market.stranger) as keeper:

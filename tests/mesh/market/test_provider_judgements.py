@@ -9,22 +9,23 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec import structs
 
+from mesh.background import Background
 from mesh.chain import Account, DeploymentPlan, TransactionSender, new_private_key
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.development import deploy_market
 from mesh.market import judgements
+from mesh.market.provider import Provider
 from schemas import address_bytes, cid_of_bytes
 from tests.contracts.suite import artifact
 from tests.mesh.market.local_market import LocalMarket
 from tests.mesh.market.observation import events, until_read
 from tests.support.market import Founded
 from tests.support.orders import RECORDING
-from tests.support.waiting import until, until_found
+from tests.support.waiting import until, until_found, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Sequence
 
-    from mesh.market.provider import Provider
     from schemas import Liability, Result
     from tests.support.routers import EmbeddedRouter
 
@@ -313,6 +314,47 @@ async def test_another_validator_accepts_one_signature_and_is_not_asked_about_ev
     assert court.local.rejections == []
 
 
+async def test_a_validator_that_fails_only_in_blocks_is_soon_left_alone(
+    court: Court, provider: Provider, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It accepts everybody in a simulation, where gas is free; in a block it reverts."""
+    code = bytes.fromhex("3a156008575f5ffd5b60015f5260205ff3")
+    validator = await placed(court, bytes.fromhex(f"60{len(code):02x}8060095f395ff3") + code)
+    liability = await court.job(provider, validator)
+    calls, burst = Calls(provider), int(judgements.WASTED.burst)
+    strangers = [Account.from_key(new_private_key()) for _ in range(4 * burst)]
+    court.local.publish(*(court.verdict(liability, stranger) for stranger in strangers))
+    await until(lambda: events(caplog, "validator-shunned"))
+    await court.stays_open(provider, liability)
+    assert calls.made("eth_sendRawTransaction") == burst + 1
+    validator, (juror,) = await court.jury(quorum=1, size=1)
+    other = await court.job(provider, validator)
+    court.local.publish(court.verdict(other, juror))
+    assert (await court.ended(other)).is_success
+
+
+async def test_the_originals_can_not_be_finalized_by_several(court: Court) -> None:
+    """They take one signature, so a jury's quorum must be 1 there."""
+    session = await court.local.new_session()
+    async with (
+        court.local.chain_of("provider", contracts="original", generation=5) as chain,
+        Provider(session, chain, court.local.market) as provider,
+        Background() as tasks,
+    ):
+        tasks.start(provider.run(), "provider at work")
+        for keys in ("demand/x", "offer/x", "result"):
+            await until_heard(court.local.session, f"aira/{court.local.market}/{keys}")
+        for quorum in (2, 1):
+            validator, jurors = await court.jury(quorum=quorum, size=2)
+            liability = await court.job(provider, validator)
+            court.local.publish(*(court.verdict(liability, juror) for juror in jurors))
+            if quorum == 1:
+                assert (await court.ended(liability)).is_success
+            else:
+                await until(lambda: provider.earnings().rejected == {"NotOffered": 2})
+                await court.stays_open(provider, liability)
+
+
 @pytest.mark.parametrize("kind", ["account", "contract"])
 async def test_in_generation_3_results_wait_for_the_validator_itself(
     court: Court, provider: Provider, kind: str, caplog: pytest.LogCaptureFixture
@@ -357,7 +399,11 @@ async def test_what_does_not_fit_is_heard_again(court: Court, monkeypatch: pytes
 
 async def deployed(court: Court, name: str, arguments: bytes) -> str:
     """A contract that only tests use."""
-    creation = bytes.fromhex(artifact(name)["bytecode"][2:]) + arguments
+    return await placed(court, bytes.fromhex(artifact(name)["bytecode"][2:]) + arguments)
+
+
+async def placed(court: Court, creation: bytes) -> str:
+    """The contract that some code creates."""
     async with court.local.chain_of("rival") as chain:
         receipt = await TransactionSender(chain.node, court.local.accounts["rival"]).send(to=None, data=creation)
     assert receipt.contract is not None
