@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.validator.components import NotAJuror, NotAValidator
-from schemas import Result
+from schemas import Result, verify
 from tests.mesh.validator.courts import PRICE, Court, announcements_of, claim, liar, reports_on
 from tests.support.objectives import objective
-from tests.support.waiting import until_found
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from mesh import Evidence
@@ -72,18 +72,22 @@ async def test_a_quorum_must_agree(place: Place) -> None:
 
 
 async def test_what_others_sign_counts_for_nothing(place: Place) -> None:
-    """A stranger's verdict, and nonsense: the job waits for the juror."""
+    """The Results of a stranger: the juror waits for the promisor's."""
     async with Court(place, 5) as court:
         jury = await court.jury(0)
-        validator, robot = await court.validator(0, jury), await court.robot()
-        async with court.at_work(robot) as person:
+        validator, robot = await court.validator(0, jury), await liar(court)
+        async with court.at_work(validator, robot) as person:
             contract = await court.demand(person, jury)
+            ledger = validator.runtime.parts.ledger
+            await until_found(lambda: ledger.verdict(contract.address), what="the case")
             for success in (True, False):
-                person.send(Result(liability=contract.address, result=contract.liability.objective, success=success))
-            async with validator:
-                outcome = await contract.outcome()
-            assert outcome.success
-            assert outcome.result != contract.liability.objective
+                person.send(Result(liability=contract.address, result=contract.liability.model, success=success))
+            await until(lambda: validator.runtime.results.received >= 2)
+            await claim(robot, contract, contract.liability.objective, success=False)
+            assert (await contract.outcome()).result == contract.liability.objective
+            stored = await ledger.verdict(contract.address)
+            assert stored is not None
+            assert verify(stored.result).signer == robot.address
 
 
 async def test_a_juror_that_signs_nonsense_is_outvoted(place: Place) -> None:
