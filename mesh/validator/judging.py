@@ -40,7 +40,9 @@ _MAY_STAY_OPEN: Final = frozenset({"closed"})
 """Findings that may stay undecided: that an agent crashed, and may have lost a second of the recording, is no fault."""
 _FINDINGS_SIZE: Final = LONGEST_REPORT - 4096
 """Bytes of a report that are left for its findings."""
-_MESSAGE: Final = struct.Struct("<qII")
+_INTERVAL: Final = struct.Struct("<q")
+_DISTINCT: Final = 8
+"""Different times between messages without which a recording has no hash."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +72,9 @@ class Case:
 class Judgement:
     """Whether a result counts, and all that was found: the work counts only if it is claimed and every finding holds.
 
-    `marks` identify the recording, so that it pays only one job: the CID of the file, and a hash of its messages and
-    the times between them, which stays if only metadata and the time of day are changed.
+    `marks` identify the recording, so that it pays only one job: the CID of the file, and a hash of the times between
+    its messages, to the nanosecond, which stays if names, values and the time of day are changed. A recording with few
+    messages has no hash, as another one might have the same.
     """
 
     success: bool
@@ -150,32 +153,29 @@ class _Trial:
         self._policies = policies
         self._checks: list[PolicyCheck] = []
         self._hash = blake2b(digest_size=32)
-        self._topics: dict[str, bytes] = {}
-        self._count = 0
+        self._intervals: set[int] = set()
         self._last = 0
 
     def open(self, recording: Objective) -> None:
         self._evidence.open(recording)
         self._checks = [policy.begin(self._evidence) for policy in self._policies]
         self._last = recording.start_ns
-        self._topics = {topic.name: topic.name.encode() for topic in recording.topics}
 
     def add(self, message: Played, part: int) -> None:
         judged = self._evidence.add(message, part)
         for check in self._checks:
             check.add(judged)
-        topic, payload, time = self._topics[message.topic], message.payload, message.log_time_ns
-        self._hash.update(_MESSAGE.pack(time - self._last, len(topic), len(payload)) + topic)
-        self._hash.update(payload)
-        self._last = time
-        self._count += 1
+        since, self._last = message.log_time_ns - self._last, message.log_time_ns
+        self._hash.update(_INTERVAL.pack(since))
+        if len(self._intervals) < _DISTINCT:
+            self._intervals.add(since)
 
     def open_objective(self, objective: Objective) -> None:
         self._evidence.open_objective(objective)
 
     def marks(self, cid: str) -> tuple[str, ...]:
-        """What identifies the recording. Two messages at least, since the times between them make the hash unique."""
-        return (cid, self._hash.hexdigest()) if self._count > 1 else (cid,)
+        """What identifies the recording."""
+        return (cid, self._hash.hexdigest()) if len(self._intervals) == _DISTINCT else (cid,)
 
     def findings(self) -> Iterator[tuple[str, Finding]]:
         """What the policies have found, with their names; nothing if the recording is not readable."""

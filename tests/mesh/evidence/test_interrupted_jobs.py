@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from mesh.clock import SYSTEM_CLOCK
+from mesh.evidence import verify
 from mesh.recording import Recorder, RecordingAbout, open_objective
 from schemas import cid_of_file
 from tests.mesh.evidence.jobs import WORDS, JobFiles, failures, make_job, record, stop
@@ -82,3 +83,13 @@ def test_a_clock_that_is_set_back_makes_no_honest_recording_fail(tmp_path: Path)
     times = verdict.of("times")
     assert times is not None
     assert times.holds
+
+
+def test_the_time_of_all_parts_counts_for_the_period_but_not_the_time_between(tmp_path: Path) -> None:
+    """Two parts of three and two seconds, with two hours between them by the robot's clock."""
+    job = interrupted(tmp_path, WORDS[:3], WORDS[3:], clocks=(SetClock(), SetClock(NOON + 2 * HOUR)))
+    for seconds, holds in ((3, False), (4, True)):
+        verdict = verify(job.claim, objective=job.objective, result=job.result, period=(NOON, NOON + seconds * SECOND))
+        found = verdict.of("period")
+        assert found is not None
+        assert found.holds is holds, found.detail

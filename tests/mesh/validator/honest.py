@@ -107,7 +107,7 @@ def failing(error: type[Exception], *places: int, synced: bool = False, then: Ca
 
 
 async def slowly(job: Job, message: Played) -> None:
-    await asyncio.sleep(0.12)
+    await asyncio.sleep(0.2)
     await shine(job, message)
 
 

@@ -37,6 +37,7 @@ from tests.mesh.validator.tampering import (
     lacking,
     moved,
     naming,
+    number_payload,
     renamed,
     state_payload,
     stating,
@@ -195,6 +196,14 @@ def foreign_files(others: Others) -> Kinds:
         "it is another job's, renamed and moved to now": (
             "complete/replayed",
             both(taken(others.same_robot), renamed, naive(moved(SECOND))),
+        ),
+        "it is another job's, renamed, with other temperatures": (
+            "complete/replayed",
+            both(
+                taken(others.same_robot),
+                renamed,
+                naive(lambda f: f.edit_all("/lamp/temperature", payload=number_payload(30))),
+            ),
         ),
         "it is another job's, with another index": (
             "complete/replayed",
