@@ -144,3 +144,17 @@ def test_a_requested_amount_is_never_less_than_needed(wei: int, asked: str) -> N
 
 def test_a_requested_amount_of_a_coin_with_few_decimals_is_exact() -> None:
     assert at_least(1_500_000_001, Currency("XRT", 9)) == "1.500000001 XRT"
+
+
+async def test_a_validator_of_its_own_account(machine: Machine) -> None:
+    found = await machine.examined("validator", "robot")
+    result = found.one("validator")
+    assert (result.status, result.code) == (CheckStatus.OK, "own-account")
+
+
+async def test_a_validator_contract_that_is_none_gets_a_hint(machine: Machine) -> None:
+    lighthouse = (await machine.examined("validator", "robot", validator_contract=LIGHTHOUSE)).cause("validator")
+    assert lighthouse.code == "not-a-validator"
+    assert "aira validator deploy" in lighthouse.hint
+    nothing = await machine.examined("validator", "robot", validator_contract="0x" + "11" * 20)
+    assert nothing.cause("validator").code == "not-a-validator"
