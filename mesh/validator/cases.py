@@ -127,6 +127,7 @@ class Cases:
         """A reorganisation reverted a case's liability; it may come back at the same address."""
         if self._close(liability):
             log.warning("the liability was reverted", extra=log_event("case-set-aside", liability=liability))
+            await asyncio.to_thread(self._parts.store.release, liability)
         await self._parts.ledger.set_aside(liability)
 
     def send_again(self) -> None:

@@ -24,6 +24,7 @@ from mesh.retry import Backoff, RetryPolicy
 from mesh.validator.judging import Case, Judgement, judge
 from mesh.validator.policies import COMPLETE
 from mesh.work.models import Models
+from mesh.work.registration import in_daemon_thread
 from schemas import Result, decode
 from schemas.model import InvalidDescription
 from schemas.verdicts import ReportFinding, ValidatorReport
@@ -165,7 +166,7 @@ class CaseJudge:
         )
         address = work.case.liability.address
         try:
-            found = await asyncio.to_thread(judge_in_thread)
+            found = await in_daemon_thread(judge_in_thread)
         except Exception as error:
             facts = log_event("judging-failed", liability=address, error=type(error).__name__)
             log.exception("judging failed; the liability is judged again after a restart", extra=facts)

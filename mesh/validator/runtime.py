@@ -97,6 +97,7 @@ class ValidatorRuntime(Role):
                     await self.parts.ledger.set_aside(stored.liability.address)
                 elif record.is_finalized:
                     await self.parts.ledger.end(record.address)
+                    await asyncio.to_thread(self.parts.store.release, record.address)
                 else:
                     await self.cases.open(stored.liability, since_ns=stored.since_ns)
 

@@ -12,13 +12,15 @@ import sys
 import threading
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
+
+T = TypeVar("T")
 
 _OURS: Final = frozenset({"mesh", "schemas", "bridges"})
 """The packages whose code is not the user's."""
@@ -75,17 +77,17 @@ async def call_handler(handler: Callable[..., object], *arguments: Any) -> None:
     if inspect.iscoroutinefunction(inspect.unwrap(handler)):
         outcome = handler(*arguments)
     else:
-        outcome = await _in_thread(handler, *arguments)
+        outcome = await in_daemon_thread(handler, *arguments)
     if inspect.isawaitable(outcome):
         await outcome
 
 
-async def _in_thread(function: Callable[..., object], *arguments: Any) -> object:
+async def in_daemon_thread(function: Callable[..., T], *arguments: Any) -> T:
     """The result of a function that may block. Its daemon thread delays neither other work nor the end of the process.
 
     The threads of `asyncio.to_thread` are few, and the agent's own work needs them.
     """
-    context, outcome = contextvars.copy_context(), Future[object]()
+    context, outcome = contextvars.copy_context(), Future[T]()
     outcome.set_running_or_notify_cancel()  # so that it can't be cancelled, and the thread can set it
 
     def run() -> None:
