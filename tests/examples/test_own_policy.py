@@ -1,4 +1,4 @@
-"""The validator with a policy of its own judges the job of the README, by the command line, also after `kill -9`."""
+"""The validator with a policy of its own judges the job of the README, by the command line."""
 
 from __future__ import annotations
 
@@ -69,13 +69,3 @@ def test_a_job_is_judged_by_the_policy_and_paid(bench: Bench) -> None:
         assert told[-1]["success"]
         signed = [json.loads(line) for line in validator.log().splitlines() if "verdict-signed" in line]
         assert [event["success"] for event in signed] == ["True"]
-
-
-@pytest.mark.full
-def test_a_validator_killed_before_its_verdict_judges_after_its_restart(bench: Bench) -> None:
-    with bench.robot(), bench.validator() as validator:
-        bench.demand()
-        validator.kill()
-        with bench.validator() as again:
-            assert bench.demand("--existing", "new")[-1]["success"]
-            assert "verdict-signed" in again.log()
