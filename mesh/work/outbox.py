@@ -75,8 +75,9 @@ class Outbox:
     """Sends the messages that the ledger holds to the channel. Receivers drop duplicates.
 
     A message is sent when it is posted, and then again after growing delays (`policy`). All are sent at once, and their
-    delays start over, when `run` starts, when the network returns and when a provider appears on the market: a provider
-    starts with an empty order book. Beyond `rate` messages wait: the oldest longest, and offers behind all others.
+    delays start over, when `run` starts, when the network returns and when a provider or a validator appears on the
+    market: it starts with an empty order book, or has missed a Result. Beyond `rate` messages wait: the oldest longest,
+    and offers behind all others.
     `clock` (seconds) and `chance` (0 to 1, for jitter) are injected by tests.
     """
 
@@ -179,7 +180,7 @@ class Outbox:
             self._channel.watch_presence(lambda _key: appeared.set(), role=role)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._send_on_return(), name="outbox after network loss")
-            tasks.create_task(self._send_to_providers(appeared), name="outbox to new providers")
+            tasks.create_task(self._send_to_newcomers(appeared), name="outbox to newcomers")
             await self.send_all()
             while True:
                 await self._wait()
@@ -226,9 +227,12 @@ class Outbox:
             if self._network.connected:
                 await self.send_all()
 
-    async def _send_to_providers(self, appeared: asyncio.Event) -> None:
+    async def _send_to_newcomers(self, appeared: asyncio.Event) -> None:
         while True:
             await appeared.wait()
             appeared.clear()
-            log.debug("a provider appeared: all unsent messages are sent again", extra=log_event("provider-appeared"))
+            log.debug(
+                "a provider or validator appeared: all unsent messages are sent again",
+                extra=log_event("provider-appeared"),
+            )
             await self.send_all()

@@ -191,8 +191,9 @@ async def test_each_message_backs_off_on_its_own(
         await sent_at(156, first, second)
 
 
-async def test_all_is_sent_at_once_when_a_provider_appears(
-    router: EmbeddedRouter, tmp_path: Path, received: list[tuple[str, Any]]
+@pytest.mark.parametrize("role", ["provider", "validator"])
+async def test_all_is_sent_at_once_when_a_provider_or_a_validator_appears(
+    router: EmbeddedRouter, tmp_path: Path, received: list[tuple[str, Any]], role: str
 ) -> None:
     ours: list[Demand | Offer | Result] = [demand(), offer(), result()]
     async with opened(router, tmp_path, NEVER) as post, Background() as tasks:
@@ -205,7 +206,7 @@ async def test_all_is_sent_at_once_when_a_provider_appears(
         received.clear()
         async with Network(Endpoints(connect=(router.endpoint,))) as network, Channel(network.session, MARKET) as late:
             late.announce("agent", LIGHTHOUSE)
-            late.announce("provider", LIGHTHOUSE)
+            late.announce(role, LIGHTHOUSE)
             await until(lambda: len(received) >= len(ours))
             assert sorted(repr(message) for _, message in received) == sorted(map(repr, ours))
 
