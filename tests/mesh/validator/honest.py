@@ -36,7 +36,7 @@ from tests.mesh.validator.lamps import (
 from tests.support.bags import Bag, BagMessage
 from tests.support.objectives import MILLISECOND
 from tests.support.routers import client_config
-from tests.support.waiting import until
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -141,9 +141,11 @@ def device(place: Place, name: str, objective: Path, *, temperature: str = "") -
             told.append(level)
 
         key = str(ObjectiveTopicKey(ROBOT.address, address, "/lamp"))
-        subscriber: Any = session.declare_subscriber(key, answer)
+        subscribers: list[Any] = [session.declare_subscriber(key, answer)]
+        subscribers.append(session.declare_subscriber(f"test/{name}{temperature}", print))  # known after the first one
         yield told
-        subscriber.undeclare()
+        for subscriber in subscribers:
+            subscriber.undeclare()
 
 
 FLOAT: Final = encode_value(1.0)[1]
@@ -281,7 +283,8 @@ async def several_devices(place: Place, name: str) -> FinishedJob:
     objective, robot = place.order(name), place.robot(name)
     oven = device(place, name, objective, temperature="/oven/temperature")
     with device(place, name, objective) as told, oven as also_told:
-        await asyncio.sleep(0.5)  # until the robot's router knows them
+        for key in (f"test/{name}", f"test/{name}/oven/temperature"):
+            await until_heard(place.session, key)
 
         async def answered() -> None:
             await until(lambda: len(told) == len(also_told) == len(LEVELS))

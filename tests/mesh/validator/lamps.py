@@ -91,7 +91,7 @@ def follows_levels(evidence: Evidence) -> Iterator[str]:
 POLICIES: Final[tuple[Policy, ...]] = (
     policy_of("acknowledged:command=/lamp:answer=/lamp/state:within=1s"),
     policy_of("schema"),
-    policy_of("rate:topic=/lamp/temperature:min=5:max=1000:gap=1s"),
+    policy_of("rate:topic=/lamp/temperature:min=4:max=1000:gap=1s"),
     OwnPolicy("levels", "The lamp shows each level that it was told to.", follows_levels),
 )
 

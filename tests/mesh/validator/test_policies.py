@@ -118,7 +118,7 @@ def described(schema: bytes) -> PayloadType:
     return PayloadType("json", "it", "jsonschema", schema)
 
 
-DEEP = b'{"a":' * 400 + b"1" + b"}" * 400
+DEEP = b'{"a":' * 700 + b"1" + b"}" * 700
 
 
 @pytest.mark.parametrize(
