@@ -16,7 +16,8 @@ from mesh.cli.status import describe_status, show_all, show_one, summarize_statu
 from mesh.devchain import JsonRpcServer
 from mesh.errors import InvalidAddress
 from mesh.settings import Settings
-from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, Work
+from mesh.validator.validator import Validator
+from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, ValidationStatus, Work
 from tests.mesh.cli.served_chain import columns
 from tests.mesh.market.local_market import QUICK
 from tests.mesh.watching.test_presence import WAY, bridge_status, status
@@ -46,12 +47,41 @@ MARKET_FACTS = MarketStatus(
 )
 
 
+VALIDATION = ValidationStatus(
+    validators=(STRANGER.address, ROBOT.address),
+    policies=("complete", "rate"),
+    fee=10**8,
+    cases={"waiting": 2, "judging": 0, "signed": 1, "ended": 1_234},
+    store=StoreUse(files=3, bytes=2048, quota=10 * 1024**3),
+)
+
+
 async def read_status(place: Place, role: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """The status of a role as `aira status --json` prints it."""
     await show_one(place.settings("watcher"), place.address(role), timeout=5.0, as_json=True)
     (found,) = json.loads(capsys.readouterr().out)
     assert isinstance(found, dict)
     return found
+
+
+async def test_a_validator_reports_its_parts_and_its_cases(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    account, chain = place.market.accounts["person"], place.chains["person"]
+    validator = Validator(settings=place.settings("judge"), account=account, chain=chain, fee="0.1 XRT")
+    async with validator:
+        found = await read_status(place, "person", capsys)
+    assert found["role"] == "validator"
+    assert found["parts"] == dict.fromkeys(("channel", "listener"), "alive")
+    assert found["validation"]["validators"] == [place.address("person")]
+    assert (found["validation"]["policies"], found["validation"]["fee"]) == (["complete"], "100000000")
+
+
+def test_a_validator_is_described_for_people() -> None:
+    judge = msgspec.structs.replace(status(role="validator"), validation=VALIDATION)
+    shown = describe_status(judge)
+    assert shown["judges for"] == f"{STRANGER.address}, {ROBOT.address}"
+    assert shown["open cases"] == "2 waiting, 1 signed"
+    assert (shown["done"], shown["fee"], shown["policies"]) == ("1,234", "0.1 XRT", "complete, rate")
+    assert summarize_status(judge).endswith("3 open cases")
 
 
 async def test_an_agent_reports_its_parts_its_block_and_its_work(
