@@ -15,7 +15,7 @@ from coincurve import PrivateKey
 
 from mesh.errors import ConfigurationError, InputError
 from mesh.extras import needs_extra
-from schemas.address import keccak256, parse_address
+from schemas.address import address_bytes, checksum_address, keccak256, parse_address
 from schemas.signing import Signer
 
 if TYPE_CHECKING:
@@ -225,3 +225,11 @@ def _read_password(path: Path) -> bytes:
     except OSError as error:
         raise KeyfileError(path, f"can't read the password file: {error.strerror}") from None
     return lines[0] if lines else b""
+
+
+def created_address(sender: str, nonce: int) -> str:
+    """The address of the contract that an account's transaction with this nonce deploys."""
+    number = nonce.to_bytes((nonce.bit_length() + 7) // 8)
+    encoded = number if 0 < nonce < 0x80 else bytes([0x80 + len(number)]) + number  # RLP
+    content = b"\x94" + address_bytes(sender) + encoded
+    return checksum_address(keccak256(bytes([0xC0 + len(content)]) + content)[12:])

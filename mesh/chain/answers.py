@@ -133,7 +133,7 @@ class Log(_Answer, frozen=True):
 
 
 class MinedTransaction(_Answer, frozen=True):
-    """The receipt of a transaction. `status` is 1 if it succeeded; `contract_address` is what it deployed."""
+    """The receipt of a transaction. `status` is 1 if it succeeded."""
 
     block_number: Count
     block_hash: Word
@@ -141,7 +141,6 @@ class MinedTransaction(_Answer, frozen=True):
     effective_gas_price: Quantity
     status: Count
     logs: Annotated[list[Log], Meta(max_length=MAX_LOGS)]
-    contract_address: Address | None = None
 
 
 class KnownTransaction(_Answer, frozen=True):

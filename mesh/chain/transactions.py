@@ -13,6 +13,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from mesh.chain.accounts import created_address
 from mesh.chain.confirmation import (
     Confirmation,
     NonceLost,
@@ -239,7 +240,8 @@ class TransactionSender:
             block_number=receipt.block_number,
             gas_used=gas_used,
             wei=wei,
-            contract=receipt.contract_address,
+            # A node may leave it out, or name a contract of its own.
+            contract=None if entry.fields["to"] else created_address(self.account.address, entry.nonce),
             logs=tuple(receipt.logs),
         )
 

@@ -9,13 +9,15 @@ import stat
 from typing import TYPE_CHECKING
 
 import pytest
+import rlp  # type: ignore[import-untyped]
 from eth_account import Account as EthAccount
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mesh.chain import Account, KeyfileError, WrongPassword, keyfile_address, new_private_key, write_keyfile
-from mesh.chain.accounts import KeyfileExists, NotAKeyfile
+from mesh.chain.accounts import KeyfileExists, NotAKeyfile, created_address
 from mesh.errors import ConfigurationError, InputError
+from schemas.address import address_bytes, checksum_address, keccak256
 from schemas.signing import recover
 
 if TYPE_CHECKING:
@@ -181,3 +183,10 @@ def test_neither_key_nor_password_is_shown_or_logged(
 def test_an_account_can_not_be_pickled() -> None:
     with pytest.raises(TypeError):
         pickle.dumps(Account.from_key(KEY))
+
+
+@pytest.mark.parametrize("nonce", [0, 1, 127, 128, 255, 256, 65_535, 65_536, 2**40])
+def test_the_address_of_a_new_contract_is_known_before_it_exists(nonce: int) -> None:
+    sender = Account.from_key(new_private_key()).address
+    expected = keccak256(rlp.encode([address_bytes(sender), nonce]))[12:]
+    assert created_address(sender, nonce) == checksum_address(expected)

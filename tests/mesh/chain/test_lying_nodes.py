@@ -128,3 +128,14 @@ def test_a_contracts_reason_is_cut_off() -> None:
     said = b"no" * 10_000
     words = (32).to_bytes(32, "big") + len(said).to_bytes(32, "big") + said + bytes(-len(said) % 32)
     assert explain(bytes.fromhex("08c379a0") + words).reason == "no" * 500
+
+
+async def test_a_node_can_not_name_another_contract_as_the_one_that_was_deployed(node: EmbeddedChain) -> None:
+    wire, account = _Lying(node), Account.from_key(node.funded_keys[0])
+    async with Chain(wire, account=account, timing=QUICK) as chain:
+        wire.lies["eth_getTransactionReceipt"] = lambda receipt: receipt | {"contractAddress": chain.factory}
+        made = await chain.validators.deploy([account.address], 1)
+        assert made.address != chain.factory
+        jury = await chain.validators.jury(made.address)
+        assert jury is not None
+        assert jury.jurors == (account.address,)

@@ -57,6 +57,11 @@ async def _everything(chain: Chain) -> None:
     await chain.lighthouses.list()
     assert await chain.has_mesh_contracts()
     assert await node.block_hash(0)
+    made = await chain.validators.deploy([account.address, unused_address()], 2)
+    jury = await chain.validators.jury(made.address)
+    assert jury is not None
+    assert (jury.jurors, jury.quorum) == (made.jurors, 2)
+    assert await chain.validators.accepts(made.address, account.address)
 
 
 @pytest.mark.sample("nodes")
