@@ -170,7 +170,8 @@ class Validator(Lifecycle):
     def _add(self, policy: Policy) -> None:
         if policy == COMPLETE:
             return  # it is always there
-        if any(policy.name == known.name for known in self._policies):
+        own = isinstance(policy, OwnPolicy)  # others may be there several times, with other options
+        if any(known == policy or (own and known.name == policy.name) for known in self._policies):
             raise InvalidPolicy(policy.name, "it is given twice")
         if len(self._policies) >= MOST_POLICIES:
             raise InvalidPolicy(policy.name, f"a validator has {MOST_POLICIES} policies at most")

@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.recording import Played
+from mesh.settings import Settings
 from mesh.validator.evidence import Evidence, JudgedMessage
 from mesh.validator.policies import POLICIES, policy_of
+from mesh.validator.policy import InvalidPolicy
+from mesh.validator.validator import Validator
 from schemas.model import ModelDescription, ModelTopic
 from schemas.payloads import PayloadType, encode_value
 from schemas.value_schema import ValueSchema
@@ -162,6 +165,17 @@ def test_messages_are_as_the_model_says_of_results() -> None:
     assert found(schema, said(ANSWER, 0, value=2.5), model=model)["model"] is False
     assert found(schema, said(OTHER, 0, value=1.5), model=model)["model"] is False
     assert "model" not in found(schema, said(ANSWER, 0, value=2.5))
+
+
+def test_a_validator_has_a_policy_several_times_with_other_options_only() -> None:
+    several = ["rate:topic=/imu:min=50", "rate:topic=/gps:min=1"]
+    validator = Validator(settings=Settings(), policies=several)
+    assert [policy.name for policy in validator.policies] == ["complete", "rate", "rate"]
+    with pytest.raises(InvalidPolicy):
+        Validator(settings=Settings(), policies=[*several, several[0]])
+    for name in ("rate", "complete"):
+        with pytest.raises(InvalidPolicy):
+            validator.check(name, description="Mine.")(lambda evidence: True)
 
 
 def test_values_beyond_counting_are_a_finding() -> None:

@@ -209,7 +209,8 @@ export const texts = {
   ownCheck: { contract: "Terms", order: "Your order", signature: "Signature", objective: "Objective file", result: "Recording file", open: "Not checked" } as Record<string, string>,
   check: {
     "objective-file": "Objective file", "result-file": "Recording file", finalized: "Ended", signature: "Signature", readable: "Readable",
-    statistics: "Counts", closed: "Complete", sequence: "No gaps", times: "In order", liability: "This job", agent: "This robot",
+    statistics: "Counts", closed: "Complete", sequence: "No gaps", times: "In order", duplicates: "No copies",
+    roles: "Who sent what", clock: "Clock", liability: "This job", agent: "This robot",
     lighthouse: "This market", objective: "This objective", played: "Objective played",
   } as Record<string, string>,
   walletsNode: "your wallet's node",
