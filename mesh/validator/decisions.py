@@ -45,7 +45,7 @@ FETCHES_OF_PROMISOR: Final = 4
 """The same for one promisor: files that nobody serves must not delay the cases of others."""
 FETCH_SECONDS: Final = 600.0
 """The most seconds of one attempt to fetch; the next attempt continues where it ended."""
-FETCH_AGAIN: Final = RetryPolicy(initial=1.0, ceiling=300.0)
+FETCH_AGAIN: Final = RetryPolicy(initial=1.0, ceiling=60.0)
 """How long to wait before files that nobody serves are looked for again."""
 JUDGED_OF_PROMISOR: Final = 512
 """Recordings of one promisor that wait to be judged."""

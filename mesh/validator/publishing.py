@@ -19,32 +19,38 @@ from schemas.selectors import LIABILITY, market_selector
 from schemas.verdicts import ValidatorAnnouncement
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from mesh.validator.components import ValidatorComponents
 
 ANSWERS: Final = Rate(per_second=100.0, burst=1000)
 """Answers to queries. Zenoh does not say who asks, so that all share this."""
 REFRESH: Final = 600.0
-"""Seconds after which announcements are signed again: parties ignore old ones."""
+"""Seconds after which an announcement is signed again: parties ignore old ones."""
 PENDING: Final = 64
 """Queries for reports that may be pending; further ones are dropped."""
 
 
 class Announcements:
-    """Answers queries of `ValidatorKey` with a signed announcement for each of the addresses that it judges for."""
+    """Answers queries of `ValidatorKey` with a signed announcement for each of the addresses that it judges for.
 
-    def __init__(self, parts: ValidatorComponents) -> None:
+    An announcement is signed again when it is older than `REFRESH`. `clock` is the time of day in seconds.
+    """
+
+    def __init__(self, parts: ValidatorComponents, *, clock: Callable[[], float] = time.time) -> None:
         self._parts = parts
+        self._clock = clock
         self._rate = RateLimiter(per_sender=ANSWERS)
-        self._encoded: dict[str, bytes] = {}
-        """By the key's text."""
-        self._signed_at = 0.0
+        self._signed: dict[str, ValidatorAnnouncement] = {}
+        """By validator."""
         self._queryables: list[Any] = []
 
     async def __aenter__(self) -> Self:
-        self._sign()
-        session = self._parts.network.session
-        for key in self._encoded:
-            self._queryables.append(session.declare_queryable(key, partial(self._answer, key), complete=True))
+        session, lighthouse = self._parts.network.session, self._parts.channel.lighthouse
+        for validator in self._parts.bench.validators:
+            key = str(ValidatorKey(lighthouse, validator))
+            answer = partial(self._answer, key, validator)
+            self._queryables.append(session.declare_queryable(key, answer, complete=True))
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
@@ -52,31 +58,32 @@ class Announcements:
             for queryable in self._queryables:
                 queryable.undeclare()
 
-    def _sign(self) -> None:
-        bench, terms, signer = self._parts.bench, self._parts.terms, self._parts.signer
-        self._signed_at = time.time()
-        for validator in bench.validators:
-            is_contract = validator == bench.contract
-            announcement = ValidatorAnnouncement(
-                validator=validator,
-                juror=signer.address,
-                title=terms.title,
-                policies=tuple(policy.note for policy in terms.policies),
-                fee=terms.fee,
-                quorum=bench.quorum if is_contract else 1,
-                jurors=bench.jurors if is_contract else 1,
-                made_at=int(self._signed_at),
-            )
-            key = str(ValidatorKey(self._parts.channel.lighthouse, validator))
-            self._encoded[key] = announcement.signed_by(signer).encode()
+    def announcement(self, validator: str) -> ValidatorAnnouncement:
+        """The signed announcement for one of the addresses."""
+        now, found = int(self._clock()), self._signed.get(validator)
+        if found is None or not 0 <= now - found.made_at < REFRESH:
+            found = self._signed[validator] = self._sign(validator, now)
+        return found
 
-    def _answer(self, key: str, query: zenoh.Query) -> None:
-        """Answer on Zenoh's thread: the announcement is ready, and at most `REFRESH` old."""
+    def _sign(self, validator: str, now: int) -> ValidatorAnnouncement:
+        bench, terms, signer = self._parts.bench, self._parts.terms, self._parts.signer
+        is_contract = validator == bench.contract
+        return ValidatorAnnouncement(
+            validator=validator,
+            juror=signer.address,
+            title=terms.title,
+            policies=tuple(policy.note for policy in terms.policies),
+            fee=terms.fee,
+            quorum=bench.quorum if is_contract else 1,
+            jurors=bench.jurors if is_contract else 1,
+            made_at=now,
+        ).signed_by(signer)
+
+    def _answer(self, key: str, validator: str, query: zenoh.Query) -> None:
+        """Answer on Zenoh's thread, as nothing has to be read."""
         with query:
             if self._rate.allow(""):
-                if time.time() > self._signed_at + REFRESH:
-                    self._sign()
-                query.reply(key, self._encoded[key], encoding="application/json")
+                query.reply(key, self.announcement(validator).encode(), encoding="application/json")
             else:
                 self._parts.drops.count("recall")
 

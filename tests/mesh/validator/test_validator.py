@@ -9,6 +9,7 @@ import pytest
 
 from mesh.chain import XRT
 from mesh.validator import publishing
+from mesh.validator.publishing import REFRESH, Announcements
 from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
@@ -54,6 +55,16 @@ async def test_an_announcement_is_signed_again_so_that_parties_believe_it(
                 return again.is_signed and again.made_at > first.made_at
 
             await until_found(is_renewed, what="a later announcement")
+
+
+async def test_announcements_stay_fresh(place: Place) -> None:
+    """Parties ignore old ones: a validator that runs for days signs them again."""
+    times = [1_000.0, 1_000.0 + REFRESH - 1, 1_000.0 + REFRESH, 500.0]
+    async with Court(place) as court, await court.validator() as validator:
+        announcements = Announcements(validator.runtime.parts, clock=lambda: times.pop(0))
+        made = [announcements.announcement(validator.address) for _ in range(4)]
+    assert [one.made_at for one in made] == [1_000, 1_000, 1_000 + REFRESH, 500]
+    assert all(one.is_signed for one in made)
 
 
 async def test_undone_work_is_refunded_with_the_reason(place: Place) -> None:
