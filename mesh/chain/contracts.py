@@ -57,9 +57,9 @@ class ContractVersion:
         """
         return lighthouse.finalizeLiability(result.liability, *result_arguments(result, *others))
 
-    def finalization_without_turn(self, result: Result) -> ContractCall:
-        """The call by which anybody finalizes a liability with its result. Raises `NotOffered`."""
-        return self._factory.finalize(result.liability, *result_arguments(result))
+    def finalization_without_turn(self, result: Result, *others: Result) -> ContractCall:
+        """The call by which anybody finalizes a liability, as `finalization`. Raises `NotOffered`."""
+        return self._factory.finalize(result.liability, *result_arguments(result, *others))
 
     def validation(self, result: Result, *, agree: bool) -> ContractCall:
         """The call by which a generation-3 validator finalizes. Raises `NotOffered`."""
@@ -139,7 +139,7 @@ class OriginalContracts(ContractVersion):
         call = super().validation(result, agree=AGREE)
         return lighthouse.to(result.liability, call.data)
 
-    def finalization_without_turn(self, result: Result) -> ContractCall:
+    def finalization_without_turn(self, result: Result, *others: Result) -> ContractCall:
         raise NotOffered("finalization without a turn", self.generation)
 
     def validation(self, result: Result, *, agree: bool) -> ContractCall:

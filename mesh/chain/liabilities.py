@@ -188,12 +188,12 @@ class Liabilities:
         functions = await self._contracts.lighthouse_contract(lighthouse)
         return await self._settle(self._contracts.version.finalization(functions, result, *others))
 
-    async def finalize_without_turn(self, result: Result) -> Settled:
-        """Finalize a liability by its signed result as any account, when no provider does; nothing is minted.
+    async def finalize_without_turn(self, result: Result, *others: Result) -> Settled:
+        """Finalize a liability as `finalize` does, as any account, when no provider does; nothing is minted.
 
         Raises `NotOffered` for the original contracts, `Reverted` (`WrongSigner`, `AlreadyFinalized`, …).
         """
-        return await self._settle(self._contracts.version.finalization_without_turn(result))
+        return await self._settle(self._contracts.version.finalization_without_turn(result, *others))
 
     async def validate(self, result: Result, *, agree: bool) -> Settled:
         """Finalize a generation-3 liability as the validator that it names.

@@ -176,6 +176,16 @@ async def test_a_quorum_finalizes_in_any_order(market: DeployedMarket) -> None:
             assert (await chain.liabilities.get(liability)).is_success
 
 
+async def test_anybody_brings_the_results_of_a_quorum_without_a_turn(market: DeployedMarket) -> None:
+    deployed, jurors = await some_jury(market)
+    async with market.chain(market.provider, generation=5) as provider, market.chain(market.stranger) as stranger:
+        liability = await create(market, provider, deployed.address)
+        signed = [market.result(liability, account=juror, success=False) for juror in jurors[::2]]
+        await stranger.liabilities.finalize_without_turn(*signed)
+        ended = await provider.liabilities.get(liability)
+        assert (ended.is_finalized, ended.is_success) == (True, False)
+
+
 async def test_what_is_no_quorum_is_refused(market: DeployedMarket) -> None:
     deployed, jurors = await some_jury(market)
     async with market.chain(market.provider, generation=5) as chain:
