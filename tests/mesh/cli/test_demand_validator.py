@@ -113,7 +113,8 @@ async def test_a_doubtful_validator_is_named_before_anything_is_signed(
     settings = settings_of(site, "person")
     expected = UnsafeValidator if who == "lighthouse" else DoubtfulValidator
     with pytest.raises(expected):
-        await demand(settings, as_json=True, **options, **TERMS)
+        async with asyncio.timeout(60):
+            await demand(settings, as_json=True, **options, **TERMS)
     async with site.agent("person") as person:
         assert person.orders() == []
     if who == "lighthouse":
@@ -197,3 +198,14 @@ def lying(site: Site) -> Agent:
             robot.send(Result(liability=address, result=liability.objective, success=True))
 
     return robot
+
+
+async def test_who_watches_a_liability_sees_the_verdict_when_it_is_there(site: Site, juror: Juror) -> None:
+    async with site.provider(), site.robot([]) as robot, site.agent("person") as person:
+        contract = await person.demand(site.job("word"), cost=7, validator=juror.signer.address)
+        command, variables = (*AIRA, "liability", "watch", contract.address), site.variables("person")
+        async with Serving(*command, says="must judge the result: 1 juror alike", variables=variables) as watching:
+            juror.judge(contract, contract.liability.objective, success=False)
+            line = f"juror {juror.signer.address} judged: the work does not count: {MISSING.detail}"
+            await asyncio.to_thread(watching.wait_until_said, line)
+        assert robot.address == contract.liability.promisor
