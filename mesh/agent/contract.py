@@ -86,8 +86,8 @@ class Contract:
         Of a job that failed it fetches the recording, for at most `REASON_TIMEOUT`, and reads the reason.
         """
         async with (
-            self._reports.followed(self.liability, on_progress) as on_job,
-            followed_job(self._parts, self.liability, on_job),
+            self._reports.followed(self.liability, on_progress),
+            followed_job(self._parts, self.liability, on_progress),
         ):
             ended = await asyncio.shield(self._ended)
             ended = msgspec.structs.replace(ended, reports=await self._last_reports())

@@ -22,7 +22,7 @@ from mesh.flood import BoundedDict, Rate, RateLimiter
 from mesh.log_context import liability_context, log_event
 from mesh.role import Lifecycle
 from mesh.watching.queries import query_all
-from schemas import ZERO_ADDRESS, InvalidRecord
+from schemas import ZERO_ADDRESS, InvalidRecord, Result
 from schemas.selectors import report_selector
 from schemas.verdicts import LONGEST_REPORT, ValidatorReport
 
@@ -104,13 +104,10 @@ class ContractReports(Lifecycle):
         return () if judged is None else tuple(judged.reports[juror] for juror in sorted(judged.reports))
 
     @asynccontextmanager
-    async def followed(self, liability: Liability, on_progress: OnProgress) -> AsyncIterator[OnProgress]:
-        """Meanwhile report what the jurors of a contract say, or that they are silent or disagree.
-
-        Yields the function to which to report the job, which thereby shows when the promisor has signed its result.
-        """
+    async def followed(self, liability: Liability, on_progress: OnProgress) -> AsyncIterator[None]:
+        """Meanwhile report what the jurors of a contract say, or that they are silent or disagree."""
         if on_progress is nothing or liability.validator == ZERO_ADDRESS:
-            yield on_progress
+            yield
             return
         self.follow(liability)
         judged, changed = self._judged[liability.address], asyncio.Event()
@@ -119,20 +116,24 @@ class ContractReports(Lifecycle):
             changed.set()
             report(on_progress, judged_progress(found, judged))
 
-        def on_job(progress: Progress) -> None:
-            if progress.kind == "result":
-                changed.set()
-            on_progress(progress)
-
         for found in judged.reports.values():
             judge(found)
         judged.listeners.append(judge)
         try:
             async with Background() as tasks:
                 tasks.start(self._report_silence(judged, changed, on_progress), f"verdict on {liability.address}")
-                yield on_job
+                tasks.start(self._hear_result(liability, changed), f"result for {liability.address}")
+                yield
         finally:
             judged.listeners.remove(judge)
+
+    async def _hear_result(self, liability: Liability, changed: asyncio.Event) -> None:
+        """Note that the promisor has signed its result, which it sends again until the contract ends."""
+        async with self._parts.channel.subscribe(Result) as results:
+            async for result in results:
+                if result.message.liability == liability.address and result.signer == liability.promisor:
+                    changed.set()
+                    return
 
     async def _report_silence(self, judged: JudgedContract, changed: asyncio.Event, on_progress: OnProgress) -> None:
         """Say that jurors are silent, or can't agree any more, after the result or a report, once for each state."""

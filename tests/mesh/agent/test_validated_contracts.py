@@ -161,8 +161,13 @@ async def test_those_who_wait_are_told_that_the_validator_is_silent(
         assert (unjudged.agent, unjudged.code) == (juror.signer.address, "silent")
         assert (unjudged.position, unjudged.total) == (0, 1)
         assert f"from block {refundable:,}" in unjudged.detail
+        again: list[Progress] = []
+        late = asyncio.create_task(contract.outcome(on_progress=again.append))  # the robot has said all that it says
+        await until(lambda: any(one.kind == "unjudged" for one in again))
+        assert "result" not in [one.kind for one in again]
         await judge(place, juror, robot, contract, success=True)
         assert (await ending).success
+        assert (await late).success
 
 
 async def test_a_fee_is_not_guessed_when_nobody_announces_one(place: Place) -> None:
