@@ -174,7 +174,7 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
     path, easier = tmp_path / "job.mcap", tmp_path / "easier.mcap"
     path.write_bytes(objective(("/go", "there"), ("/go", "back")))
     easier.write_bytes(objective(("/go", "there")))
-    order: dict[str, Any] = {"model": MODEL, "cost": "7wn", "validator_fee": "0", "lifetime": 1000}
+    order: dict[str, Any] = {"model": MODEL, "cost": "7wn", "validator": "", "validator_fee": None, "lifetime": 1000}
     nothing, other = (VerifiedFiles(objective=file, result=None, message=None) for file in (None, easier))
     async with asyncio.timeout(180), served_market(tmp_path, capsys) as (endpoint, url):
         robot, person = (
