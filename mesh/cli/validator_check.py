@@ -75,7 +75,6 @@ class CheckedFiles:
 
 async def check_recording(settings: Settings, files: CheckedFiles, policies: tuple[str, ...], *, as_json: bool) -> bool:
     """Print what the policies find in a recording. Returns whether all of it holds."""
-    from mesh.recording import ABOUT, GENEROUS, open_objective
     from mesh.validator.judging import examine
 
     chosen = await asyncio.to_thread(_policies, settings, policies, files.checks)
@@ -83,8 +82,7 @@ async def check_recording(settings: Settings, files: CheckedFiles, policies: tup
     message = None if files.message is None else await asyncio.to_thread(require_readable(files.message).read_bytes)
     async with opened_store(settings) as store:
         recording = await _file(settings, store, files.recording)
-        opened = await asyncio.to_thread(open_objective, recording, GENEROUS)
-        about = opened.metadata.get(ABOUT, {})
+        about = await asyncio.to_thread(_about, recording, required=files.objective is None)
         objective = files.objective or await fetch(settings, store, about.get("objective", ""))
         with progress("checking") as tell:
             found = await asyncio.to_thread(
@@ -108,6 +106,18 @@ async def check_recording(settings: Settings, files: CheckedFiles, policies: tup
 async def _file(settings: Settings, store: Store, name: str) -> Path:
     found = file_or_cid(name)
     return require_readable(found) if isinstance(found, Path) else await fetch(settings, store, found)
+
+
+def _about(path: Path, *, required: bool) -> Mapping[str, str]:
+    """The job that a recording names. Of an unreadable one, nothing; or raises `RecordingError` if it is `required`."""
+    from mesh.recording import ABOUT, GENEROUS, RecordingError, open_objective
+
+    try:
+        return open_objective(path, GENEROUS).metadata.get(ABOUT, {})
+    except RecordingError:
+        if required:
+            raise
+        return {}
 
 
 def _policies(settings: Settings, named: tuple[str, ...], program: Path | None) -> tuple[Policy, ...]:

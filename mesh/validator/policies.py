@@ -195,11 +195,13 @@ class _RateCheck(PolicyCheck):
             yield Finding("rate", False, f"there is no message {where}")
             return
         per_second = self.count / max(1.0, self.recorded_ns / _SECOND)
-        too_few = self.policy.least is not None and per_second < self.policy.least
-        too_many = self.policy.most is not None and per_second > self.policy.most
-        yield Finding(
-            "rate", not too_few and not too_many, f"{self.count} messages {where}, {per_second:.4g} per second"
-        )
+        said = f"{self.count} messages {where}, {per_second:.4g} per second"
+        if self.policy.least is not None and per_second < self.policy.least:
+            yield Finding("rate", False, f"{said}, and at least {self.policy.least:g} are required")
+        elif self.policy.most is not None and per_second > self.policy.most:
+            yield Finding("rate", False, f"{said}, and at most {self.policy.most:g} are allowed")
+        else:
+            yield Finding("rate", True, said)
         gap, since = self.longest[0] / _SECOND, self.longest[1]
         longest = f"the longest time without a message {where} is {gap:.4g} s, from {since:.3f} s on"
         yield Finding("gaps", self.longest[0] <= self.policy.gap_ns, longest)

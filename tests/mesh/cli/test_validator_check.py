@@ -59,6 +59,15 @@ def test_each_policy_that_is_named_is_applied_and_a_failure_is_exit_code_1(job: 
     assert "holds  schema/types" in done.stdout
 
 
+def test_a_recording_that_is_cut_fails_and_without_an_objective_can_not_be_checked(job: JobFiles) -> None:
+    job.result.write_bytes(job.result.read_bytes()[:900])
+    done = checked(job)
+    assert (done.exit_code, "FAILS  complete/readable" in done.stdout) == (1, True)
+    words = ["validator", "check", str(job.result), "--data-dir", str(job.result.parent / "data")]
+    done = CliRunner().invoke(main, words)
+    assert (done.exit_code, "[corrupt-recording]" in done.stderr) == (2, True)
+
+
 def test_findings_are_printed_as_json(job: JobFiles) -> None:
     done = checked(job, "--policy", "rate", "--json")
     said = json.loads(done.stdout)
