@@ -1,4 +1,4 @@
-"""A contract that names a validator: what its jurors have reported, what is missing, and how people are told."""
+"""A contract that names a validator: what its jurors have reported, what is missing, and how it is shown to people."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ PER_JUROR: Final = Rate(per_second=1.0, burst=16)
 LOOKED_AT: Final = Rate(per_second=20.0, burst=200)
 """Reports in all that are looked at."""
 SILENCE: Final = 30.0
-"""Seconds without a verdict after which those who wait are told that they wait for the validator."""
+"""Seconds without a verdict after which those who wait hear that the validator is silent."""
 ASK_TIMEOUT: Final = 3.0
 """Seconds in which jurors answer with earlier reports."""
 

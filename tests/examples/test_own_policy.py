@@ -63,9 +63,9 @@ def bench(market: dict[str, str], tmp_path: Path) -> Bench:
 
 def test_a_job_is_judged_by_the_policy_and_paid(bench: Bench) -> None:
     with bench.robot(), bench.validator() as validator:
-        told = bench.demand()
-        assert told[0]["kind"] == "validator"
-        assert [policy["name"] for policy in told[0]["policies"]] == ["complete", "schema", "lamp-answers"]
-        assert told[-1]["success"]
+        said = bench.demand()
+        assert said[0]["kind"] == "validator"
+        assert [policy["name"] for policy in said[0]["policies"]] == ["complete", "schema", "lamp-answers"]
+        assert said[-1]["success"]
         signed = [json.loads(line) for line in validator.log().splitlines() if "verdict-signed" in line]
         assert [event["success"] for event in signed] == ["True"]
