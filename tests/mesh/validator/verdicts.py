@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import zenoh
 
-from tests.mesh.validator.honest import KINDS, Place
+from tests.mesh.validator.faults import Place
+from tests.mesh.validator.honest import KINDS
 from tests.mesh.validator.lamps import THIEF, LampRobot, order
 from tests.mesh.validator.tampered_claims import tampered, tamperings
 from tests.mesh.validator.tampering import Others
