@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from tests.contracts.market import Market
     from tests.contracts.suite import Person
 
+pytestmark = pytest.mark.sample("market")
+
 COST = 5 * XRT
 FEE = XRT
 

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from tests.contracts.market import Market
 
+pytestmark = pytest.mark.sample("market")
+
 SOMEBODY = "0x" + "42" * 20
 CURVE_ORDER = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD0364141
 

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from tests.contracts.chains import Chain
     from tests.contracts.suite import Person
 
+pytestmark = pytest.mark.sample("market")
+
 PROVIDERS: Final = 1000
 AT_ONCE: Final = 100
 TIMEOUT: Final = 10

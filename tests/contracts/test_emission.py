@@ -11,6 +11,8 @@ from tests.contracts.suite import REFUND_DELAY, XRT
 if TYPE_CHECKING:
     from tests.contracts.market import Market
 
+pytestmark = pytest.mark.sample("market")
+
 COST = 5 * XRT
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from tests.contracts.chains import Chain
     from tests.contracts.suite import Person
 
+pytestmark = pytest.mark.sample("market")
+
 TIMEOUT: Final = 10
 DELAY: Final = 120
 COST: Final = 5 * XRT

@@ -14,6 +14,8 @@ from tests.contracts.suite import REFUND_DELAY, XRT
 if TYPE_CHECKING:
     from tests.contracts.market import Market
 
+pytestmark = pytest.mark.sample("market")
+
 COST = 5 * XRT
 FEE = 2 * XRT
 HUGE = 2**256 - 1

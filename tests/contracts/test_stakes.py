@@ -13,6 +13,8 @@ from tests.contracts.suite import XRT
 if TYPE_CHECKING:
     from tests.contracts.market import Market
 
+pytestmark = pytest.mark.sample("market")
+
 
 def test_stakes_can_be_withdrawn(market: Market) -> None:
     suite = market.suite

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import pytest
+
 from schemas import keccak256
 from tests.contracts.suite import REFUND_DELAY
 
@@ -11,6 +13,8 @@ if TYPE_CHECKING:
     from web3.contract import Contract
 
     from tests.contracts.market import Market
+
+pytestmark = pytest.mark.sample("market")
 
 COST = 1000
 

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.contracts.rounds import TIMEOUT, Round
 from tests.contracts.suite import XRT
 
 if TYPE_CHECKING:
     from tests.contracts.market import Market
+
+pytestmark = pytest.mark.sample("market")
 
 
 def test_a_turn_has_as_many_transactions_as_minimal_stakes(market: Market) -> None:

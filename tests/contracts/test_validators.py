@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 AnOrder = TypeVar("AnOrder", Demand, Offer)
 
+pytestmark = pytest.mark.sample("market")
+
 COST = 5 * XRT
 FEE = XRT
 

@@ -14,6 +14,8 @@ from tests.contracts.suite import XRT
 if TYPE_CHECKING:
     from tests.contracts.market import Market
 
+pytestmark = pytest.mark.sample("market")
+
 
 @pytest.mark.parametrize("withdrawn", ["demand", "offer"])
 def test_a_withdrawn_order_makes_no_liability(market: Market, withdrawn: str) -> None:
