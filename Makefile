@@ -14,8 +14,8 @@ INSTALLED := .venv/.installed
 LOCK := requirements/lock.txt
 TYPED := schemas mesh bridges peers tests bench examples
 BENCHES := $(shell grep -l __main__ bench/*.py)
-# Processes that run the tests. They wait more than they compute, so there are three for each core; 0 runs all in one.
-JOBS ?= $(shell echo $$((3 * $$(getconf _NPROCESSORS_ONLN))))
+# Processes that run the tests. They wait more than they compute, so there are two for each core; 0 runs all in one.
+JOBS ?= $(shell echo $$((2 * $$(getconf _NPROCESSORS_ONLN))))
 # CI measures coverage, which takes time.
 COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 # A busy machine may delay or drop what a test waits for. At most three tests run a second time, each with its traceback.
