@@ -70,7 +70,7 @@ class Playbacks:
             self._session,
             self._agent,
             job.liability,
-            await asyncio.to_thread(self._open_recorder, job.liability),
+            await self._opened_recorder(job.liability),
             objective=objective,
             pace=self._pace,
             position=job.position,
@@ -175,6 +175,17 @@ class Playbacks:
             leftover.unlink(missing_ok=True)
         if sync and self._folder.exists():
             sync_directory(self._folder)
+
+    async def _opened_recorder(self, liability: Liability) -> Recorder:
+        """An open recorder. It is closed if this is cancelled meanwhile: the thread that opens it can't be stopped."""
+        opening = asyncio.ensure_future(asyncio.to_thread(self._open_recorder, liability))
+        try:
+            return await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            await asyncio.wait([opening])
+            if opening.exception() is None:
+                await asyncio.to_thread(opening.result().close)
+            raise
 
     def _open_recorder(self, liability: Liability) -> Recorder:
         finished, partial, _ = self._recording_files(liability.address)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
@@ -36,6 +37,16 @@ async def test_an_interrupted_recording_is_continued(playbacks: Playbacks) -> No
     assert summary.recovered == 1
     recorded = [String.decode(message.payload).data for message in open_objective(summary.path).messages()]
     assert recorded == ["before", "after"]
+
+
+async def test_a_run_that_is_cancelled_while_its_recording_is_opened_leaves_it_to_another(playbacks: Playbacks) -> None:
+    cancelled = asyncio.create_task(playbacks.create(job()))
+    await asyncio.sleep(0)
+    cancelled.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await cancelled
+    summary = await (await playbacks.create(job())).close()
+    assert summary.messages == 0
 
 
 @pytest.mark.parametrize("leftover", ["", ".part", ".cut"])
