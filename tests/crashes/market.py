@@ -101,7 +101,7 @@ class CrashMarket:
                 raise AssertionError(f"{cell.name}: {error}\n{logs}") from None
             finally:
                 self._stop("person")
-                if disk is not None:
+                if cell.fault in ("disk", "clock"):  # the next cell's job is for a process without the fault
                     self._stop(cell.victim)
 
     def _start_for(self, cell: Cell, control: Path, work: Path, disk: Path | None) -> None:
