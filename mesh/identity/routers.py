@@ -20,6 +20,8 @@ from mesh.network.endpoints import Endpoints, check_locators
 from schemas.agent_keys import DeviceTopicKey
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import zenoh
 
     from mesh.settings import Settings
@@ -94,15 +96,20 @@ def is_loopback(locator: str) -> bool:
 def zenohd_configuration(endpoints: Endpoints) -> str:
     """The router as a configuration file (JSON5) of `zenohd`. Raises `ConfigurationError` if it can't work."""
     endpoints.config()
-    nested: dict[str, Any] = {}
-    for path, value in endpoints.options().items():
-        *sections, name = path.split("/")
-        section = nested
-        for each in sections:
-            section = section.setdefault(each, {})
-        section[name] = value
     heading = "// Created by `aira router config`; zenohd reads it when it starts: zenohd --config FILE\n"
-    return heading + json.dumps(nested, indent=2) + "\n"
+    return heading + json.dumps(nested(endpoints.options()), indent=2) + "\n"
+
+
+def nested(options: Mapping[str, object]) -> dict[str, Any]:
+    """Options by their path in Zenoh's configuration, as the sections of a file."""
+    sections: dict[str, Any] = {}
+    for path, value in options.items():
+        *names, last = path.split("/")
+        section = sections
+        for name in names:
+            section = section.setdefault(name, {})
+        section[last] = value
+    return sections
 
 
 class IdentityDenied(RemoteError, code="identity-denied"):

@@ -29,7 +29,7 @@ async def fail(error: Exception) -> None:
 async def test_leaving_cancels_all_tasks() -> None:
     ended: list[str] = []
 
-    async with asyncio.timeout(5), Background() as tasks:
+    async with asyncio.timeout(60), Background() as tasks:
         tasks.start(for_ever(ended, "a"), "a")
         tasks.start(for_ever(ended, "b"), "b")
         await asyncio.sleep(0)

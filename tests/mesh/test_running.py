@@ -75,7 +75,7 @@ def signalled(call: str, *signals: signal.Signals) -> tuple[int, str, str]:
             process.send_signal(number)
         sent = time.monotonic()
         output, errors = process.communicate(timeout=30)
-        assert time.monotonic() - sent < 5
+        assert time.monotonic() - sent < 20
         return process.returncode, printed + output, errors
 
 

@@ -112,9 +112,9 @@ class Place:
 
     @asynccontextmanager
     async def provider(self) -> AsyncIterator[Provider]:
-        """The lighthouse's provider at work, for a minute at most: no test may hang."""
+        """The lighthouse's provider at work, for some minutes at most: no test may hang."""
         async with (
-            asyncio.timeout(60),
+            asyncio.timeout(180),
             Network(Endpoints(connect=(self.endpoint,))) as network,
             Provider(network.session, self.chains["provider"], self.market.deployment.lighthouse_name) as provider,
             Background() as tasks,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import zenoh
 
+from mesh.identity.routers import nested
+from mesh.network.endpoints import SEND_WAIT, Endpoints
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
 from tests.support.processes import Server
@@ -15,6 +17,9 @@ from tests.support.processes import Server
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
+
+OPEN_MILLISECONDS: Final = 30_000
+WAIT_MICROSECONDS: Final = round(SEND_WAIT * 1e6)
 
 
 class EmbeddedRouter:
@@ -81,23 +86,19 @@ class Zenohd(Server):
 
 
 def client_config(endpoint: str) -> zenoh.Config:
-    """The configuration of a client of the router at `endpoint`, without scouting."""
-    config = {
-        "mode": "client",
-        "connect": {"endpoints": [endpoint]},
-        "scouting": {"multicast": {"enabled": False}},
-    }
-    return zenoh.Config.from_json5(json.dumps(config))
+    """The configuration of a client of the router at `endpoint`, which queues and waits as the product's clients do."""
+    config = Endpoints(connect=(endpoint,)).config()
+    # The product's clients try again after a shorter time, `zenoh.open` does not.
+    config.insert_json5("transport/unicast/open_timeout", str(OPEN_MILLISECONDS))
+    return config
 
 
 def _router_config(endpoint: str, more: Mapping[str, Any]) -> dict[str, Any]:
-    """Scouting is off, so that tests running at the same time do not find each other's routers.
+    """As the product's routers, but they wait as long as clients for room in a queue: no test has a client too slow.
 
-    `delay` is the half second that a router would otherwise wait for others when it opens.
+    Gossip is off, so that tests running at the same time do not find each other's routers.
     """
-    return {
-        "mode": "router",
-        "listen": {"endpoints": [endpoint]},
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
-        **more,
-    }
+    config = nested(Endpoints(mode="router", listen=(endpoint,)).options())
+    config["scouting"]["gossip"] = {"enabled": False}
+    config["transport"]["link"]["tx"]["queue"]["congestion_control"] = {"drop": {"wait_before_drop": WAIT_MICROSECONDS}}
+    return {**config, **more}

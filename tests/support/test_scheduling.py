@@ -15,7 +15,7 @@ SETTINGS = """
 [pytest]
 addopts = --import-mode=importlib -p no:cacheprovider
 asyncio_default_fixture_loop_scope = function
-faulthandler_timeout = 3
+faulthandler_timeout = 60
 faulthandler_exit_on_timeout = true
 """
 CONFTEST = """

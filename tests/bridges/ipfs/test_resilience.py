@@ -82,6 +82,7 @@ async def test_no_accepted_message_is_lost_by_outages_of_the_daemon(
         await until(lambda: len(set(bob.heard)) == 60, what="the messages accepted meanwhile", seconds=SECONDS)
         assert bridge.status().losses == 1
 
+        await until_found(lambda: bob.peers(topic), seconds=SECONDS)
         await bob.publish(topic, legacy_json(answer := offer()))
         await until(lambda: encode(answer) in mesh.payloads, seconds=SECONDS)
     # The message in flight when the daemon died may arrive twice, and at each of its two starts the one that was being

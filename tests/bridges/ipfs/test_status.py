@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from typing import TYPE_CHECKING
 
 from bridges.ipfs.status import (
@@ -154,6 +155,7 @@ async def test_a_flood_is_one_log_event_and_losses_are_a_warning(
     def said() -> list[logging.LogRecord]:
         return [record for record in caplog.records if record.name == "bridges.ipfs.channel"]
 
+    begun = time.monotonic()
     async with (
         on_mesh(router.endpoint, topic) as mesh,
         bridging(router.endpoint, api, topic, tmp_path / "journal", limit=20, report_interval=0.5) as bridge,
@@ -167,7 +169,7 @@ async def test_a_flood_is_one_log_event_and_losses_are_a_warning(
         assert (status.to_ipfs.kinds, status.to_ipfs.dropped) == ({"demand": 20}, {"no-room": 80})
         assert status.uptime > 0
     lines = said()
-    assert 1 <= len(lines) < 10
+    assert 1 <= len(lines) <= (time.monotonic() - begun) / 0.5
     assert max(record.levelno for record in lines) == logging.WARNING
     assert {line.__dict__["event"] for line in lines} == {"bridge-reported"}
     facts = lines[0].__dict__["facts"]

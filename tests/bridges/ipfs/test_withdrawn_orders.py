@@ -14,7 +14,7 @@ from schemas import Demand, Offer, Signer, Withdrawal, encode, message_hash, ver
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
 from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, demand, offer
 from tests.support.ports import free_port
-from tests.support.waiting import until, until_answered
+from tests.support.waiting import until, until_answered, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -45,6 +45,7 @@ async def test_a_withdrawn_order_is_not_relayed(
     await bob.listen(topic)
     async with bridging(router.endpoint, swarm.a.api, topic, tmp_path / "journal") as bridge:
         await until(lambda: bridge.status().state == "connected", seconds=SECONDS)
+        await until_found(lambda: bob.peers(topic), what="the bridge's daemon", seconds=SECONDS)
         await until_seen(mesh, bridge.address)
         one, two, kept = demand(), demand(), demand()
         withdrawals = withdrawal_of(one), withdrawal_of(two), withdrawal_of(kept, STRANGER)

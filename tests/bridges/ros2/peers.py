@@ -8,8 +8,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
-import zenoh
-
 from tests.support.peers import require
 
 if TYPE_CHECKING:
@@ -19,12 +17,6 @@ HERE: Final = Path(__file__).parent
 VECTORS: Final = HERE / "vectors"
 SECONDS: Final = 30.0
 """Patience with a peer on a busy machine."""
-
-
-def client_config(endpoint: str) -> zenoh.Config:
-    """The configuration of a session that connects to a router, and to nothing else."""
-    config = {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
-    return zenoh.Config.from_json5(json.dumps(config))
 
 
 class RosPeer:

@@ -11,7 +11,8 @@ from typing import Any
 
 import zenoh
 
-from tests.bridges.ros2.peers import VECTORS, client_config
+from tests.bridges.ros2.peers import VECTORS
+from tests.support.routers import client_config
 
 REQUEST = bytes.fromhex("00010000" + "0200000000000000" + "0300000000000000")
 """AddTwoInts of 2 and 3."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 async def received(socket: Any, *kinds: str) -> list[dict[str, Any]]:
     """The events until one of each kind has come."""
     events: list[dict[str, Any]] = []
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not set(kinds) <= {event["kind"] for event in events}:
             events += json.loads((await socket.receive()).data)
     return events
@@ -105,5 +105,5 @@ async def test_a_slow_tab_loses_old_ticks_of_the_market_and_nothing_else() -> No
 async def test_what_is_no_subscription_ends_the_connection(serve: Any) -> None:
     async with serve() as browser, browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket:
         await socket.send_str("[1]")
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             assert (await socket.receive()).type.name in ("CLOSE", "CLOSED")

@@ -168,8 +168,8 @@ async def test_a_periodic_handler_is_called_at_the_start_and_again_after_failure
         raise ZeroDivisionError
 
     async with agent:
-        await until(lambda: calls == 1, seconds=5)
-        await until(lambda: calls >= 4, seconds=5)
+        await until(lambda: calls == 1)
+        await until(lambda: calls >= 4)
     ended = calls
     await asyncio.sleep(3 * SOON)
     assert calls == ended

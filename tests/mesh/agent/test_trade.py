@@ -155,7 +155,7 @@ async def test_closing_the_agent_fails_the_wait_for_a_contract(place: Place) -> 
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
     with pytest.raises(ClosedError):
-        await asyncio.wait_for(demand, 10)
+        await asyncio.wait_for(demand, 60)
     async with place.agent("person") as person:
         assert [order.kind for order in person.orders()] == ["demand"], "it is open until it is withdrawn or expires"
 
@@ -168,7 +168,7 @@ async def test_closing_the_agent_fails_the_wait_for_an_outcome(place: Place) -> 
             outcome = asyncio.create_task(contract.outcome())
             await known(robot, contract.address)
         with pytest.raises(ClosedError):
-            await asyncio.wait_for(outcome, 10)
+            await asyncio.wait_for(outcome, 60)
         await robot.finish(contract.address, success=False)
 
 
@@ -263,7 +263,7 @@ async def test_a_contract_that_has_ended_has_its_outcome_at_once(place: Place) -
     async with place.provider(), working(place.agent("robot")), place.agent("person") as person:
         address = (await person.demand(job(place))).address
         outcome = await (await person.contract(address)).outcome()
-    async with place.agent("provider") as later, asyncio.timeout(10):
+    async with place.agent("provider") as later, asyncio.timeout(60):
         contract = await later.contract(address)
         assert await contract.outcome() == outcome
         assert len(later.runtime.trader.contracts) == 0

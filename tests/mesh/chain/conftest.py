@@ -127,7 +127,7 @@ async def prepare(endpoint: str | Transport, keys: tuple[bytes, ...]) -> Deploye
 async def read_to(chain: Chain, first: int, last: int, *, lighthouses: Iterable[str] = ()) -> list[BlockEvents]:
     """The events of the blocks from `first` to `last`."""
     blocks: list[BlockEvents] = []
-    async with asyncio.timeout(10), aclosing(chain.follow(first, lighthouses=lighthouses)) as events:
+    async with asyncio.timeout(60), aclosing(chain.follow(first, lighthouses=lighthouses)) as events:
         async for block in events:
             blocks.append(block)
             if block.block_number >= last:

@@ -51,7 +51,7 @@ async def pending_hashes(node: Node) -> dict[int, str]:
 
 async def until_pending(node: Node, count: int) -> dict[int, str]:
     """The same, once there are `count` of them."""
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while len(found := await pending_hashes(node)) < count:
             await asyncio.sleep(0.01)
     return found

@@ -29,7 +29,7 @@ async def test_a_stuck_transaction_is_replaced_with_higher_fees_and_takes_effect
         offered = int((await node.request("eth_getTransactionByHash", first))["maxFeePerGas"], 16)
         # No block takes the first any more.
         await node.request("anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while not sending.done():
                 await node.request("evm_mine")
                 await asyncio.sleep(0.05)
@@ -64,7 +64,7 @@ async def test_the_replaced_version_may_be_the_one_that_is_mined(anvil: Anvil) -
         )
         first = (await until_pending(node, 1))[0]
         wire.swallows = True
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while not wire.swallowed:
                 await asyncio.sleep(0.01)
         await node.request("evm_mine")
@@ -147,7 +147,7 @@ async def test_a_confirmed_transaction_that_a_reorganisation_left_in_the_pool_is
         sending = asyncio.create_task(sender.send(to=friends[1], data=b"", value=7))
         await until_pending(node, 2)
         await node.request("anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while not sending.done():
                 await node.request("evm_mine")
                 await asyncio.sleep(0.05)

@@ -87,7 +87,7 @@ async def _until(
 ) -> list[BlockEvents]:
     """The blocks up to and including the first one for which `is_last` is true."""
     blocks: list[BlockEvents] = []
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         async for block in events:
             blocks.append(block)
             if is_last(block):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
@@ -110,10 +111,11 @@ async def test_all_who_wait_for_a_block_share_the_looks(anvil: Anvil) -> None:
     async with Node(counting, timing=replace(QUICK, poll_interval=0.2)) as node:
         seen = (await node.heads.look()).hash
         waiting = [asyncio.create_task(node.heads.next(seen)) for _ in range(10)]
+        begun = time.monotonic()
         await asyncio.sleep(1.0)
         await node.request("evm_mine")
         assert {head.number for head in await asyncio.gather(*waiting)} == {1}
-        assert counting.calls["eth_getBlockByNumber"] < 10
+        assert counting.calls["eth_getBlockByNumber"] < 2 * (time.monotonic() - begun) / 0.2
     await counting.close()
 
 
@@ -157,7 +159,7 @@ async def test_an_expected_block_is_looked_for_at_once(anvil: Anvil) -> None:
         await asyncio.sleep(0)
         await node.request("evm_mine")
         node.heads.expect(1)
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(25):
             assert (await waiting).number == 1
 
 

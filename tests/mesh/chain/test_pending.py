@@ -127,7 +127,7 @@ async def test_a_stuck_transaction_of_an_earlier_process_is_replaced(anvil: Anvi
             await sender.send(to=friend, data=b"", value=1)
     async with open_sender(anvil, replace(QUICK, replace_after=0.1), transactions=tmp_path) as (node, sender):
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=2))
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while (await until_pending(node, 2))[0] == stuck.value.tx:
                 await asyncio.sleep(0.01)
         await node.request("evm_mine")

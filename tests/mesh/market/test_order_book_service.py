@@ -96,7 +96,7 @@ async def test_it_answers_with_all_orders_of_a_model(router: EmbeddedRouter) -> 
 
         await demands.recall()
 
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             recalled = {(await anext(demands)).hash for _ in range(20)}
         assert recalled == {order.hash for order in book.orders()}
 

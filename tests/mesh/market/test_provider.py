@@ -226,7 +226,7 @@ async def test_a_provider_is_present_while_it_is_open(local: LocalMarket) -> Non
 
 
 async def test_leaving_while_contracts_are_created_does_not_hang(local: LocalMarket) -> None:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         async with local.provider() as provider:
             for _ in range(50):
                 local.publish(local.demand(), local.offer())

@@ -157,10 +157,10 @@ async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> Non
 
     async with queue_of(local, limit=2, under_way=1) as queue, asyncio.TaskGroup() as tasks:
         for _ in range(2):  # the first is being sent, the second waits
-            async with asyncio.timeout(5):
+            async with asyncio.timeout(60):
                 await queue.has_room()
             tasks.create_task(queue.send(transaction))
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             await queue.has_room()
         tasks.create_task(queue.send(transaction))
         waiting = asyncio.create_task(queue.has_room())
@@ -169,7 +169,7 @@ async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> Non
         assert queue.waiting == 2
 
         free.set()
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             await waiting
 
 
@@ -243,7 +243,7 @@ async def test_others_are_sent_while_a_transaction_waits_for_its_next_attempt(lo
         task = asyncio.create_task(queue.send(Transaction(NodeUnreachable("http://node", "silence"))))
         await until(lambda: queue.is_down)
         assert queue.waiting == 1
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             assert await queue.send(Transaction()) == 1
         task.cancel()
 

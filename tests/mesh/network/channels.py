@@ -37,7 +37,7 @@ async def listening(
 
 
 async def take(messages: Subscription[Any], count: int) -> list[Verified[Any]]:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         return [await anext(messages) for _ in range(count)]
 
 

@@ -203,7 +203,7 @@ async def test_leaving_a_subscription_ends_its_iteration(here: zenoh.Session, th
         theirs.publish(demand())
         await until(lambda: taken)
 
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(60):
         await consuming
     assert len(taken) == 1
 

@@ -90,6 +90,6 @@ async def test_a_presence_watch_ends_with_its_channel(here: zenoh.Session, there
 
 
 async def until_present(channel: Channel, expected: list[PresenceKey]) -> None:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while await channel.present() != expected:
             await asyncio.sleep(0.01)

@@ -33,13 +33,13 @@ def put(session: zenoh.Session, *numbers: int) -> None:
 
 
 async def take(numbers: Pump[int], count: int) -> list[int]:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         return [await anext(numbers) for _ in range(count)]
 
 
 async def take_to_last(numbers: Pump[int]) -> list[int]:
     taken = []
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while (value := await anext(numbers)) != LAST:
             taken.append(value)
     return taken
@@ -203,7 +203,7 @@ async def test_leaving_ends_a_waiting_iteration(here: zenoh.Session) -> None:
         consuming = asyncio.create_task(collect(numbers))
         await asyncio.sleep(0)
 
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(60):
         assert await consuming == []
     with pytest.raises(StopAsyncIteration):
         await anext(numbers)

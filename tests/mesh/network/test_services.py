@@ -185,7 +185,7 @@ async def test_requests_are_handled_concurrently(here: zenoh.Session, there: zen
         await together.wait()
         return Done(True)
 
-    async with offering(there, here, start=start), asyncio.timeout(5):
+    async with offering(there, here, start=start), asyncio.timeout(60):
         replies = await asyncio.gather(*(call(here, ADDRESS, "start", REQUEST) for _ in range(3)))
 
     assert replies == [Done(True)] * 3

@@ -31,7 +31,7 @@ def client(*connect: str, timeout: float = 10.0) -> Network:
 
 
 async def next_change(changes: AsyncIterator[NetworkChange]) -> NetworkChange:
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(60):
         return await anext(changes)
 
 
@@ -76,7 +76,7 @@ async def test_a_client_waits_for_a_router_that_starts_later(timeout: float) -> 
         first_attempt.close()
 
     with EmbeddedRouter(port):
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             await opening
         assert network.connected
         await network.__aexit__(None, None, None)
@@ -141,8 +141,8 @@ async def test_a_taken_port_is_reported() -> None:
 
 async def test_a_router_is_usable_at_once_without_others() -> None:
     took = []
-    # What else goes on on the machine may make one of them slow, and hardly all.
-    for _ in range(3):
+    # What else goes on on the machine may make some of them slow, and hardly all.
+    while len(took) < 20 and min(took, default=1.0) >= 0.4:
         begun, endpoint = time.monotonic(), free_endpoint()
         async with Network(Endpoints(mode="router", listen=(endpoint,))) as router, client(endpoint) as network:
             assert router.connected
@@ -244,7 +244,7 @@ async def test_a_session_that_opens_after_its_cancellation_is_closed(router: Emb
 
     assert router.session is not None
     listener = router.session.info.declare_transport_events_listener(changed)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while len(opened) < 3:
             opening = asyncio.create_task(client(router.endpoint).__aenter__())
             await asyncio.sleep(0)
@@ -277,7 +277,7 @@ async def test_a_process_that_is_stopped_while_it_waits_for_a_router_ends() -> N
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-c", WAITS_FOR_EVER, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
-        async with asyncio.timeout(15):
+        async with asyncio.timeout(60):
             out, _ = await process.communicate()
 
     assert (out, process.returncode) == (b"cancelled\n", 0)

@@ -110,9 +110,9 @@ async def in_cdr(job: Job, message: Played) -> None:
 
 
 @contextmanager
-def device(place: Place, name: str, objective: Path, *, temperature: str = "") -> Iterator[list[float]]:
-    """A lamp with a session of its own, which answers what is played. Yields what it was told."""
-    address, told = contract(name, objective).address, list[float]()
+def device(place: Place, name: str, objective: Path, *, temperature: str = "") -> Iterator[None]:
+    """A lamp with a session of its own, which answers what is played."""
+    address = contract(name, objective).address
 
     with zenoh.open(client_config(place.endpoint)) as session:
 
@@ -125,12 +125,11 @@ def device(place: Place, name: str, objective: Path, *, temperature: str = "") -
             put(temperature or "/lamp/temperature", 20.5)
             if not temperature:
                 put("/lamp/state", {"level": level, "mode": "on"})
-            told.append(level)
 
         key = str(ObjectiveTopicKey(ROBOT.address, address, "/lamp"))
         subscribers: list[Any] = [session.declare_subscriber(key, answer)]
         subscribers.append(session.declare_subscriber(f"test/{name}{temperature}", print))  # known after the first one
-        yield told
+        yield
         for subscriber in subscribers:
             subscriber.undeclare()
 

@@ -45,13 +45,14 @@ from tests.mesh.validator.lamps import (
 from tests.support.bags import Bag, BagMessage
 from tests.support.objectives import MILLISECOND
 from tests.support.routers import client_config
-from tests.support.waiting import until, until_heard
+from tests.support.waiting import until_found, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from mesh.recording import Played
     from mesh.work.job import Job
+    from mesh.work.run import JobRun
 
 
 async def plain(place: Place, name: str) -> FinishedJob:
@@ -172,13 +173,15 @@ async def unplugged(place: Place, name: str) -> FinishedJob:
 async def several_devices(place: Place, name: str) -> FinishedJob:
     objective, robot = place.order(name), place.robot(name)
     oven = device(place, name, objective, temperature="/oven/temperature")
-    with device(place, name, objective) as told, oven as also_told:
+    with device(place, name, objective), oven:
         for key in (f"test/{name}", f"test/{name}/oven/temperature"):
             await until_heard(place.session, key)
 
-        async def answered() -> None:
-            await until(lambda: len(told) == len(also_told) == len(LEVELS))
-            await asyncio.sleep(0.3)  # what they have said arrives
+        async def answered(run: JobRun) -> None:
+            async def is_recorded() -> bool:  # each command, the lamp's two answers, and the oven's
+                return (await run.sync()).messages == 4 * len(LEVELS)
+
+            await until_found(is_recorded, what="all answers")
 
         robot.before_end = answered
         return await robot.work(name, objective, None)

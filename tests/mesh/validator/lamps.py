@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from mesh.validator.evidence import Evidence
     from mesh.validator.policy import Policy
     from mesh.work.job import Job
+    from mesh.work.run import JobRun
 
     Handler = Callable[[Job, Played], Awaitable[object]]
 
@@ -185,8 +186,8 @@ class LampRobot:
         self._robot = robot
         self._clock = clock
         self.folder = folder
-        self.before_end: Callable[[], Awaitable[object]] | None = None
-        """Is awaited between the last command and the end of a job."""
+        self.before_end: Callable[[JobRun], Awaitable[object]] | None = None
+        """Is awaited between the last command and the end of a job's run."""
 
     async def work(
         self,
@@ -242,7 +243,7 @@ class LampRobot:
         run = await playbacks.stop(liability.address)
         assert run is not None
         if self.before_end is not None:
-            await self.before_end()
+            await self.before_end(run)
         return (await run.close(sync=False)).path
 
     async def _crash(self, playbacks: Playbacks, address: str) -> None:

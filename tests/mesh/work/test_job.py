@@ -132,7 +132,7 @@ async def test_a_handler_may_close_its_own_run_and_is_the_last_to_be_called(maki
         calls += 1
         await run.close("enough")
 
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         await run.play(close)
     assert calls == 1
     assert making.recorded()[-1] == (NOTE_TOPIC, String("enough").encode(), "ros1;std_msgs/String")
@@ -144,7 +144,7 @@ async def test_a_run_that_is_closed_while_its_handler_waits_for_a_message_ends(m
     playing = asyncio.create_task(run.play(None))
     await until(lambda: run.position == 1)
     await run.close()
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         await playing
     assert run.position == 1
 
@@ -185,7 +185,7 @@ async def test_closing_works_when_the_session_has_broken(making: Making) -> None
     run.open()
     run.publish("/led", "on")
     await asyncio.to_thread(making.session.close)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         await run.close("the network is gone")
 
 

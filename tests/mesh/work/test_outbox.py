@@ -93,10 +93,14 @@ async def test_messages_are_sent_again_until_they_have_an_effect(post: Post, rec
         await until(lambda: [message for _, message in received].count(second) >= 3)
         assert await post.outbox.settle(outgoing_identity(second))
         assert not await post.outbox.settle(outgoing_identity(second))
-        await asyncio.sleep(QUICKLY.initial)
+
+        async def is_sent_twice_more() -> None:
+            before = [message for _, message in received].count(first)
+            await until(lambda: [message for _, message in received].count(first) >= before + 2)
+
+        await is_sent_twice_more()  # after what was under way
         so_far = [message for _, message in received].count(second)
-        before = [message for _, message in received].count(first)
-        await until(lambda: [message for _, message in received].count(first) >= before + 3)
+        await is_sent_twice_more()
         assert [message for _, message in received].count(second) == so_far
 
 
@@ -198,11 +202,10 @@ async def test_all_is_sent_at_once_when_a_provider_or_a_validator_appears(
     ours: list[Demand | Offer | Result] = [demand(), offer(), result()]
     async with opened(router, tmp_path, NEVER) as post, Background() as tasks:
         await listened_to(post)
-        tasks.start(post.outbox.run(), "outbox")
         for message in ours:
             await post.outbox.post(message)
-        await until(lambda: {repr(message) for _, message in received} == {repr(message) for message in ours})
-        await asyncio.sleep(0.1)  # let the outbox's own start be over
+        tasks.start(post.outbox.run(), "outbox")
+        await until(lambda: len(received) == 2 * len(ours), what="all once more at the outbox's own start")
         received.clear()
         async with Network(Endpoints(connect=(router.endpoint,))) as network, Channel(network.session, MARKET) as late:
             late.announce("agent", LIGHTHOUSE)
