@@ -140,7 +140,7 @@ async def test_a_taken_port_is_reported() -> None:
 
 
 async def test_a_router_is_usable_at_once_without_others() -> None:
-    took = []
+    took = list[float]()
     # What else goes on on the machine may make some of them slow, and hardly all.
     while len(took) < 20 and min(took, default=1.0) >= 0.4:
         begun, endpoint = time.monotonic(), free_endpoint()
