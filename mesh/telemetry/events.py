@@ -42,6 +42,7 @@ def event_of(record: logging.LogRecord, *, default: LogSource = context.UNKNOWN_
     if source is context.UNKNOWN_SOURCE:
         source = default
     error = record.exc_info[1] if record.exc_info else None
+    facts = _facts(getattr(record, "facts", {}))
     event = LogEvent(
         time=timestamp(record.created),
         level=level_of(record.levelno),
@@ -51,8 +52,8 @@ def event_of(record: logging.LogRecord, *, default: LogSource = context.UNKNOWN_
         role=source.role,
         address=source.address,
         lighthouse=source.lighthouse,
-        liability=context.current_liability(),
-        facts=_facts(getattr(record, "facts", {})),
+        liability=context.current_liability() or facts.get("liability", ""),
+        facts=facts,
         error="" if error is None else _cut(_encodable(_describe(error)), MAX_SHORT_TEXT),
         trace="" if error is None else _encodable("".join(traceback.format_exception(error)))[-MAX_TRACEBACK:],
     )

@@ -92,7 +92,7 @@ class Cases:
         self._open[liability.address] = case
         self._of_promisor[promisor] += 1
         facts = log_event("case-opened", liability=liability.address, validator=liability.validator)
-        log.info("%s names this validator", liability.address, extra=facts)
+        log.info("it names this validator", extra=facts)
         case.task = self._tasks.create_task(self._work(case), name=f"case {liability.address}")
 
     async def take(self, result: Verified[Result]) -> bool:
@@ -114,7 +114,7 @@ class Cases:
             await self._parts.ledger.end(liability)
             await asyncio.to_thread(self._parts.store.release, liability)
             facts = log_event("case-ended", liability=liability, success=success)
-            log.info("%s has ended: %s", liability, "paid" if success else "refunded", extra=facts)
+            log.info("it has ended: %s", "paid" if success else "refunded", extra=facts)
 
     async def reopen(self, liability: str) -> None:
         """A reorganisation reverted the end of a case: what was signed is sent again."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.agent import Agent
 from mesh.chain import XRT, Account, Chain
 from mesh.composition import chain_of
-from mesh.devchain.development import ALLOWANCE, ROLES, deploy_market
+from mesh.devchain.development import ALLOWANCE, PLAN, ROLES, deploy_market
 from mesh.retry import RetryPolicy
 from mesh.settings import Settings
 from schemas import cid_of_bytes
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from mesh.chain import NewLighthouse
+    from mesh.chain import DeploymentPlan, NewLighthouse
     from schemas import Demand, Verified
 
 MODEL: Final = cid_of_bytes(b"what the robots of the operated market can do")
@@ -44,9 +44,11 @@ class Site:
         self.lighthouse = Settings().lighthouse_contract
 
     @classmethod
-    async def found(cls, url: str, keys: Sequence[bytes], endpoint: str, folder: Path) -> Site:
+    async def found(
+        cls, url: str, keys: Sequence[bytes], endpoint: str, folder: Path, *, plan: DeploymentPlan = PLAN
+    ) -> Site:
         """Deploy a market, and approve the allowances of robot and person."""
-        await deploy_market(url, keys)
+        await deploy_market(url, keys, plan=plan)
         site = cls(url, keys, endpoint, folder)
         for role in ("robot", "person"):
             async with site.chain(role) as chain:

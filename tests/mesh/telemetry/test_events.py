@@ -50,6 +50,12 @@ def test_an_event_has_its_source_and_its_liability() -> None:
     }
 
 
+def test_an_event_outside_of_a_context_has_the_liability_that_its_facts_name() -> None:
+    event = record("it names this validator")
+    vars(event).update(log_event("case-opened", liability=LIABILITY))
+    assert json.loads(json_line(event_of(event)))["liability"] == LIABILITY
+
+
 def test_the_time_is_utc_with_milliseconds() -> None:
     event = record("now")
     event.created = 1_700_000_000.0019
