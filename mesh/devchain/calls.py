@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any, Final
 
 from eth.exceptions import Revert
@@ -11,12 +12,17 @@ from eth_utils.exceptions import ValidationError
 from mesh.chain.reverts import REVERTED
 from mesh.devchain.bounded_vm import GAS_LIMIT, bounded
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data, parse_quantity
+from mesh.flood import RecentDict
 
 if TYPE_CHECKING:
     from eth.abc import BlockHeaderAPI, ChainAPI, ComputationAPI
 
 CALL_STIPEND: Final = 2_300
 """Gas that a value transfer passes on for free; an estimate leaves room for it, as geth's does."""
+
+ANSWERS: Final = 256
+"""Answers to calls that are kept, and the most bytes of a call and its answer: clients often ask the same."""
+LONGEST_KEPT: Final = 16_384
 
 Call = dict[str, Any]
 """The fields of a call by their JSON-RPC names, parsed: from, to, data (bytes), value, gas (int)."""
@@ -28,19 +34,28 @@ class Calls:
     def __init__(self, chain: ChainAPI, *, run_seconds: float) -> None:
         self._chain: Any = chain
         self._run_seconds = run_seconds
+        self._answers: RecentDict[tuple[Any, ...], bytes] = RecentDict(ANSWERS)
+        """What calls have returned, by block, second and call: a contract may ask for the time."""
 
     def call(self, fields: Call, height: int) -> bytes:
         """What a call returns. Raises `RpcError` with the revert data when it fails."""
+        block = self._chain.get_canonical_block_header_by_number(height).hash
+        asked = (block, int(time.time()), *sorted(fields.items()))
+        if known := self._answers.get(asked, b""):
+            return known
         with bounded(self._run_seconds):
             computation = self._run(fields, height, gas=_gas_of(fields))
         _raise_if_failed(computation)
-        return bytes(computation.output)
+        answer = bytes(computation.output)
+        if len(answer) + len(fields["data"]) <= LONGEST_KEPT:
+            self._answers[asked] = answer
+        return answer
 
     def estimate(self, fields: Call, height: int) -> int:
         """Gas limit with which a transaction goes through; raises as `call` does.
 
-        What a run with all gas used; if that is not enough, with the 64th part that a call inside keeps back
-        (EIP-150) and the stipend; else, as geth does, a search up to the whole limit, to within a 64th.
+        What a run with all gas used; if it calls others, or that is not enough, with the 64th part that a call inside
+        keeps back (EIP-150) and the stipend; else, as geth does, a search up to the whole limit, to within a 64th.
         """
         with bounded(self._run_seconds):
             return self._search_gas(fields, height, limit=_gas_of(fields))
@@ -49,8 +64,8 @@ class Calls:
         computation = self._run(fields, height, gas=limit)
         _raise_if_failed(computation)
         used = limit - int(computation.get_gas_remaining())
-        low = used - 1
-        for attempt in (used, (used + CALL_STIPEND) * 64 // 63):
+        low, with_kept = used - 1, (used + CALL_STIPEND) * 64 // 63
+        for attempt in (with_kept,) if computation.children else (used, with_kept):
             if attempt >= limit:
                 return limit
             if self._suffices(fields, height, gas=attempt):
