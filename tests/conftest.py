@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from tests.support.ci import IN_CI
-from tests.support.ipfs import JsIpfs
 from tests.support.nodes import Anvil
 from tests.support.routers import EmbeddedRouter, Zenohd
 
@@ -74,13 +73,6 @@ def zenohd() -> Iterator[Zenohd]:
 def anvil() -> Iterator[Anvil]:
     """An EVM node with a new chain."""
     with Anvil() as running:
-        yield running
-
-
-@pytest.fixture(scope="session")
-def js_ipfs() -> Iterator[JsIpfs]:
-    """A js-ipfs daemon that all tests of a run share: it takes seconds to start, so tests use topics of their own."""
-    with JsIpfs() as running:
         yield running
 
 

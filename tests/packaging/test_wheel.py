@@ -93,6 +93,7 @@ def in_base(base: Path, *arguments: str | Path, folder: Path) -> subprocess.Comp
     )
 
 
+@pytest.mark.full
 def test_every_command_works_or_names_its_extra(base: Path, tmp_path: Path) -> None:
     done = in_base(base, WALKER, folder=tmp_path)
     assert done.returncode == 0, done.stderr

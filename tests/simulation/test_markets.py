@@ -33,6 +33,7 @@ def test_jobs_end_in_a_market_with_a_validator(chain: str) -> None:
     assert found["paid"] > 0
 
 
+@pytest.mark.full
 def test_a_job_ends_on_the_evm_too() -> None:
     found, said = simulate("--seed", "1", "--jobs", "1", "--only", "none", "--chain", "evm")
     assert (found["paid"] + found["refunded"], found["violations"]) == (1, []), said

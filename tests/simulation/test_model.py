@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from schemas import keccak256
 from tests.simulation.model import bloom_of
 from tests.simulation.model_history import ModelHistory, twins
+from tests.support.ci import IN_CI
 
-HISTORIES: Final = int(os.environ.get("AIRA_MODEL_HISTORIES", "30"))
+HISTORIES: Final = int(os.environ.get("AIRA_MODEL_HISTORIES", "30" if IN_CI else "8"))
 STEPS: Final = 60
 SHOWN: Final = ("status", "contractAddress", "from", "to", "blockNumber", "transactionIndex", "type")
 

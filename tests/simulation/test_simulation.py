@@ -61,6 +61,7 @@ def test_planted_bugs_fit_the_sources() -> None:
         compile(mutation.source(), mutation.name, "exec")
 
 
+@pytest.mark.full
 def test_a_planted_bug_is_found() -> None:
     command = [sys.executable, "-m", "tests.simulation", "--mutants", "--seed", "1", "--mutant", "before the objective"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)

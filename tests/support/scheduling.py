@@ -1,4 +1,4 @@
-"""How the processes of `make test` share the tests: a file at a time, the longest first."""
+"""How the processes of `make test` share the tests: a file or folder at a time, the longest first."""
 
 from __future__ import annotations
 
@@ -9,36 +9,37 @@ from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]
 if TYPE_CHECKING:
     from xdist.workermanage import WorkerController  # type: ignore[import-untyped]
 
+TOGETHER: Final = ("tests/web", "tests/bridges/ipfs", "tests/contracts")
+"""Folders whose files share servers: one process runs all of them, and its servers end with the last file."""
+
 SECONDS: Final[dict[str, int]] = {
-    "tests/web/test_page.py": 150,
-    "tests/examples/test_blink.py": 120,
-    "tests/mesh/cli/test_serving.py": 100,
-    "tests/web/test_lessons.py": 90,
-    "tests/web/test_outages.py": 90,
-    "tests/bridges/ipfs/test_resilience.py": 80,
-    "tests/web/test_lies.py": 75,
-    "tests/mesh/operations/test_two_providers.py": 70,
-    "tests/bridges/ipfs/test_channel.py": 55,
-    "tests/contracts/test_money.py": 50,
-    "tests/examples/test_air_pollution.py": 45,
-    "tests/examples/test_greenhouse.py": 25,
-    "tests/mesh/operations/test_unfit_at_the_start.py": 55,
-    "tests/bridges/serial/test_firmware.py": 50,
-    "tests/web/test_roles.py": 50,
-    "tests/mesh/cli/test_chain_up.py": 50,
-    "tests/mesh/cli/test_status.py": 35,
-    "tests/mesh/cli/test_verify.py": 35,
-    "tests/bridges/ipfs/test_content.py": 30,
-    "tests/mesh/demo/test_demo.py": 30,
-    "tests/bridges/ipfs/test_cli.py": 25,
-    "tests/bridges/ipfs/test_jobs.py": 25,
-    "tests/mesh/chain/test_following_reorganisations.py": 25,
+    "tests/web": 400,
+    "tests/bridges/ipfs": 200,
+    "tests/contracts": 120,
+    "tests/mesh/cli/test_serving.py": 115,
+    "tests/simulation/test_simulation.py": 105,
+    "tests/mesh/market/test_provider_judgements.py": 85,
+    "tests/mesh/cli/test_demand_validator.py": 80,
+    "tests/mesh/cli/test_chain_up.py": 60,
+    "tests/mesh/cli/test_logs_of_roles.py": 50,
+    "tests/peers/test_install.py": 50,
+    "tests/mesh/demo/test_demo.py": 50,
+    "tests/mesh/validator/test_juries.py": 45,
+    "tests/bridges/serial/test_edge_jobs.py": 40,
+    "tests/mesh/agent/test_services.py": 40,
+    "tests/mesh/operations/test_unfit_at_the_start.py": 40,
+    "tests/mesh/market/test_reorganisations.py": 35,
+    "tests/mesh/market/test_provider_failures.py": 35,
+    "tests/mesh/doctor/test_command.py": 35,
+    "tests/bridges/serial/test_detection.py": 35,
+    "tests/mesh/cli/test_liability.py": 30,
+    "tests/examples/test_blink.py": 30,
 }
-"""Roughly how long the longest files take on a busy machine. All others are short."""
+"""Roughly how long the longest files and folders take on a busy machine. All others are short."""
 
 
 class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
-    """Gives each process whole files, so that fixtures of a module are set up once."""
+    """Gives each process whole files, so that fixtures of a module are set up once, and the folders in `TOGETHER`."""
 
     def remove_node(self, node: WorkerController) -> str | None:
         """Reassign what a crashed process left undone; returns the test that it crashed in, which is not run again."""
@@ -52,7 +53,8 @@ class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
         return broken
 
     def _split_scope(self, nodeid: str) -> str:
-        return nodeid.split("::", 1)[0]
+        file = nodeid.split("::", 1)[0]
+        return next((folder for folder in TOGETHER if file.startswith(f"{folder}/")), file)
 
     def _reschedule(self, node: WorkerController) -> None:
         # A process that just started may not have collected its tests yet.

@@ -19,12 +19,13 @@ faulthandler_timeout = 60
 faulthandler_exit_on_timeout = true
 """
 CONFTEST = """
-from tests.support.scheduling import SECONDS, LongestFirst
+from tests.support import scheduling
 
-SECONDS["test_e.py"] = 60
+scheduling.SECONDS["test_e.py"] = 60
+scheduling.TOGETHER = ("folder",)
 
 def pytest_xdist_make_scheduler(config, log):
-    return LongestFirst(config, log)
+    return scheduling.LongestFirst(config, log)
 """
 QUICK = "def test_{}(): pass\n"
 BREAKS_DOWN = "def test_breaks_down(): import os; os._exit(3)\n"
@@ -46,7 +47,7 @@ def outcomes(folder: Path, **modules: str) -> list[tuple[str, str, str]]:
 
 
 def test_each_file_runs_in_one_process_and_the_longest_first(tmp_path: Path) -> None:
-    files = ("test_a", "test_b", "test_c", "folder/test_d", "test_e")
+    files = ("test_a", "test_b", "test_c", "folder/test_d", "test_e", "folder/test_f")
     reported = outcomes(tmp_path, **dict.fromkeys(files, "".join(QUICK.format(number) for number in range(3))))
     processes: dict[str, set[str]] = defaultdict(set)
     begun: dict[str, str] = {}
@@ -56,6 +57,7 @@ def test_each_file_runs_in_one_process_and_the_longest_first(tmp_path: Path) -> 
         begun.setdefault(process, file)
     assert processes.keys() == {f"{Path(name).name}.py" for name in files}
     assert all(len(found) == 1 for found in processes.values())
+    assert processes["test_d.py"] == processes["test_f.py"], "a folder whose files share servers"
     assert "test_e.py" in begun.values()
 
 

@@ -71,7 +71,7 @@ def hostile_model(folder: Path) -> Path:
     return path
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     folder, port = tmp_path_factory.mktemp("site"), free_port()
     endpoint, node = f"tcp/127.0.0.1:{free_port()}", f"http://127.0.0.1:{port}"
@@ -97,7 +97,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         yield Site(url, *models, node, bytes(key), variables, folder)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def paid_job(site: Site) -> str:
     """The address of a job that is paid, with all checks passed."""
     with Browser(site.url, site.wallet()) as browser:

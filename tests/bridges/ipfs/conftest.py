@@ -34,13 +34,13 @@ class Swarm:
             await client.call("swarm/connect", ("arg", self.a.swarm_address))
 
 
-@pytest.fixture(scope="session", params=KINDS)
+@pytest.fixture(scope="package", params=KINDS)
 def kind(request: pytest.FixtureRequest) -> type[JsIpfs | Kubo]:
     """The kind of daemon: js-ipfs, and a current Kubo if `AIRA_KUBO` names one."""
     return KINDS[request.param]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def swarms() -> Iterator[Callable[[type[JsIpfs | Kubo]], Swarm]]:
     """Starts two daemons of a kind, once: they outlive the tests of the other kind, and no test stops them."""
     with ExitStack() as stack:
@@ -52,6 +52,14 @@ def swarms() -> Iterator[Callable[[type[JsIpfs | Kubo]], Swarm]]:
             return Swarm(a, b)
 
         yield swarm_of
+
+
+@pytest.fixture
+def js_ipfs(swarms: Callable[[type[JsIpfs | Kubo]], Swarm]) -> JsIpfs:
+    """A js-ipfs daemon, which no test stops; tests use topics of their own."""
+    daemon = swarms(JsIpfs).a
+    assert isinstance(daemon, JsIpfs)
+    return daemon
 
 
 @pytest.fixture
@@ -67,7 +75,7 @@ async def swarm(shared_swarm: Swarm) -> Swarm:
     return shared_swarm
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def library() -> Iterator[LibraryNode]:
     """A Kubo library node without connections."""
     with LibraryNode() as node:

@@ -130,6 +130,7 @@ async def test_a_doubtful_validator_is_named_before_anything_is_signed(
     assert (posted.validator, posted.validator_fee) == (validator, 99 if who == "cheap" else 0)
 
 
+@pytest.mark.sample("lies")
 @pytest.mark.parametrize("lies", [False, True])
 async def test_a_whole_job_by_commands_under_a_real_validator(site: Site, lies: bool) -> None:
     """`aira provider`, `aira validator` and `aira demand` are processes."""

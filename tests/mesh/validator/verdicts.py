@@ -65,8 +65,11 @@ class HonestVerdict(NamedTuple):
     judgement: Judgement
 
 
-async def judge_honest(endpoint: str, folder: Path) -> list[HonestVerdict]:
-    """Do a hundred jobs under faults with sessions at a router's endpoint, and judge them by one juror."""
+async def judge_honest(endpoint: str, folder: Path, *, of_each: int = 100) -> list[HonestVerdict]:
+    """Do a hundred jobs under faults with sessions at a router's endpoint, and judge them by one juror.
+
+    `of_each` is the most jobs of a kind.
+    """
     at_a_time = asyncio.Semaphore(AT_A_TIME)
     with zenoh.open(client_config(endpoint)) as session:
         place = Place(endpoint, session, folder)
@@ -75,6 +78,6 @@ async def judge_honest(endpoint: str, folder: Path) -> list[HonestVerdict]:
             async with at_a_time:
                 return one, await one.work(place, f"{one.work.__name__}-{number}")
 
-        jobs = await asyncio.gather(*(work(one, number) for one in KINDS for number in range(one.jobs)))
+        jobs = await asyncio.gather(*(work(one, number) for one in KINDS for number in range(min(one.jobs, of_each))))
     judged: dict[str, str] = {}
     return [HonestVerdict(kind, job, job.judge(judged)) for kind, job in jobs]

@@ -18,7 +18,7 @@ from tests.support.waiting import until_found
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-KUBO_LIBRARY = Path(__file__).with_name("kubo_library.py")
+KUBO_LIBRARY = Path(__file__).parents[2] / "support" / "kubo_library.py"
 # Names that every IPFS node has given these bytes since 2015.
 DOCUMENTED = {
     b"": "QmbFMke1KXqnYyBBWxB74N4c5SBnJMVAiMNRcGu6x1AwQH",
