@@ -7,6 +7,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.support.ci import IN_CI
 from tests.support.nodes import Anvil
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 gc.disable()  # until all tests are collected: they stay, and looking through them takes a third of that time
 
 ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from bridges.ipfs import ChannelBridge, Daemon, RelayJournal, RelayValidator
 from bridges.ipfs.daemon import CALL_TIMEOUT
 from mesh.background import Background
 from mesh.network import Channel, Endpoints, Network, Pump
+from schemas.status import BridgeStatus, bridge_status_key
 from tests.support.orders import LIGHTHOUSE
 from tests.support.waiting import until_found
 
@@ -87,6 +89,17 @@ async def on_mesh(endpoint: str, topic: str) -> AsyncIterator[Mesh]:
 
         tasks.start(listen(), "hears the mesh")
         yield mesh
+
+
+async def status_of_the_bridge(session: zenoh.Session, topic: str) -> BridgeStatus:
+    """What the only bridge of a market replies for its status."""
+    nobody = "0x" + "0" * 40
+    key = bridge_status_key(nobody, topic).replace(nobody, "*")
+    replies = await asyncio.to_thread(lambda: list(session.get(key, timeout=30.0)))
+    (reply,) = [reply.ok for reply in replies if reply.ok is not None]
+    status = BridgeStatus.decode(reply.payload.to_bytes())
+    assert str(reply.key_expr) == bridge_status_key(status.bridge, topic)
+    return status
 
 
 async def until_seen(mesh: Mesh, *addresses: str) -> None:

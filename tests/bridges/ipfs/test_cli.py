@@ -10,7 +10,7 @@ from bridges.ipfs.validation import legacy_json
 from mesh.identity.roster import Member
 from mesh.network import Channel, Network
 from schemas import encode
-from tests.bridges.ipfs.bridges import on_mesh, until_seen
+from tests.bridges.ipfs.bridges import on_mesh, status_of_the_bridge, until_seen
 from tests.bridges.ipfs.statuses import health
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.orders import PERSON, demand, offer
@@ -123,6 +123,7 @@ async def test_a_killed_bridge_continues_and_sends_nothing_twice(
         await until_seen(mesh)
         mesh.channel.publish(one := demand())
         await until(lambda: bob.heard, seconds=60)
+        await until_found(lambda: has_journalled_it(mesh, topic), seconds=60)
         await asyncio.to_thread(bridge.kill)
         await until_found(lambda: nobody_hears(mesh, topic), seconds=60)
         await asyncio.to_thread(bridge.start)
@@ -134,6 +135,11 @@ async def test_a_killed_bridge_continues_and_sends_nothing_twice(
         assert bob.heard == [legacy_json(one), legacy_json(two)]
         await bob.publish(topic, legacy_json(three := offer()))
         await until(lambda: encode(three) in mesh.payloads, seconds=60)
+
+
+async def has_journalled_it(mesh: Mesh, topic: str) -> bool:
+    """Whether the bridge has the daemon's answer that it published a message: a crash before repeats that."""
+    return (await status_of_the_bridge(mesh.network.session, topic)).to_ipfs.carried == 1
 
 
 async def nobody_hears(mesh: Mesh, topic: str) -> bool:

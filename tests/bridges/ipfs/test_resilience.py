@@ -166,7 +166,7 @@ async def test_a_restarted_bridge_sends_what_waited_and_nothing_twice(
     async with bridging(router.endpoint, swarm.a.api, topic, journal) as bridge:
         await ready(bridge, mesh)
         mesh.channel.publish(known)
-        await until(lambda: bob.heard, seconds=SECONDS)
+        await until(lambda: bob.heard and bridge.status().to_ipfs.carried == 1, seconds=SECONDS)
     async with bridging(router.endpoint, own_daemon.api, topic, journal) as bridge:  # its daemon is not running
         await until_seen(mesh, bridge.address)
         mesh.channel.publish(waited)

@@ -21,8 +21,8 @@ from mesh.cli.status import describe_status
 from mesh.flood import Drops
 from mesh.network import Channel, Endpoints, Network
 from mesh.telemetry.metrics import merged
-from schemas.status import ALIVE, BridgeStatus, ContentMetrics, bridge_status_key
-from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
+from schemas.status import ALIVE, ContentMetrics
+from tests.bridges.ipfs.bridges import bridging, on_mesh, status_of_the_bridge, until_seen
 from tests.bridges.ipfs.replays import OldDaemon
 from tests.bridges.ipfs.statuses import direction, health, metrics, status
 from tests.support.commands import AIRA, Serving
@@ -195,18 +195,12 @@ async def test_a_bridge_announces_its_presence_and_answers_with_its_status(
         found = next(key for key in await channel.present() if key.role == "bridge")
         assert found.agent == bridge.address
 
-        async def ask() -> BridgeStatus:
-            key = bridge_status_key("0x" + "0" * 40, topic).replace("0x" + "0" * 40, "*")
-            replies = await asyncio.to_thread(lambda: list(network.session.get(key, timeout=10.0)))
-            (reply,) = [reply.ok for reply in replies if reply.ok is not None]
-            assert str(reply.key_expr) == bridge_status_key(found.agent, topic)
-            return BridgeStatus.decode(reply.payload.to_bytes())
-
         async def shows_both() -> bool:
-            return len((await ask()).mesh_peers) == 2
+            return len((await status_of_the_bridge(network.session, topic)).mesh_peers) == 2
 
         await until_found(shows_both, seconds=30)
-        status = await ask()
+        status = await status_of_the_bridge(network.session, topic)
+        assert status.bridge == found.agent
         assert (status.lighthouse, status.api, status.state, status.carries) == (topic, api, "no daemon", False)
         assert status.mesh_peers == (f"agent 0x{'12' * 20}", f"bridge {bridge.address}")
         assert status.to_ipfs.received == status.to_mesh.received == 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
+import time
 from typing import TYPE_CHECKING, Any
 
 from mesh.background import Background
@@ -98,11 +98,11 @@ async def test_a_limited_number_is_looked_at_in_one_round() -> None:
     waiting, _ = unfunded(book, purse, retry=OFTEN, interval=0.2)
     for _ in range(2 * CHECKS):
         waiting.add(verified_demand())
+    begun = time.monotonic()
     async with Background() as tasks:
         tasks.start(waiting.run(), "unfunded")
-        await until(lambda: purse.asked)
-        await asyncio.sleep(0.05)
-        assert len(purse.asked) <= CHECKS
+        await until(lambda: len(purse.asked) > CHECKS)
+        assert time.monotonic() - begun > 0.39, "it takes two rounds, each after an interval"
         await until(lambda: len(purse.asked) >= 2 * CHECKS)
 
 

@@ -117,7 +117,7 @@ async def claim(robot: Agent, contract: Contract, recording: str, *, success: bo
 
 async def asked(agent: Agent, selector: str) -> list[bytes]:
     """What others reply to a query."""
-    replies = await query_all(agent.network.session, [selector], timeout=2.0)
+    replies = await query_all(agent.network.session, [selector], timeout=30.0)
     return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
 
