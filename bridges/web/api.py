@@ -23,6 +23,7 @@ from bridges.web.errors import InvalidRequest, OperatorsOnly, PageNotFound
 from bridges.web.file_api import FileApi
 from bridges.web.orders import PER_SIGNER
 from bridges.web.reference import OPENAPI
+from bridges.web.validators import ValidatorApi
 from bridges.web.views import liability_json
 from mesh.agent.orders import default_lifetime
 from mesh.errors import ChainError
@@ -56,7 +57,7 @@ class LocalOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename
     objective: str
     cost: str
     validator: str = ""
-    validator_fee: str = "0"
+    validator_fee: str | None = None
     token: str = ""
     lifetime: int | None = None
 
@@ -125,6 +126,7 @@ class Api:
             post("/api/v1/local/withdrawals", self.local_withdrawal),
             post("/api/v1/local/refunds", self.local_refund),
             *FileApi(self._files).routes(),
+            *ValidatorApi(self._parts).routes(),
             get("/api/v1/liabilities", self.liabilities),
             get("/api/v1/liabilities/{address}", self.job),
             get("/api/v1/liabilities/{address}/verification", self.verification),
@@ -217,7 +219,7 @@ class Api:
             model=wanted.model,
             cost=amount(wanted.cost),
             validator=wanted.validator,
-            validator_fee=amount(wanted.validator_fee),
+            validator_fee=None if wanted.validator_fee is None else amount(wanted.validator_fee),
             token=wanted.token,
             lifetime=wanted.lifetime,
         )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from mesh.agent import Agent
 from mesh.agent.components import ChainHead, connected
+from mesh.agent.validators import ValidatorDirectory
 from mesh.composition import chain_of
 from mesh.content import Exchange, Store
 from mesh.flood import Drops
@@ -33,6 +34,7 @@ class WebComponents:
     store: Store
     exchange: Exchange
     drops: Drops
+    validators: ValidatorDirectory
     agent: Agent | None
     lighthouse: str
     """The lighthouse's address."""
@@ -76,6 +78,7 @@ async def opened(
             store=store,
             exchange=exchange,
             drops=drops,
+            validators=ValidatorDirectory(network.session, channel, opened_chain),
             agent=agent,
             lighthouse=await opened_chain.names.address(settings.lighthouse_contract),
             token=await opened_chain.names.address(settings.erc20_token),

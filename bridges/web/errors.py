@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from mesh.cli.errors import DoubtfulValidator
 from mesh.errors import AiraError, ConfigurationError, InputError
 
 
@@ -83,4 +84,4 @@ def status_of(error: AiraError) -> int:
         return error.status
     if error.code in ("not-a-liability", "content-unavailable", "unknown-name"):
         return 404
-    return 400 if isinstance(error, InputError) else 502
+    return 400 if isinstance(error, InputError | DoubtfulValidator) else 502

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from bridges.web.errors import NoLocalAccount, OrderUnusable, PageNotFound, TooManyRequests
+from bridges.web.validators import require_judged
 from mesh.agent import OrderState
 from mesh.background import Background
 from mesh.cli.errors import NotRefundable
@@ -82,11 +83,15 @@ class OrderPublisher(Lifecycle):
         self._market.changed(order, order.state(self._market.head))
         return order
 
-    async def order(self, *, objective: str, **terms: Any) -> SeenOrder:
-        """The local account orders; its agent publishes. Raises `NoLocalAccount`, and as `Agent.order`."""
+    async def order(self, *, objective: str, validator: str, validator_fee: int | None, **terms: Any) -> SeenOrder:
+        """The local account orders; its agent publishes.
+
+        Raises `NoLocalAccount`, `DoubtfulValidator`, and as `Agent.order`.
+        """
         if self._parts.agent is None:
             raise NoLocalAccount("this server has no account", hint="start it with --keyfile, or connect a wallet")
-        posted = await self._parts.agent.order(objective, **terms)
+        fee = await require_judged(self._parts, validator, validator_fee) if validator else 0
+        posted = await self._parts.agent.order(objective, validator=validator, validator_fee=fee, **terms)
         verified: Verified[Any] = verify_message(posted.message)
         return self._market.add(verified, posted=True)
 

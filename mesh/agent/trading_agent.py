@@ -241,7 +241,8 @@ class TradingAgent(Lifecycle):
         """What the validator of these terms wants, in wn. Raises `ValidatorSilent`."""
         if (validator := terms["validator"]) == ZERO_ADDRESS:
             return 0
-        await check_named(self.parts.chain, terms)
+        generation = self.settings.generation
+        await check_named(self.parts.chain, validator, lighthouse=terms["lighthouse"], generation=generation)
         announced = await self.runtime.validators.find(validator)
         if announced.is_silent:
             raise ValidatorSilent(validator)

@@ -6,7 +6,7 @@ import asyncio
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from mesh.agent.errors import Declined
 from mesh.amounts import XRT
@@ -18,7 +18,7 @@ from schemas.keys import ValidatorKey
 from schemas.verdicts import LONGEST_REPORT, PolicyNote, ValidatorAnnouncement
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
     import zenoh
 
@@ -160,14 +160,13 @@ async def accepted_of(chain: Chain, validator: str, signers: Iterable[str]) -> l
     return [signer for signer in some if await chain.validators.accepts(validator, signer)]
 
 
-async def check_named(chain: Chain, terms: Mapping[str, Any]) -> None:
-    """Raise what signing a demand with these terms would raise because of its validator: `UnsafeValidator`, …"""
+async def check_named(chain: Chain, validator: str, *, lighthouse: str, generation: int) -> None:
+    """Raise what signing a demand that names this validator would raise: `UnsafeValidator`, …"""
     from mesh.chain import UnsafeValidator  # an agent that watches does without the chain
 
-    if terms["validator"] == terms["lighthouse"]:
-        raise UnsafeValidator(terms["validator"])
-    nonce = "00" * 32 if terms["sender"] is None else 0
-    await chain.validators.check(Demand(**terms, nonce=nonce, validator_fee=0))
+    if validator == lighthouse:
+        raise UnsafeValidator(validator)
+    await chain.validators.check_named(validator, generation=generation)
 
 
 async def refund_delay(chain: Chain) -> int | None:

@@ -96,17 +96,21 @@ class Validators:
         Raises `UnsafeValidator`; `ValidatorWithoutCode` in generation 5, where it must be a contract; `NotOffered` for
         a jury that needs several signatures, on the original contracts; `ChainError`.
         """
-        if order.validator == ZERO_ADDRESS:
+        await self.check_named(order.validator, generation=order.generation)
+
+    async def check_named(self, validator: str, *, generation: int) -> None:
+        """Like `check`, for the validator (EIP-55 address) of an order that is still to be written."""
+        if validator == ZERO_ADDRESS:
             return
-        _check(order, await self._verdict(order.validator))
+        _check(validator, generation, await self._verdict(validator))
         version = self._contracts.version
-        if isinstance(version, OriginalContracts) and await self.quorum(order.validator) > 1:
+        if isinstance(version, OriginalContracts) and await self.quorum(validator) > 1:
             raise NotOffered("validator that needs several signatures", version.generation)
 
     def check_known(self, order: Order) -> None:
         """Like `check`, without asking the chain: a validator that is not known raises `UnsafeValidator`, too."""
         if order.validator != ZERO_ADDRESS:
-            _check(order, self._known(order.validator))
+            _check(order.validator, order.generation, self._known(order.validator))
 
     async def quorum(self, validator: str) -> int:
         """How many accounts must sign the same result: a jury's quorum, 1 for other contracts.
@@ -208,8 +212,8 @@ class Validators:
         return self._juries[contract]
 
 
-def _check(order: Order, verdict: _Verdict | None) -> None:
+def _check(validator: str, generation: int, verdict: _Verdict | None) -> None:
     if verdict is None or not verdict.is_safe:
-        raise UnsafeValidator(order.validator)
-    if order.generation == 5 and not verdict.has_code:
-        raise ValidatorWithoutCode(order.validator)
+        raise UnsafeValidator(validator)
+    if generation == 5 and not verdict.has_code:
+        raise ValidatorWithoutCode(validator)

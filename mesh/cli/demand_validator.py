@@ -1,4 +1,4 @@
-"""What `aira demand --validator` says before it signs: who judges, by which policies, and for what fee."""
+"""What `aira demand --validator` and the page say before they sign: who judges, by which policies, for what fee."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from mesh.errors import AiraError
 from schemas.address import ZERO_ADDRESS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from mesh import AnnouncedValidator
     from mesh.agent import Agent
+    from mesh.agent.validators import ValidatorDirectory
     from mesh.chain import Chain
 
 
 @dataclass(frozen=True, kw_only=True)
-class _JudgedTerms:
+class JudgedTerms:
     """What a validator announces, the fee that the demand offers, and when the cost can be returned without it."""
 
     announced: AnnouncedValidator
@@ -33,6 +34,32 @@ class _JudgedTerms:
     """Blocks from the contract's creation; None if the contracts offer no refund."""
     block_time: float | None
     """Seconds."""
+
+    @classmethod
+    async def of(
+        cls,
+        chain: Chain,
+        directory: ValidatorDirectory,
+        validator: str,
+        *,
+        lighthouse: str,
+        generation: int,
+        fee: int | None,
+    ) -> JudgedTerms:
+        """Those of a demand at `lighthouse` that names `validator` (addresses); without a `fee` (wn) what it announces.
+
+        Raises `UnsafeValidator` and its like, `ChainError`.
+        """
+        from mesh.agent.validators import check_named, refund_delay
+
+        await check_named(chain, validator, lighthouse=lighthouse, generation=generation)
+        announced = await directory.find(validator)
+        return cls(
+            announced=announced,
+            fee=announced.fee if fee is None else fee,
+            refund_delay=await refund_delay(chain),
+            block_time=await _block_time(chain),
+        )
 
     @property
     def doubts(self) -> dict[str, str]:
@@ -50,6 +77,11 @@ class _JudgedTerms:
             doubts["low-fee"] = f"{offered}, so it may refuse the work"
         return doubts
 
+    @property
+    def reasons(self) -> str:
+        """The doubts, for people."""
+        return "; ".join(self.doubts.values())
+
     def lines(self) -> Iterator[str]:
         """What it means, for people."""
         found = self.announced
@@ -65,9 +97,11 @@ class _JudgedTerms:
                 yield "  its jurors judge by different policies"
         low = " (what it wants is not known)" if found.is_silent else ""
         yield f"  fee {XRT.show(self.fee)}{low}, on top of the cost, also if the work does not count"
-        yield f"  if it is silent: {self._refund()}"
+        yield f"  if it is silent: {self.refund}"
 
-    def _refund(self) -> str:
+    @property
+    def refund(self) -> str:
+        """What can be returned, and when, if nobody judges."""
         if self.refund_delay is None:
             return "the contracts offer no refund, so the cost stays in the contract"
         about = f" (about {_rough(self.refund_delay * self.block_time)})" if self.block_time else ""
@@ -79,7 +113,6 @@ class _JudgedTerms:
         """The same for JSON; fees in wn."""
         found = self.announced
         return {
-            "kind": "validator",
             "validator": found.address,
             "title": found.title,
             "jurors": found.jurors,
@@ -111,35 +144,32 @@ async def agreed_fee(
     `fee` is what the maker offers, None for what is announced. Doubts whether somebody will judge must be `confirmed`,
     or are asked about in a terminal. Raises `UnsafeValidator` and its like, and `DoubtfulValidator`.
     """
-    from mesh.agent.validators import check_named, refund_delay
-
     if not validator:
         return 0
-    runtime, chain = agent.runtime, agent.parts.chain
+    runtime = agent.runtime
     terms = await runtime.trader.writer.terms(model=agent.model, objective=cid, token="", validator=validator, **fields)
     if terms["validator"] == ZERO_ADDRESS:
         return 0
-    await check_named(chain, terms)
-    announced = await runtime.validators.find(terms["validator"])
-    judged = _JudgedTerms(
-        announced=announced,
-        fee=announced.fee if fee is None else fee,
-        refund_delay=await refund_delay(chain),
-        block_time=await _block_time(chain),
+    judged = await JudgedTerms.of(
+        agent.parts.chain,
+        runtime.validators,
+        terms["validator"],
+        lighthouse=terms["lighthouse"],
+        generation=agent.settings.generation,
+        fee=fee,
     )
     if as_json:
-        print_json(judged.json())
+        print_json({"kind": "validator"} | judged.json())
     else:
         for line in judged.lines():
             print_line(line)
     if judged.doubts:
-        await _confirm(judged.doubts, confirmed=confirmed, quiet=as_json)
+        await _confirm(judged.reasons, confirmed=confirmed, quiet=as_json)
     return judged.fee
 
 
-async def _confirm(doubts: Mapping[str, str], *, confirmed: bool, quiet: bool) -> None:
+async def _confirm(reasons: str, *, confirmed: bool, quiet: bool) -> None:
     """Say the doubts, and ask in a terminal, unless they are confirmed. Raises `DoubtfulValidator`."""
-    reasons = "; ".join(doubts.values())
     can_ask = sys.stdin.isatty() and not quiet
     if confirmed or can_ask:
         click.echo(f"aira: {reasons}", err=True)

@@ -58,6 +58,14 @@ class Site:
         with Serving(*AIRA, *command, says="page  ", variables=variables):
             yield f"http://127.0.0.1:{port}"
 
+    @contextmanager
+    def validator(self, *options: str) -> Iterator[None]:
+        """A validator at work, with the provider's account, which has ether."""
+        keyfile = f"{self.folder}/development/provider.json"
+        variables = self.variables | {"AIRA_KEYFILE": keyfile, "AIRA_DATA_DIR": str(self.folder / "validator")}
+        with Serving(*AIRA, "validator", *options, says=" judges by ", variables=variables):
+            yield
+
 
 def hostile_model(folder: Path) -> Path:
     """A model whose texts are scripts."""

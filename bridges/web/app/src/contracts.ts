@@ -21,6 +21,7 @@ const ABI = parseAbi([
   "function isFinalized() view returns (bool)",
   "function isSuccess() view returns (bool)",
   "function isLiability(address account) view returns (bool)",
+  "function isValidator(address signer) view returns (bool)",
 ]);
 
 type Getter =
@@ -41,6 +42,12 @@ export type Reader = (to: Address, data: Hex) => Promise<Hex>;
 export async function read(reader: Reader, liability: Address, functionName: Getter): Promise<any> {
   const data = await reader(liability, encodeFunctionData({ abi: ABI, functionName }));
   return decodeFunctionResult({ abi: ABI, functionName, data });
+}
+
+/** Whether a validator's contract accepts what an account signs. */
+export async function acceptsSigner(reader: Reader, validator: Address, signer: Address): Promise<boolean> {
+  const data = await reader(validator, encodeFunctionData({ abi: ABI, functionName: "isValidator", args: [signer] }));
+  return decodeFunctionResult({ abi: ABI, functionName: "isValidator", data });
 }
 
 /** The text of a CID in a contract; empty if there is none. */

@@ -64,6 +64,11 @@ export function withdrawalHash({ order, lighthouse, deadline }: Withdrawal): Hex
   return keccak256(encodeAbiParameters(types, [WITHDRAWAL, order, lighthouse, deadline]));
 }
 
+/** The hash that a juror signs of its announcement's text. */
+export function announcementHash(text: string): Hex {
+  return keccak256(toBytes(`aira validator\0${text}`));
+}
+
 /** Who signed a hash as a personal message. Throws for a signature in any form but the one that the market takes. */
 export async function signerOf(hash: Hex, signature: string): Promise<Address> {
   const digits = signature.replace(/^0x/, "");

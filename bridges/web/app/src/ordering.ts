@@ -57,11 +57,11 @@ export async function signAndPost(demand: Demand, shown: Hex, account: Account):
 /** Lets the server's local account order. Returns the order's hash. */
 export async function orderLocally(draft: Draft, account: Address, market: Market): Promise<string> {
   const { model, objective, lifetime } = draft;
-  const validator = draft.validator === zeroAddress ? "" : draft.validator;
   const [cost, validatorFee] = [String(draft.cost), String(draft.validatorFee)];
-  const fields = { model, objective, cost, validator, validatorFee, token: "", lifetime };
+  const named = draft.validator === zeroAddress ? "" : draft.validator;
+  const fields = { model, objective, cost, validator: named, validatorFee, token: "", lifetime };
   const { order } = await post<PostedOrder>("local/orders", fields);
-  checkAsked(order, { model, objective, cost, account, market });
+  checkAsked(order, { model, objective, cost, validator: draft.validator, validatorFee, account, market });
   await checkOrder(order);
   rememberOrder({ hash: order.hash, deadline: order.deadline, wire: "" });
   return order.hash;

@@ -4,12 +4,12 @@ import type { Address, Hex } from "viem";
 import { getBytes, post } from "./api";
 import type { Account } from "./app";
 import { cidOf } from "./cid";
-import { cidText, read } from "./contracts";
+import { acceptsSigner, cidText, read } from "./contracts";
 import type { Reader } from "./contracts";
-import { orderHash, resultHash, signerOf } from "./messages";
+import { announcementHash, orderHash, resultHash, signerOf } from "./messages";
 import type { Demand, Offer } from "./messages";
 import { texts } from "./texts";
-import type { Answer, Finding, Job, Market, Order } from "./types";
+import type { Answer, Finding, Job, Market, Order, Validator } from "./types";
 import { ask } from "./wallet";
 
 const LARGEST = 64 * 1024 * 1024;
@@ -45,11 +45,14 @@ export async function checkOrder(order: Order): Promise<void> {
 }
 
 /** Throws `ServerLies` if an order that the local account made is not the one that was asked for. */
-export function checkAsked(order: Order, asked: { model: string; objective: string; cost: string; account: Address; market: Market }): void {
-  const { model, objective, cost, account, market } = asked;
+export function checkAsked(
+  order: Order,
+  asked: { model: string; objective: string; cost: string; validator: Address; validatorFee: string; account: Address; market: Market },
+): void {
+  const { model, objective, cost, validator, validatorFee, account, market } = asked;
   const same =
     order.kind === "demand" && order.model === model && order.objective === objective && order.cost === cost &&
-    order.signer === account && order.token === market.token.address && order.lighthouse === market.lighthouse.address;
+    order.validator === validator && order.validatorFee === validatorFee && order.signer === account && order.token === market.token.address && order.lighthouse === market.lighthouse.address;
   if (!same) throw new ServerLies(texts.lieAsked);
 }
 
@@ -103,6 +106,46 @@ async function throughServer(to: Address, data: Hex): Promise<Hex> {
   });
   if (answer.result === undefined) throw new Error(answer.error?.message ?? texts.unreachable);
   return answer.result;
+}
+
+/**
+ * Throws `ServerLies` unless jurors whom the validator accepts have signed what the server says of it. Returns whether
+ * the wallet's node was asked for that.
+ */
+export async function checkValidator(said: Validator, account: Account | null, market: Market): Promise<boolean> {
+  const { reader, independent } = readerFor(account, market);
+  const records = await Promise.all(said.announcements.map((one) => signedAnnouncement(one, said.validator, reader)));
+  const fees = records.map((one) => Number(one.fee)).sort((one, other) => one - other);
+  const signed = {
+    title: records[0]?.title ?? "",
+    online: records.map((one) => one.juror),
+    policies: records.flatMap((one) => one.policies).map(policyText),
+    fee: fees.length ? fees[Math.min(said.quorum, fees.length) - 1] : null,
+  };
+  const same =
+    said.title === signed.title && said.online.join() === signed.online.join() &&
+    said.policies.map(policyText).join() === [...new Set(signed.policies)].join() &&
+    (said.announcedFee === null ? null : Number(said.announcedFee)) === signed.fee;
+  if (!same) throw new ServerLies(texts.lieValidator);
+  return independent;
+}
+
+interface Announcement {
+  validator: Address;
+  juror: Address;
+  title: string;
+  policies: { name: string; description: string }[];
+  fee: number | string;
+}
+
+const policyText = (policy: { name: string; description: string }) => JSON.stringify([policy.name, policy.description]);
+
+async function signedAnnouncement(one: Validator["announcements"][number], validator: Address, reader: Reader): Promise<Announcement> {
+  const record: Announcement = JSON.parse(one.text);
+  const signer = await signerOf(announcementHash(one.text), one.signature).catch(() => null);
+  const isJurors = signer !== null && signer === record.juror && record.validator === validator;
+  if (!isJurors || !(signer === validator || (await acceptsSigner(reader, validator, signer)))) throw new ServerLies(texts.lieValidator);
+  return record;
 }
 
 type Check = (job: Job, reader: Reader, independent: boolean) => Promise<Finding>;

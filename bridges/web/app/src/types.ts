@@ -118,6 +118,7 @@ export interface AgentStatus {
     fees: string;
     minted: string;
   };
+  validation?: { validators: Address[]; policies: string[]; fee: string; cases: Record<string, number> };
   dropped?: Record<string, number>;
 }
 
@@ -303,6 +304,24 @@ export interface Lighthouse {
   block: number;
   providers: { address: Address; stake: string; quota: number; hasTurn: boolean; status: AgentStatus | null }[];
   gasPrice: string;
+}
+
+/** How a validator judges, as its jurors announce it. */
+export interface Validator {
+  validator: Address;
+  title: string;
+  jurors: number;
+  quorum: number;
+  online: Address[];
+  policies: { name: string; description: string }[];
+  unanimous: boolean;
+  announcedFee: string | null;
+  fee: string;
+  refundDelay: number | null;
+  blockTime: number | null;
+  doubts: Record<string, string>;
+  refund: string;
+  announcements: { juror: Address; text: string; signature: string }[];
 }
 
 export interface StreamEvent {

@@ -1,6 +1,6 @@
 import { useMemo, useState } from "preact/hooks";
-import { isAddress, zeroAddress } from "viem";
-import type { Address, Hex } from "viem";
+import { zeroAddress } from "viem";
+import type { Hex } from "viem";
 import { useApp, useData, wordsOf } from "../app";
 import { isCid } from "../cid";
 import { amount, duration, ether, parseAmount, plain } from "../format";
@@ -13,6 +13,8 @@ import { allowedContract, rememberContract } from "../trust";
 import type { AccountState, Agent, Market, Model, Objective } from "../types";
 import { Action, Badge, Dialog, Facts, Field, Name, Problem, Show, Strange } from "../ui";
 import { ObjectiveChoice } from "./objective";
+import { NOBODY, ValidatorChoice } from "./validator";
+import type { Judge } from "./validator";
 
 const LIFETIMES = [5, 10, 60, 720];
 
@@ -120,18 +122,15 @@ function PriceAndSign(props: { model: string; objective: Objective; price?: stri
   const { market, account } = useApp();
   const [price, setPrice] = useState(typicalPrice(props.price, market.token.symbol) || "1");
   const [minutes, setMinutes] = useState(10);
-  const [validator, setValidator] = useState("");
-  const [fee, setFee] = useState("0");
+  const [judge, setJudge] = useState<Judge | null>(NOBODY);
   const cost = parseAmount(price, market.token.decimals);
-  const validatorFee = parseAmount(fee, market.xrt.decimals);
-  const wrongValidator = validator !== "" && !isAddress(validator);
   const draft = useMemo<Draft | null>(() => {
-    if (cost === null || validatorFee === null || wrongValidator) return null;
+    if (cost === null || judge === null) return null;
     return {
-      model: props.model, objective: props.objective.cid, cost, validatorFee,
-      validator: (validator as Address) || zeroAddress, lifetime: minutes === 10 ? market.defaultLifetime : blocksOf(minutes, market),
+      model: props.model, objective: props.objective.cid, cost, validatorFee: judge.fee,
+      validator: judge.address, lifetime: minutes === 10 ? market.defaultLifetime : blocksOf(minutes, market),
     };
-  }, [price, minutes, validator, fee, props.model, props.objective.cid]);
+  }, [price, minutes, judge, props.model, props.objective.cid]);
   return (
     <>
       <div class="fields">
@@ -146,17 +145,7 @@ function PriceAndSign(props: { model: string; objective: Objective; price?: stri
           )}
         </Field>
       </div>
-      <details class="more">
-        <summary>{texts.withValidator}</summary>
-        <div class="fields">
-          <Field label={texts.validator} error={wrongValidator ? texts.notAnAddress : ""} hint={texts.validatorHint}>
-            {(id, described) => <input id={id} aria-describedby={described} class="wide" spellcheck={false} value={validator} onInput={(event) => setValidator(event.currentTarget.value.trim())} />}
-          </Field>
-          <Field label={texts.validatorFee} error={validatorFee === null ? texts.notAnAmount : ""}>
-            {(id, described) => <input id={id} aria-describedby={described} inputMode="decimal" value={fee} onInput={(event) => setFee(event.currentTarget.value)} />}
-          </Field>
-        </div>
-      </details>
+      <ValidatorChoice choose={setJudge} />
       {account ? <OrderButton draft={draft} /> : <p class="callout">{texts.connectFirst}</p>}
     </>
   );
