@@ -16,9 +16,10 @@ import pytest
 
 from mesh.chain import NewLiability
 from mesh.chain.reader import list_created
+from schemas import ZERO_ADDRESS
 from tests.crashes.points import GO, REACHED
 from tests.crashes.process import CONTROL, COST, OBJECTIVE, POINT, VALIDATOR, WORDS
-from tests.mesh.operations.site import Site
+from tests.mesh.operations.site import GENERATION_5, Site
 from tests.support.commands import Serving, invoke
 from tests.support.content import ROOT
 from tests.support.nodes import Anvil
@@ -52,9 +53,13 @@ STEP_NS: Final = 10**8
 
 
 class CrashMarket:
-    """`with CrashMarket() as market: market.play(cell)`. Roles that no cell touched go on running for the next."""
+    """`with CrashMarket() as market: market.play(cell)`. Roles that no cell touched go on running for the next.
 
-    def __init__(self) -> None:
+    In generation 5, a jury whose juror is the validator judges all jobs.
+    """
+
+    def __init__(self, generation: int = 3) -> None:
+        self._options = dict(GENERATION_5) if generation == 5 else {}
         self.folder = Path(tempfile.mkdtemp(prefix="aira-crashes-"))
         self._stack = ExitStack()
         self._running: dict[str, Serving] = {}
@@ -73,6 +78,10 @@ class CrashMarket:
         chain = AsyncExitStack()
         self._chain = self._runner.run(chain.enter_async_context(self.site.chain("provider")))
         self._stack.callback(lambda: self._runner.run(chain.aclose()))
+        self._judge = self.site.address("validator")
+        if self._options:
+            self._judge = self._runner.run(self._chain.validators.deploy([self._judge], 1)).address
+            self._options["validator_contract"] = self._judge
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -114,10 +123,10 @@ class CrashMarket:
 
     def _validator(self, cell: Cell) -> dict[str, str]:
         """The validator of a cell's job, as a variable of the person."""
-        return {VALIDATOR: self.site.address("validator")} if "validator" in _roles_of(cell) else {}
+        return {VALIDATOR: self._judge} if "validator" in _roles_of(cell) else {}
 
     def _start(self, role: str, work: Path, disk: Path | None, **armed: str) -> None:
-        options = {"log_format": "json", "playback": "recorded"}
+        options = {"log_format": "json", "playback": "recorded", **self._options}
         options["data_dir"] = str(disk or self.folder / f"state-{role}")
         variables = self.site.variables(role, **options) | {OBJECTIVE: str(work), "PYTHONPATH": str(ROOT)} | armed
         command = (sys.executable, "-m", "tests.crashes.process", role)
@@ -186,10 +195,11 @@ class CrashMarket:
     def _check(self, cell: Cell, work: Path, liability: Liability, before: dict[str, int]) -> None:
         """Paid once or refunded, and `aira verify` holds. Only a full disk may end a job without success."""
         assert liability.is_success or cell.fault == "disk", "the job failed"
+        assert liability.validator == self._validator(cell).get(VALIDATOR, ZERO_ADDRESS)
         paid = COST if liability.is_success else 0
         expected = {"person": before["person"] - paid, "robot": before["robot"] + paid}
         wait_until(lambda: self._runner.run(self._balances()) == expected, what=f"one payment of {paid}")
-        variables = self.site.variables("person", data_dir=str(self.folder / "verify"))
+        variables = self.site.variables("person", data_dir=str(self.folder / "verify"), **self._options)
         if liability.is_success:
             self._revive(work, cell)  # the robot has the files, and may have ended since
             verified = invoke("verify", liability.address, **variables)
@@ -242,8 +252,8 @@ class CrashMarket:
 
 
 def _roles_of(cell: Cell) -> list[str]:
-    """The processes that a cell needs, in the order in which they start. Only its own cells have a validator."""
-    return [role for role in READY if role != "validator" or cell.victim == role]
+    """The processes that a cell needs, in the order in which they start."""
+    return [role for role in READY if role != "validator" or role == cell.victim or cell.generation == 5]
 
 
 def _fill(filler: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 from tests.crashes.points import Point
 
 BOOK, SETTLEMENT = "mesh.market.book:OrderBook", "mesh.market.settlement:Settlement"
-RESULTS = "mesh.market.judgements:ResultSettlement"
+RESULTS, JUDGEMENTS = "mesh.market.judgements:ResultSettlement", "mesh.market.judgements:Judgements"
 QUEUE, SENDER = "mesh.market.transaction_queue:TransactionQueue", "mesh.chain.transactions:TransactionSender"
 STORE, CONFIRMATION = "mesh.chain.transaction_store:TransactionStore", "mesh.chain.confirmation:Confirmation"
 TRADER, OUTBOX = "mesh.agent.trade:Trader", "mesh.work.outbox:Outbox"
@@ -90,6 +90,25 @@ POINTS: Final = {
 }
 """The points of each role, in the order of a job."""
 
+SETTLING: Final = (f"{CASES}._settle", f"{SENDER}._send_numbered", f"{CONFIRMATION}.wait")
+"""What a validator does in generation 3 only."""
+
+JURY_POINTS: Final = {
+    "provider": (
+        Point("before", f"{JUDGEMENTS}.add"),
+        Point("after", f"{JUDGEMENTS}.add"),
+        Point("before", f"{JUDGEMENTS}._hold"),
+        Point("after", f"{JUDGEMENTS}._hold"),
+        *POINTS["provider"][-4:],  # from the finalization on
+    ),
+    "validator": (
+        *(point for point in POINTS["validator"] if not point.method.endswith(SETTLING)),
+        Point("before", f"{CASES}._send"),
+        Point("after", f"{CASES}._send"),
+    ),
+}
+"""The points of a job that a jury judges, and a provider finalizes by what it has signed."""
+
 SHARED: Final = (
     *(("provider", point) for point in POINTS["provider"][::3]),
     *(("robot", point) for point in POINTS["robot"][1::3]),
@@ -108,22 +127,31 @@ FAULTS: Final = {
 
 
 class Cell(NamedTuple):
-    """`victim` fails by `fault` when the process `at` reaches `point`."""
+    """`victim` fails by `fault` when the process `at` reaches `point`. In generation 5 a jury judges the job."""
 
     victim: str
     fault: str
     at: str
     point: Point
+    generation: int = 3
 
     @property
     def name(self) -> str:
-        return f"{self.victim}-{self.fault}-{'' if self.at == self.victim else f'{self.at}-'}{self.point.name}"
+        jury = "jury-" if self.generation == 5 else ""
+        return f"{jury}{self.victim}-{self.fault}-{'' if self.at == self.victim else f'{self.at}-'}{self.point.name}"
 
 
-CELLS: Final = tuple(
-    Cell(victim, fault, at, point)
-    for victim, faults in FAULTS.items()
-    for (at, point), fault in product(
-        [(victim, point) for point in POINTS[victim]] if victim in POINTS else SHARED, faults
-    )
+CELLS: Final = (
+    *(
+        Cell(victim, fault, at, point)
+        for victim, faults in FAULTS.items()
+        for (at, point), fault in product(
+            [(victim, point) for point in POINTS[victim]] if victim in POINTS else SHARED, faults
+        )
+    ),
+    *(
+        Cell(victim, fault, victim, point, generation=5)
+        for victim, points in JURY_POINTS.items()
+        for point, fault in product(points, FAULTS[victim])
+    ),
 )

@@ -36,7 +36,7 @@ def provider() -> None:
 
 
 def validator() -> None:
-    """`aira validator`, for its own account."""
+    """`aira validator`, for its own account and the jury that the settings name."""
     from mesh.cli import main
 
     main(["validator"])

@@ -7,15 +7,17 @@ separated by commas.
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
+from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
 from tests.crashes.market import CrashMarket
-from tests.crashes.matrix import CELLS, FAULTS, POINTS, SHARED, Cell
+from tests.crashes.matrix import CELLS, FAULTS, JURY_POINTS, POINTS, SHARED, Cell
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 SAMPLE: Final = (
     "provider-kill-",
@@ -25,6 +27,7 @@ SAMPLE: Final = (
     "validator-kill-",
     "person-kill-",
     "node-reorganise-",
+    "jury-provider-kill-",
 )
 """The beginnings of the cells of CI, of each the one in the middle."""
 
@@ -41,21 +44,22 @@ def chosen() -> tuple[Cell, ...]:
 
 
 @pytest.fixture(scope="module")
-def market() -> Iterator[CrashMarket]:
-    with CrashMarket() as market:
-        yield market
+def markets() -> Iterator[Callable[[int], CrashMarket]]:
+    """The market of a generation."""
+    with ExitStack() as stack:
+        yield cache(lambda generation: stack.enter_context(CrashMarket(generation)))
 
 
 if CHOSEN := chosen():
 
     @pytest.mark.parametrize("cell", CHOSEN, ids=lambda cell: cell.name)
-    def test_a_job_survives_the_fault(market: CrashMarket, cell: Cell) -> None:
-        market.play(cell)
+    def test_a_job_survives_the_fault(markets: Callable[[int], CrashMarket], cell: Cell) -> None:
+        markets(cell.generation).play(cell)
 
 
 def test_each_point_is_a_method() -> None:
     """Whoever renames one of them changes the table."""
-    for points in POINTS.values():
+    for points in (*POINTS.values(), *JURY_POINTS.values()):
         for point in points:
             point.find()
 

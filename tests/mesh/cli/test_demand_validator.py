@@ -13,7 +13,7 @@ from mesh.chain import UnsafeValidator
 from mesh.cli.demand import demand
 from mesh.cli.errors import DoubtfulValidator, JobNotDone
 from schemas import Demand, Result, Verified
-from tests.mesh.operations.site import MODEL, Site, settings_of
+from tests.mesh.operations.site import GENERATION_5, MODEL, Site, settings_of
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.jurors import COMPLETE, MISSING, Juror
 
@@ -159,8 +159,7 @@ async def test_a_whole_job_by_commands_under_a_real_validator(site: Site, lies: 
 
 async def test_a_whole_job_by_commands_under_a_jury_of_generation_5(site: Site) -> None:
     """`aira validator deploy`, two jurors that must judge alike, and a demand that names their contract."""
-    names = dict.fromkeys(("xrt_contract", "erc20_token"), "xrt.3.robonomics.eth")
-    common = {"generation": "5", "factory_contract": "factory.3.robonomics.eth", "log_format": "json", **names}
+    common = GENERATION_5 | {"log_format": "json"}
     jurors = [site.address(role) for role in ("rival", "poor")]
     named = [word for juror in jurors for word in ("--juror", juror)]
     person = site.variables("person", **common)

@@ -12,7 +12,7 @@ import pytest
 
 from mesh.chain import DeploymentPlan
 from mesh.cli.errors import NotRefundable
-from tests.mesh.operations.site import MODEL, Site, has_event
+from tests.mesh.operations.site import GENERATION_5, MODEL, Site, has_event
 from tests.support.commands import AIRA, SECONDS, Serving, aira, refused
 from tests.support.waiting import until, until_found
 
@@ -29,9 +29,6 @@ COST: Final = 7
 FEE: Final = 100
 REFUND_DELAY: Final = 60
 """Blocks."""
-GENERATION: Final = {"generation": "5", "factory_contract": "factory.3.robonomics.eth"} | dict.fromkeys(
-    ("xrt_contract", "erc20_token"), "xrt.3.robonomics.eth"
-)
 PATIENT: Final = """
 import time
 from pathlib import Path
@@ -53,7 +50,7 @@ class Judged:
     def __init__(self, site: Site, jury: str) -> None:
         self.site = site
         self.jury = jury
-        self.robot = site.agent("robot", **GENERATION | {"generation": 5})
+        self.robot = site.agent("robot", **GENERATION_5 | {"generation": 5})
         self.may_work = asyncio.Event()
         self.robot.on_demand(self.robot.offer)
         self.robot.on("/say")(self._work)
@@ -63,22 +60,22 @@ class Judged:
         plan = DeploymentPlan(timeout_blocks=100, refund_delay=REFUND_DELAY)
         site = await Site.found(anvil.url, anvil.private_keys, endpoint, folder, plan=plan)
         words = ("validator", "deploy", "--juror", site.address("validator"), "--json")
-        done = await asyncio.to_thread(aira, *words, **site.variables("person", **GENERATION))
+        done = await asyncio.to_thread(aira, *words, **site.variables("person", **GENERATION_5))
         return cls(site, json.loads(done.stdout)["validator"])
 
     async def aira(self, *words: str, by: str = "person") -> Any:
-        return await asyncio.to_thread(aira, *words, **self.site.variables(by, **GENERATION))
+        return await asyncio.to_thread(aira, *words, **self.site.variables(by, **GENERATION_5))
 
     def validator(self, *command: str | Path) -> Serving:
         """`aira validator`, or a program."""
         own = {"validator_contract": self.jury, "validator_fee": f"{FEE}wn", "log_format": "json"}
-        variables = self.site.variables("validator", **GENERATION | own)
+        variables = self.site.variables("validator", **GENERATION_5 | own)
         return Serving(*(command or (*AIRA, "validator")), says='"validator-started"', variables=variables)
 
     def demand(self) -> Serving:
         """`aira demand`, which is ready once the contract is made."""
         terms = ("--model", MODEL, "--objective", self.site.job("word"), "--cost", f"{COST}wn")
-        variables = self.site.variables("person", **GENERATION)
+        variables = self.site.variables("person", **GENERATION_5)
         return Serving(*AIRA, "demand", *terms, "--validator", self.jury, says="\ncontract 0x", variables=variables)
 
     async def balances(self) -> dict[str, int]:

@@ -29,6 +29,13 @@ PEOPLE: Final = (*ROLES, "rival", "poor", "validator")
 FEE: Final = 5
 """The lighthouse fee of the robot's offers, wn."""
 PASSWORD: Final = "only for tests"
+GENERATION_5: Final = {
+    "generation": "5",
+    "factory_contract": "factory.3.robonomics.eth",
+    "xrt_contract": "xrt.3.robonomics.eth",
+    "erc20_token": "xrt.3.robonomics.eth",
+}
+"""Settings of a process that trades in generation 5, with the contracts for which the allowances are approved."""
 QUICK_RESEND: Final = RetryPolicy(initial=0.3, ceiling=1.0)
 
 
