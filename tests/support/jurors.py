@@ -47,9 +47,10 @@ class Juror:
         lighthouse = self.lighthouse.lower()
         key = str(ValidatorKey(lighthouse, self.validator))
         presence = str(PresenceKey(lighthouse, "validator", self.signer.address))
-        self._present: Any = self._session.liveliness().declare_token(presence)
         self._announcing: Any = self._session.declare_queryable(key, self._announce)
         self._reporting: Any = self._session.declare_queryable(f"aira/{lighthouse}/report/*", self._answer)
+        # Last: who sees it present gets its answers.
+        self._present: Any = self._session.liveliness().declare_token(presence)
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:

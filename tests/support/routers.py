@@ -13,6 +13,7 @@ from mesh.network.endpoints import SEND_WAIT, Endpoints
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
 from tests.support.processes import Server
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -91,6 +92,14 @@ def client_config(endpoint: str) -> zenoh.Config:
     # The product's clients try again after a shorter time, `zenoh.open` does not.
     config.insert_json5("transport/unicast/open_timeout", str(OPEN_MILLISECONDS))
     return config
+
+
+def wait_until_declared(endpoint: str, key: str, *, answers: bool = False) -> None:
+    """Return when another client of the router finds a subscriber on a key, or with `answers` a queryable."""
+    with zenoh.open(client_config(endpoint)) as other:
+        asking: Any = other.declare_querier(key) if answers else other.declare_publisher(key)
+        wait_until(lambda: asking.matching_status.matching, what=f"a declaration on {key}")
+        asking.undeclare()
 
 
 def _router_config(endpoint: str, more: Mapping[str, Any]) -> dict[str, Any]:

@@ -110,8 +110,8 @@ async def test_a_reply_to_another_request_is_not_taken(
     type_hash = ros.type_hash(ADD_FULL)
     shown = RosEntity("server", domain, "ab", 1, 2, "server", name="/add", type=ADD_FULL, type_hash=type_hash)
     with (
-        there.liveliness().declare_token(RmwZenoh(domain).token(shown)),
         there.declare_queryable(key, answer, complete=True),
+        there.liveliness().declare_token(RmwZenoh(domain).token(shown)),
     ):
         async with Robot(here, ros, domain=domain, drops=drops) as ours:
             for _ in range(4):

@@ -15,7 +15,7 @@ from schemas import RpcKey
 from schemas.logs import LogEvent, LogsRead
 from tests.support.commands import AIRA, SECONDS, environment
 from tests.support.orders import ROBOT
-from tests.support.routers import client_config
+from tests.support.routers import client_config, wait_until_declared
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -72,6 +72,7 @@ def pretender(endpoint: str, *events: LogEvent, missed: int = 0) -> Iterator[Non
     reply = LogsRead(instance="\x1b[2J", began="\x1b[2J", entries=events, last=1, missed=missed).encode()
     with zenoh.open(client_config(endpoint)) as session:
         queryable: Any = session.declare_queryable(key, lambda query: answer(query, key, reply))
+        wait_until_declared(endpoint, key, answers=True)
         yield
         queryable.undeclare()
 

@@ -18,7 +18,7 @@ from schemas.logs import LogsRead
 from tests.mesh.cli.following import Follower, answer, event, pretender
 from tests.support.commands import AIRA, SECONDS, environment, invoke, refused
 from tests.support.orders import PERSON, ROBOT, STRANGER
-from tests.support.routers import EmbeddedRouter, client_config
+from tests.support.routers import EmbeddedRouter, client_config, wait_until_declared
 from tests.support.sites import Site
 from tests.support.waiting import wait_until
 
@@ -69,6 +69,7 @@ def test_an_unreadable_answer_is_one_clear_line(router: EmbeddedRouter) -> None:
     key = str(RpcKey(ROBOT.address, "logs"))
     with zenoh.open(client_config(router.endpoint)) as session:
         queryable: Any = session.declare_queryable(key, lambda query: answer(query, key, b"\x1b[2J"))
+        wait_until_declared(router.endpoint, key, answers=True)
         done = invoke("logs", ROBOT.address, AIRA_CONNECT=router.endpoint)
         queryable.undeclare()
     refused(done, ServiceFailed)

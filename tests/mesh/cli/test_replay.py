@@ -24,7 +24,7 @@ from tests.support.commands import AIRA, Serving, refused
 from tests.support.listening import Listener
 from tests.support.objectives import objective, timed
 from tests.support.ports import free_endpoint
-from tests.support.routers import client_config
+from tests.support.routers import client_config, wait_until_declared
 from tests.support.waiting import at_most
 
 if TYPE_CHECKING:
@@ -42,7 +42,9 @@ SECOND = 10**9
 @pytest.fixture
 def listener(router: EmbeddedRouter) -> Iterator[Listener]:
     with zenoh.open(client_config(router.endpoint)) as session:
-        yield Listener(session)
+        listener = Listener(session)
+        wait_until_declared(router.endpoint, "any/key")
+        yield listener
 
 
 class Stage:

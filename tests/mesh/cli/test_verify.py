@@ -30,7 +30,7 @@ from tests.support.listening import Listener
 from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
-from tests.support.routers import client_config
+from tests.support.routers import client_config, wait_until_declared
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -191,6 +191,7 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
             assert [finding["holds"] for finding in said["findings"]] == [True] * 17
             with zenoh.open(client_config(endpoint)) as session:
                 listener = Listener(session)
+                await asyncio.to_thread(wait_until_declared, endpoint, "any/key")
                 await replay(nobody, ReplayOptions(source=liability))
                 robots = f"aira/agent/{load_account(robot).address.lower()}/liability/{liability.lower()}"
                 keys = sorted(await asyncio.to_thread(listener.keys, 4))
