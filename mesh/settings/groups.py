@@ -193,6 +193,9 @@ class ValidatorSettings:
     )
     validator_fee: str = option("0", "least fee, in XRT (0.1) or wn (100wn); a job that pays less never counts")
     validator_title: str = option("", "the validator's title in its announcement, for people")
+    validator_check_timeout: Interval = option(
+        60.0, "seconds that an own check may take for a recording; a result whose check takes longer is not judged"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

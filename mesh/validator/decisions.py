@@ -102,11 +102,19 @@ class CaseJudge:
         return f"not judged: the liability pays {XRT.show(pays)}, and this validator asks for {XRT.show(asks)}"
 
     async def decide(self, stored: StoredVerdict) -> Decision | None:
-        """Decide a case whose Result has arrived; None if its files or the judgement never came."""
+        """Decide a case whose Result has arrived.
+
+        None if its files or the judgement never came, or if an own check took too long.
+        """
         claim = decode(stored.result)
         assert isinstance(claim, Result)
         judgement = await self._judgement(stored, claim)
         if judgement is None:
+            return None
+        if not judgement.is_decided:
+            policies = ", ".join(judgement.overdue)
+            facts = log_event("case-not-judged", policies=policies)
+            log.error("not judged until a restart: the check of %s took too long", policies, extra=facts)
             return None
         report = self._report(stored, claim, judgement)
         return Decision(report, judgement.marks if report.success else ())

@@ -17,7 +17,7 @@ from mesh.evidence import Claim, Finding, verify
 from mesh.recording import Limits
 from mesh.validator.evidence import Evidence
 from mesh.validator.policies import COMPLETE
-from mesh.validator.policy import OwnPolicy
+from mesh.validator.policy import CHECK_TIMEOUT, OwnPolicy
 from schemas import Result, cid_of_file
 from schemas.signing import is_word
 from schemas.signing import verify as verify_signature
@@ -36,8 +36,9 @@ if TYPE_CHECKING:
 _LIMITS: Final = Limits()
 _NOT_JUDGED: Final = frozenset({"finalized"})
 """Findings of `verify` that are not about the result: a validator judges before the contract has ended."""
-_MAY_STAY_OPEN: Final = frozenset({"closed"})
-"""Findings that may stay undecided: that an agent crashed, and may have lost a second of the recording, is no fault."""
+_MAY_STAY_OPEN: Final = frozenset({"closed", CHECK_TIMEOUT})
+"""Findings that may stay undecided: that an agent crashed, and may have lost a second of the recording, is no fault of
+the robot, and neither is a check that takes too long."""
 _FINDINGS_SIZE: Final = LONGEST_REPORT - 4096
 """Bytes of a report that are left for its findings."""
 _INTERVAL: Final = struct.Struct("<q")
@@ -72,6 +73,8 @@ class Case:
 class Judgement:
     """Whether a result counts, and all that was found: the work counts only if it is claimed and every finding holds.
 
+    If an own check took too long and nothing else fails, the result is not judged: `is_decided` is false.
+
     `marks` identify the recording, so that it pays only one job: the CID of the file, and a hash of the times between
     its messages, to the nanosecond, which stays if names, values and the time of day are changed. A recording with few
     messages has no hash, as another one might have the same.
@@ -85,6 +88,16 @@ class Judgement:
     def failures(self) -> tuple[ReportFinding, ...]:
         """The findings because of which the work does not count."""
         return tuple(finding for finding in self.findings if finding.holds is False)
+
+    @property
+    def overdue(self) -> tuple[str, ...]:
+        """The policies whose checks took too long."""
+        return tuple(one.policy for one in self.findings if one.code == CHECK_TIMEOUT and one.holds is None)
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether a verdict can be signed."""
+        return self.success or bool(self.failures)
 
 
 def judge(
@@ -116,8 +129,8 @@ def judge(
     found.append(_check_replayed(case, marks))
     reported = [_reported(COMPLETE.name, finding) for finding in found]
     reported += [_reported(policy, _decided(finding)) for policy, finding in trial.findings()]
-    success = case.claimed and all(finding.holds is not False for finding in reported)
-    return Judgement(success=success, findings=_bounded(reported), marks=marks)
+    holds = all(one.holds is not False and (one.code != CHECK_TIMEOUT or one.holds) for one in reported)
+    return Judgement(success=case.claimed and holds, findings=_bounded(reported), marks=marks)
 
 
 def examine(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextvars
+import ctypes
 import inspect
 import logging
+import threading
+from concurrent.futures import Future
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Final
@@ -25,6 +29,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+CHECK_TIMEOUT: Final = "check-timeout"
+"""The code of an own check that took too long: the work then neither counts nor fails."""
+MOST_OVERDUE: Final = 4
+"""Own checks that may go on after their time in one process; while there are so many, no other one is begun."""
 _UNITS: Final = (("ms", 10**6), ("s", 10**9), ("m", 60 * 10**9), ("h", 3600 * 10**9))
 
 
@@ -121,13 +129,17 @@ class OwnPolicy(Policy):
     """A policy by a function of a user, which gets the `Evidence` and says whether it holds.
 
     It returns True or an empty text if it holds, False or a text that says why if it does not, None if it can't decide
-    (then the work does not count), or yields `Finding`s and texts. An exception also counts as undecided.
+    (then the work does not count), or yields `Finding`s and texts. An exception also counts as undecided. If it takes
+    more than `timeout` seconds, the result is not judged, unless another finding fails.
     """
 
     function: CheckFunction
+    timeout: float = 60.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not 0 < self.timeout <= threading.TIMEOUT_MAX:
+            raise InvalidPolicy(self.name, f"its timeout must be a positive number of seconds, not {self.timeout}")
         if inspect.iscoroutinefunction(self.function):
             raise InvalidPolicy(self.name, "a check is a plain function, which runs in a thread")
 
@@ -144,13 +156,54 @@ class _OwnCheck(PolicyCheck):
     def findings(self) -> Iterator[Finding]:
         name = self._policy.name
         try:
-            yield from _findings_of(self._policy.function(self._evidence), self._policy)
-        except Exception as error:  # of a user's function
+            yield from _found_in_time(self._policy, self._evidence)
+        except _CheckOverdueError as overdue:
+            yield Finding(CHECK_TIMEOUT, None, str(overdue))
+        except (Exception, SystemExit) as error:  # of a user's function
             facts = log_event("policy-check-failed", policy=name)
             log.exception("the check of the policy %s failed", name, extra=facts)
             yield Finding(
                 "check-failed", None, f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             )
+
+
+class _CheckOverdueError(Exception):
+    """A user's function did not end in time, or was not begun because others have not."""
+
+
+class _CheckInterruptedError(BaseException):
+    """Is raised in the thread of a function whose time is over."""
+
+
+_overdue: Final[set[threading.Thread]] = set()
+
+
+def _found_in_time(policy: OwnPolicy, evidence: Evidence) -> list[Finding]:
+    """What a user's function finds. Raises what it raises, and `_CheckOverdueError`.
+
+    Nothing can stop a thread from outside. An exception is raised in it, which ends what runs in Python; a function
+    that waits for something else goes on, and the number of those is bounded.
+    """
+    _overdue.difference_update([thread for thread in tuple(_overdue) if not thread.is_alive()])
+    if len(_overdue) >= MOST_OVERDUE:
+        raise _CheckOverdueError(f"it was not begun: {len(_overdue)} earlier checks have not ended")
+    context, outcome = contextvars.copy_context(), Future[list[Finding]]()
+
+    def run() -> None:
+        try:
+            outcome.set_result(context.run(lambda: list(_findings_of(policy.function(evidence), policy))))
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    thread = threading.Thread(target=run, name=f"check {policy.name}", daemon=True)
+    thread.start()
+    thread.join(policy.timeout)
+    if thread.is_alive():
+        _overdue.add(thread)
+        interrupt = ctypes.py_object(_CheckInterruptedError)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident or 0), interrupt)
+        raise _CheckOverdueError(f"it did not end within {policy.timeout:g} s")
+    return outcome.result()
 
 
 def _findings_of(outcome: Outcome, policy: OwnPolicy) -> Iterator[Finding]:

@@ -99,16 +99,18 @@ class Validator(Lifecycle):
         """The address of its account (EIP-55)."""
         return self.runtime.parts.signer.address
 
-    def check(self, name: str, *, description: str) -> Callable[[F], F]:
+    def check(self, name: str, *, description: str, timeout: float | None = None) -> Callable[[F], F]:
         """Judge by a function, too: `@validator.check("quick-lamp", description="It answers within 1 s.")`.
 
         The function gets the `Evidence`, and returns True if the work counts, or False, or a text that says why it does
         not. It may also yield several texts. It runs in a thread. `name` is a word (letters, digits, hyphens);
-        `description` is what parties read before they name this validator. Raises `InvalidPolicy`.
+        `description` is what parties read before they name this validator. If it takes more than `timeout` seconds (by
+        default the setting `validator_check_timeout`), the result is not judged. Raises `InvalidPolicy`.
         """
+        seconds = self.settings.validator_check_timeout if timeout is None else timeout
 
         def register(function: F) -> F:
-            self._add(OwnPolicy(name, description, function))
+            self._add(OwnPolicy(name, description, function, seconds))
             return function
 
         return register

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -10,10 +11,11 @@ from mesh.evidence import Finding
 from mesh.recording import open_objective
 from mesh.validator.judging import judge
 from mesh.validator.policies import POLICIES, policy_of
-from mesh.validator.policy import InvalidPolicy, OwnPolicy
+from mesh.validator.policy import MOST_OVERDUE, InvalidPolicy, OwnPolicy
 from schemas.verdicts import MOST_FINDINGS
 from tests.mesh.evidence.jobs import OTHER, THIEF, WORDS, make_job
 from tests.mesh.validator.trials import Trial, failed, liability_of
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -165,3 +167,43 @@ def test_files_beyond_the_limits_do_not_count(trial: Trial) -> None:
     files = {"objective": trial.job.objective, "recording": trial.job.result}
     judgement = judge(case, **files, policies=(), limits=Limits(messages=5))
     assert set(failed(judgement)) == {"complete/readable"}
+
+
+def endless(evidence: Evidence) -> bool:
+    while True:
+        pass
+
+
+def test_a_check_that_takes_too_long_decides_nothing(trial: Trial) -> None:
+    overdue = OwnPolicy("own", "It ends.", endless, 0.05)
+    judgement = trial.judge(overdue)
+    assert (judgement.success, judgement.is_decided, judgement.overdue) == (False, False, ("own",))
+    assert [one.detail for one in judgement.findings if one.code == "check-timeout"] == ["it did not end within 0.05 s"]
+    wait_until(lambda: not checking(), what="the end of the endless check")
+    # What fails for another reason fails all the same.
+    judgement = trial.judge(overdue, own(lambda evidence: False))
+    assert (judgement.success, judgement.is_decided) == (False, True)
+
+
+def test_checks_that_never_end_are_bounded(trial: Trial) -> None:
+    end = threading.Event()
+    stuck = OwnPolicy("own", "It ends.", lambda evidence: end.wait(), 0.02)
+    try:
+        details = [trial.judge(stuck).findings[-1].detail for _ in range(MOST_OVERDUE + 1)]
+        assert len(checking()) == MOST_OVERDUE
+        assert details[-1] == f"it was not begun: {MOST_OVERDUE} earlier checks have not ended"
+    finally:
+        end.set()
+    wait_until(lambda: not checking(), what="the end of the checks")
+    assert trial.judge(own(says_all)).success
+
+
+def checking() -> list[threading.Thread]:
+    """The threads of own checks."""
+    return [thread for thread in threading.enumerate() if thread.name.startswith("check ")]
+
+
+@pytest.mark.parametrize("timeout", [0, -1, float("nan"), float("inf")])
+def test_the_time_of_a_check_is_a_positive_number(timeout: float) -> None:
+    with pytest.raises(InvalidPolicy):
+        OwnPolicy("own", "It ends.", says_all, timeout)

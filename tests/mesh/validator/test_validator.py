@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,10 +12,12 @@ from mesh.chain import XRT
 from mesh.validator import publishing
 from mesh.validator.publishing import REFRESH, Announcements
 from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on
+from tests.support.log_events import logged_facts
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    from mesh.validator.evidence import Evidence
     from tests.support.market import Place
 
 
@@ -91,6 +94,29 @@ async def test_a_claim_of_failure_needs_no_recording(place: Place) -> None:
             assert not (await contract.outcome()).success
             (report,) = await reports_on(person, contract)
             assert [finding.code for finding in report.failures] == ["claimed"]
+
+
+async def test_a_check_that_never_returns_delays_no_other_case(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+    end, begun = threading.Event(), []
+    async with Court(place) as court:
+        validator, robot = await court.validator(), await court.robot()
+
+        @validator.check("slow", description="It ends.", timeout=0.2)
+        def slow(evidence: Evidence) -> bool:
+            begun.append(evidence.liability.address)
+            return len(begun) > 1 or end.wait()
+
+        try:
+            async with court.at_work(validator, robot) as person:
+                unjudged = await court.demand(person, validator.address)
+                await until(lambda: logged_facts(caplog, "case-not-judged"))
+                contract = await court.demand(person, validator.address)
+                assert (await contract.outcome()).success
+                assert begun == [unjudged.address, contract.address]
+                assert not (await place.chains["person"].liabilities.get(unjudged.address)).is_finalized
+                assert await reports_on(person, unjudged) == []
+        finally:
+            end.set()
 
 
 async def test_a_liability_that_pays_too_little_is_refunded(place: Place) -> None:
