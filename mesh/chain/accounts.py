@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 VERSION: Final = 3
 """Of Web3 secret storage."""
+ITERATIONS: Final = 1_000_000
+"""PBKDF2 iterations between a password and the key that opens a keyfile."""
 SHORT: Final = 55
 """The most bytes whose number RLP writes into one byte with their kind."""
 
@@ -138,17 +140,17 @@ def new_private_key() -> bytes:
     return bytes(PrivateKey().secret)
 
 
-def write_keyfile(path: Path | str, private_key: bytes, password: str) -> str:
+def write_keyfile(path: Path | str, private_key: bytes, password: str, *, iterations: int = ITERATIONS) -> str:
     """Write a key, encrypted, to a new file that only its owner reads; the account's address.
 
-    Takes most of a second. Raises `KeyfileError` when the file exists or can't be written, `InputError` for an
-    invalid `private_key`.
+    Takes most of a second, as does opening it: `iterations` of PBKDF2 slow down who guesses passwords. Raises
+    `KeyfileError` when the file exists or can't be written, `InputError` for an invalid `private_key`.
     """
     with needs_extra("chain", "keyfiles"):  # takes half a second
         from eth_keyfile.keyfile import create_keyfile_json
 
     address = Account(private_key).address
-    content = create_keyfile_json(private_key, password.encode())
+    content = create_keyfile_json(private_key, password.encode(), iterations=iterations)
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:

@@ -44,6 +44,8 @@ ALLOWANCE: Final = 1_000 * XRT
 STAKE: Final = 100 * XRT
 """What the provider stakes, wn: a hundred transactions a turn."""
 TIMING: Final = Timing(poll_interval=0.1)
+ITERATIONS: Final = 1_000
+"""Of a keyfile's password: the keys are public, so the keyfiles may open at once."""
 PLAN: Final = DeploymentPlan(timeout_blocks=100)
 
 
@@ -239,4 +241,4 @@ def _write_keyfiles(folder: Path, private_keys: tuple[bytes, ...]) -> None:
     for role, key in zip(ROLES, private_keys, strict=False):
         keyfile = folder / f"{role}.json"
         if not keyfile.exists():
-            write_keyfile(keyfile, key, password.read_text().strip())
+            write_keyfile(keyfile, key, password.read_text().strip(), iterations=ITERATIONS)

@@ -49,7 +49,7 @@ def fragile(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fragile]:
         (folder / "password").write_text("a password")
         (folder / "development").mkdir()
         for role, key in keys.items():
-            write_keyfile(folder / "development" / f"{role}.json", key, "a password")
+            write_keyfile(folder / "development" / f"{role}.json", key, "a password", iterations=1)
         variables = {
             "AIRA_CONNECT": router.endpoint,
             "AIRA_WEB3_HTTP_PROVIDER": node.url,

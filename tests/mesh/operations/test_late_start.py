@@ -57,7 +57,7 @@ def variables_of(folder: Path, *, node: int, router: int) -> dict[str, str]:
 def hand_over(folder: Path, key: bytes) -> None:
     """The files of an account."""
     (folder / "password").write_text("secret\n")
-    write_keyfile(folder / "account.json", key, "secret")
+    write_keyfile(folder / "account.json", key, "secret", iterations=1)
 
 
 @pytest.mark.sample("program", "role")
