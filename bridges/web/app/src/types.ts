@@ -118,7 +118,7 @@ export interface AgentStatus {
     fees: string;
     minted: string;
   };
-  validation?: { validators: Address[]; policies: string[]; fee: string; cases: Record<string, number> };
+  validation?: { validators: Address[]; policies: string[]; fee: number; cases: Record<string, number> };
   dropped?: Record<string, number>;
 }
 

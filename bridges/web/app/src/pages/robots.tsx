@@ -37,9 +37,9 @@ function AgentList(props: Agents) {
         {props.agents.map((agent) => (
           <tr key={agent.address + agent.role} class={agent === chosen ? "chosen" : ""}>
             <td><span class={`dot ${agent.health === "alive" ? "good" : agent.health === "degraded" ? "warn" : "bad"}`} aria-hidden="true" /> {texts.health[agent.health]}</td>
-            <td><Strange text={agent.role} most={40} /></td>
+            <td data-role={agent.role}><Strange text={agent.role} most={40} /></td>
             <td><Name text={agent.address} href={`#/account/${agent.address}`} /></td>
-            <td><Phases jobs={agent.status?.work?.jobs} /></td>
+            <td><Phases jobs={agent.status?.work?.jobs ?? agent.status?.validation?.cases} /></td>
             <td>{texts.recordShort(agent.record.done, agent.record.failed)}</td>
             <td class="right"><Money units={agent.record.earned} token={market.token} /></td>
             <td class="right">{agent.status?.uptime ? duration(agent.status.uptime) : ""}</td>
@@ -84,6 +84,9 @@ function AgentDetails({ agent }: { agent: Agent }) {
               [texts.store, status?.work ? texts.filesOf(status.work.store.files, size(status.work.store.bytes)) : ""],
               [texts.bookOrders, status?.market?.openOrders ?? ""],
               [texts.contractsMade, status?.market ? `${status.market.created} / ${status.market.finalized}` : ""],
+              [texts.judgesFor, status?.validation ? <span class="inline">{status.validation.validators.slice(0, 4).map((one) => <Name key={one} text={one} />)}</span> : ""],
+              [texts.judgesBy, status?.validation ? <Strange text={status.validation.policies.join(", ")} /> : ""],
+              [texts.itsFee, status?.validation ? amount(BigInt(status.validation.fee), market.xrt) : ""],
               ...Object.entries(status?.dropped ?? {}).map(([reason, count]) => [texts.dropped(reason), count] as [string, number]),
             ]}
           />
