@@ -94,12 +94,14 @@ async def _run_router(endpoint: str) -> None:
 
 
 def arguments(description: str, **defaults: int | tuple[str, ...]) -> argparse.Namespace:
-    """The command line options: `--json`, and for each of `defaults` a number, or one of several words."""
+    """The command line options: `--json`, and for each of `defaults` a number, one of several words, or a flag."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     for name, default in defaults.items():
         option = f"--{name.replace('_', '-')}"
-        if isinstance(default, tuple):
+        if isinstance(default, bool):
+            parser.add_argument(option, action="store_true")
+        elif isinstance(default, tuple):
             parser.add_argument(option, choices=default, default=default[0])
         else:
             parser.add_argument(option, type=int, default=default)

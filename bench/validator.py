@@ -1,7 +1,8 @@
 """Validators: what of tampered and honest recordings is paid, how long judging takes, and what it costs on the chain.
 
 Exits with 1 if a tampered recording is paid, an honest one is not, or judging takes too long. The recordings are those
-of the tests (`docs/validators.md` has the tables), the gas is that of `bench/gas.py`.
+of the tests (`docs/validators.md` has the tables), the gas is that of `bench/gas.py`. With `--chain` the tampered ones
+are also handed in for contracts on a chain, by jobs with router, provider and validator.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from mesh.recording import Recorder, RecordingAbout, json_type
 from schemas import cid_of_file
 from schemas.payloads import RAW, encode_value
 from tests.contracts.gas import measure
+from tests.mesh.validator.chain_jobs import UNHEARD, hand_in_tampered
 from tests.mesh.validator.lamps import (
     LIGHTHOUSE,
     POLICIES,
@@ -127,6 +129,21 @@ def measure_verdicts(folder: Path) -> dict[str, float]:
     }
 
 
+def measure_chain(folder: Path) -> dict[str, int]:
+    """How contracts end for which tampered recordings are handed in; `refused` are those with the expected reason."""
+    (folder / "chain").mkdir()
+    with EmbeddedRouter() as router:
+        jobs = asyncio.run(hand_in_tampered(router.endpoint, folder / "chain"))
+    refused = [job for job in jobs if job.tampering.code in job.codes and not job.liability.is_success]
+    return {
+        "chain_jobs": len(jobs),
+        "chain_paid": sum(job.liability.is_success for job in jobs),
+        "chain_judged": sum(job.tampering.kind not in UNHEARD for job in jobs),
+        "chain_refused": len(refused),
+        "chain_refunded": sum(job.liability.is_finalized and not job.liability.is_success for job in jobs),
+    }
+
+
 def measure_gas() -> dict[str, int]:
     """The gas of finalizing without a validator, by one, and by two of three jurors, by generation."""
     gas = measure()
@@ -139,6 +156,9 @@ def missed(results: dict[str, Any]) -> list[str]:
     bars = {
         "tampered_paid": results["tampered_paid"] == 0,
         "honest_paid": results["honest_paid"] == 1.0,
+        "chain_paid": results.get("chain_paid", 0) == 0,
+        "chain_refunded": results.get("chain_refunded") == results.get("chain_jobs"),
+        "chain_refused": results.get("chain_refused") == results.get("chain_judged"),
         f"judging takes {slow} s, more than {SECONDS}": slow <= SECONDS,
         f"all policies take {results['ratio']} times as long as one": results["ratio"] <= RATIO,
     }
@@ -147,11 +167,12 @@ def missed(results: dict[str, Any]) -> list[str]:
 
 def main() -> int:
     """Run from the command line; returns 1 if a bar is missed."""
-    options = arguments(__doc__.splitlines()[0], megabytes=10)
+    options = arguments(__doc__.splitlines()[0], megabytes=10, chain=False)
     logging.disable(logging.ERROR)  # own checks that fail on tampered recordings say so
     with tempfile.TemporaryDirectory(prefix="aira-bench-") as name:
         folder = Path(name)
         results = {**measure_judging(folder, options.megabytes), **measure_verdicts(folder), **measure_gas()}
+        results |= measure_chain(folder) if options.chain else {}
     show(results, as_json=options.json)
     for bar in missed(results):
         print(bar, file=sys.stderr)

@@ -111,10 +111,10 @@ class Place:
         return Agent(model, settings=settings, account=account, chain=chain, resend=QUICK_RESEND)
 
     @asynccontextmanager
-    async def provider(self) -> AsyncIterator[Provider]:
-        """The lighthouse's provider at work, for some minutes at most: no test may hang."""
+    async def provider(self, *, seconds: float = 180) -> AsyncIterator[Provider]:
+        """The lighthouse's provider at work, for so long at most: no test may hang."""
         async with (
-            asyncio.timeout(180),
+            asyncio.timeout(seconds),
             Network(Endpoints(connect=(self.endpoint,))) as network,
             Provider(network.session, self.chains["provider"], self.market.deployment.lighthouse_name) as provider,
             Background() as tasks,

@@ -69,12 +69,12 @@ class Court:
             settings=settings, account=account, chain=chain, resend=QUICK_RESEND, **({"fee": FEE} | options)
         )
 
-    async def agent(self, role: str) -> Agent:
-        """An agent of the person or the robot that trades in this generation."""
-        account = self.place.market.accounts[role]
+    async def agent(self, role: str, model: str = MODEL, *, account: Account | None = None) -> Agent:
+        """An agent of the person or the robot, or with an account of its own, that trades in this generation."""
+        account = account or self.place.market.accounts[role]
         settings = dataclasses.replace(self.place.settings(role), generation=self.generation)
         chain = await self.chain(account)
-        return Agent(MODEL, settings=settings, account=account, chain=chain, resend=QUICK_RESEND)
+        return Agent(model, settings=settings, account=account, chain=chain, resend=QUICK_RESEND)
 
     async def robot(self) -> Agent:
         """A robot that offers for every demand, and reports each message that it did."""

@@ -59,6 +59,7 @@ SLACK_NS: Final = 60 * 10**9
 LEVELS: Final = tuple(number / 20 for number in range(20))
 MODEL: Final = ModelDescription(
     title="A lamp",
+    objective=(ModelTopic(topic="/lamp"),),
     result=(
         ModelTopic(topic="/lamp/state", required=True),
         ModelTopic(topic="/lamp/temperature", required=True, value=ValueSchema(type="number", minimum=-20, maximum=80)),
@@ -89,12 +90,13 @@ def follows_levels(evidence: Evidence) -> Iterator[str]:
         yield f"the lamp showed the levels {shown}, not {told}"
 
 
-POLICIES: Final[tuple[Policy, ...]] = (
-    policy_of("acknowledged:command=/lamp:answer=/lamp/state:within=1s"),
-    policy_of("schema"),
-    policy_of("rate:topic=/lamp/temperature:min=4:max=1000:gap=1s"),
-    OwnPolicy("levels", "The lamp shows each level that it was told to.", follows_levels),
+SHIPPED: Final = (
+    "acknowledged:command=/lamp:answer=/lamp/state:within=1s",
+    "schema",
+    "rate:topic=/lamp/temperature:min=4:max=1000:gap=1s",
 )
+OWN: Final = OwnPolicy("levels", "The lamp shows each level that it was told to.", follows_levels)
+POLICIES: Final[tuple[Policy, ...]] = (*map(policy_of, SHIPPED), OWN)
 
 
 def order(path: Path, levels: tuple[float, ...] = LEVELS, *, step_ns: int = 5 * MILLISECOND) -> Path:
@@ -197,12 +199,13 @@ class LampRobot:
         *,
         topics: str = "",
         playback: str = "recorded",
+        liability: Liability | None = None,
     ) -> FinishedJob:
         """Do the job called `name`, and continue it after each `Crashed` and `Stopped` that the handler raises.
 
-        What an earlier call has left in the folder is continued, too.
+        What an earlier call has left in the folder is continued, too. Without a `liability` it invents one.
         """
-        liability, since = contract(name, objective, robot=self._robot), time.time_ns()
+        liability, since = liability or contract(name, objective, robot=self._robot), time.time_ns()
         self.folder.mkdir(parents=True, exist_ok=True)
         settings: Any = Settings(recording_topics=topics, playback=playback)  # type: ignore[arg-type]
         async with Ledger(self.folder / "ledger.sqlite") as ledger:

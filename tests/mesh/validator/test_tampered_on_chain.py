@@ -1,0 +1,32 @@
+"""Robots that hand in tampered recordings on a chain: none is paid, each is refunded for its reason."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.mesh.validator.chain_jobs import IMPOSSIBLE, UNHEARD, hand_in_tampered
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.support.routers import EmbeddedRouter
+
+SAMPLE = (
+    "its second half is cut off",
+    "a forged answer shows another level",
+    "it is of another job, renamed to this one",
+)
+
+
+@pytest.mark.parametrize("kinds", [SAMPLE, pytest.param((), marks=pytest.mark.full)], ids=["sample", "all"])
+async def test_no_tampered_recording_is_paid_on_a_chain(
+    router: EmbeddedRouter, tmp_path: Path, kinds: tuple[str, ...]
+) -> None:
+    jobs = await hand_in_tampered(router.endpoint, tmp_path, kinds)
+    assert len(jobs) == (len(kinds) or 142 - len(IMPOSSIBLE))
+    assert all(job.liability.is_finalized and not job.liability.is_success for job in jobs)
+    judged = [job for job in jobs if job.tampering.kind not in UNHEARD]
+    assert {job.tampering.kind: job.codes for job in judged if job.tampering.code not in job.codes} == {}
+    assert [job.tampering.kind for job in jobs if job.codes and job not in judged] == []
