@@ -50,7 +50,7 @@ async def test_an_agent_runs_once_at_a_time_and_may_run_again(settings: Settings
 
 async def test_an_agent_that_could_not_start_may_be_started_later(router: EmbeddedRouter) -> None:
     await asyncio.to_thread(router.stop)
-    agent = Agent(settings=Settings(connect=(router.endpoint,), connect_timeout=0.2))
+    agent = Agent(settings=Settings(connect=(router.endpoint,), connect_timeout=3.0))
     before = set(asyncio.all_tasks())
     with pytest.raises(NetworkUnavailable) as caught:
         await agent.__aenter__()

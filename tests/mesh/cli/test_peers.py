@@ -48,7 +48,7 @@ async def bridging(router: EmbeddedRouter, *bridges: BridgeStatus) -> AsyncItera
                 return len(await present(seen)) == 1 + len(bridges)
 
             await until_found(all_there, what="everybody", seconds=30)
-        yield Settings(connect=(router.endpoint,), connect_timeout=5.0)
+        yield Settings(connect=(router.endpoint,), connect_timeout=30.0)
 
 
 async def test_an_empty_channel_is_printed_as_a_line(

@@ -57,7 +57,7 @@ class Stage:
         self.path.write_bytes(objective(("/go", "there"), ("/move/left", {"x": 1}), ("/go", b"\1")))
 
     def words(self, *words: str | Path) -> list[str]:
-        options = ["--connect", self._endpoint, "--connect-timeout", "5", "--data-dir", self.data]
+        options = ["--connect", self._endpoint, "--connect-timeout", "30", "--data-dir", self.data]
         return [str(word) for word in ["replay", *words, *options]]
 
     def play(self, *words: str | Path) -> Result:

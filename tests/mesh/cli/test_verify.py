@@ -178,7 +178,7 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
     nothing, other = (VerifiedFiles(objective=file, result=None, message=None) for file in (None, easier))
     async with asyncio.timeout(180), served_market(tmp_path, capsys) as (endpoint, url):
         robot, person = (
-            settings_of(role, tmp_path, url=url, endpoint=endpoint, connect_timeout=5.0, fetch_timeout=5.0)
+            settings_of(role, tmp_path, url=url, endpoint=endpoint, connect_timeout=30.0, fetch_timeout=5.0)
             for role in ("robot", "person")
         )
         folder = str(tmp_path / "arbiter")

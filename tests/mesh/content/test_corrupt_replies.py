@@ -82,7 +82,7 @@ async def test_if_all_replies_are_corrupt_the_error_names_their_senders(
     with answer_queries(other_session, lambda query: query.reply(query.key_expr, bytes(3 << 20))):
         async with Exchange(session, store) as exchange:
             with pytest.raises(ContentCorrupt) as caught:
-                await exchange.fetch(cid, timeout=2)
+                await exchange.fetch(cid, timeout=5)
     assert caught.value.cid == cid
     assert caught.value.holders == (holder_of(other_session),)
     assert store.list() == ()

@@ -75,7 +75,7 @@ async def test_each_transaction_is_mined_in_a_block_of_its_own(node: EmbeddedCha
     assert await web3.eth.get_balance(to) == 10**24 + 12  # type: ignore[arg-type]
     block = await web3.eth.get_block(2, full_transactions=True)
     assert [dict(tx)["hash"] for tx in block["transactions"]] == [second["transactionHash"]]  # type: ignore[arg-type]
-    assert abs(block["timestamp"] - time.time()) < 10
+    assert abs(block["timestamp"] - time.time()) < 60
 
 
 async def test_a_block_has_the_time_at_which_it_was_mined(node: EmbeddedChain) -> None:
