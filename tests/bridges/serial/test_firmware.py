@@ -144,10 +144,10 @@ def flashes(uno: SimulatedBoard) -> list[bool]:
 
 def test_rosserial_commands_are_queued_and_all_of_them_run() -> None:
     # On a busy machine the board runs slower than its line: allow it more time to announce its topics.
-    patient = RosserialDialect(baud=BAUD, settle_time=3.0)
+    patient = RosserialDialect(baud=BAUD, settle_time=8.0)
     with board(ROSSERIAL_ECHO) as uno, LineClient(uno, patient) as client:
         for _ in range(12):
-            client.submit("/work")
+            client.submit("/work", seconds=200)
         assert [client.next(CommandFinished).status for _ in range(12)] == [CallStatus.READ] * 12
         uno.wait_until(lambda: flashes(uno) == [True, False] * 12, what="twelve flashes")
 
