@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from mesh import foxglove
 from mesh.background import Background
-from mesh.cli.watch import EventFormatter, event_json
+from mesh.cli.event_lines import EventFormatter, event_json
 from mesh.errors import AiraError
 from mesh.network import Pump, Reading
 from mesh.watching import JobEvent, MarketWatch, status_of

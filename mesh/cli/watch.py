@@ -4,47 +4,40 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
-import msgspec
 
-from mesh.agent.judged_contract import verdict_words
-from mesh.amounts import XRT, Unit
 from mesh.background import Background
+from mesh.cli.event_lines import EventFormatter, event_json
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import json_text, plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
+from mesh.cli.output import plural, print_json, print_line, wait_for_broken_pipe
 from mesh.cli.waiting import print_connection_changes
+from mesh.flood import Rate, RateLimiter
 from mesh.network import Reading
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
 from mesh.telemetry.logs import configure_logging
-from mesh.watching import JobEvent
-from schemas import Demand, Empty, InvalidAddress, Result, String, Verified, parse_address, parse_cid
-from schemas.signing import Decline, Rejection
-from schemas.verdicts import ValidatorReport
+from schemas import InvalidAddress, parse_address, parse_cid
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
     import zenoh
 
     from mesh.network import Channel, Network
     from mesh.recording import Recorder
     from mesh.settings import Settings
-    from mesh.watching import MarketCounters, MarketEvent, MarketWatch
-    from schemas import Liability, Offer
+    from mesh.watching import MarketCounters, MarketEvent, MarketWatch, PresenceChange
+    from schemas import PresenceKey
 
-LONGEST_TEXT: Final = 200
-"""The most characters of a text from others that are shown."""
-HASH_DIGITS: Final = 8
-"""Digits of an order's hash in a line; JSON has all 64."""
-EVENT_WIDTH: Final = 9
-"""Columns of the event's name."""
+
+PRESENCE_CHANGES: Final = Rate(per_second=4.0, burst=64)
+"""Validators that are shown as they come and go; more are left out."""
 
 
 @click.command("watch")
@@ -60,7 +53,7 @@ def command(
     settings: Settings, model: str | None, with_open: bool, readings: bool, out: Path | None, as_json: bool
 ) -> None:
     """Print one line for each event on a lighthouse's channel: orders, rejections, declines, contracts, jobs,
-    results and validators' verdicts. Ctrl-C stops it.
+    results, validators' verdicts, and which validators are present. Ctrl-C stops it.
 
     Needs a router, but no account and no chain. Prints only orders and results with valid signatures; invalid messages
     are counted, and the counts are printed at the end and on SIGUSR1. --json prints one object per line, with amounts
@@ -104,12 +97,29 @@ async def watch(
         tasks = await stack.enter_async_context(_report_beside(network, seen))
         if not as_json:
             click.echo(f"watching {channel.lighthouse}; Ctrl-C stops it", err=True)
+        if model is None:
+            _show_validators(channel, show)
         if with_open:
             tasks.start(seen.recall(), "open orders")
         async for event in seen:
             show(event)
             if fetcher is not None:
                 fetcher.handle(event)
+
+
+def _show_validators(channel: Channel, show: Callable[[PresenceChange], None]) -> None:
+    """Show each juror that is present now, and from now on who comes and who goes. Anybody may announce any number."""
+    from mesh.watching import PresenceChange, PresentPeer
+
+    limiter = RateLimiter(per_sender=PRESENCE_CHANGES)
+
+    def changed(key: PresenceKey, *, is_present: bool) -> None:
+        if limiter.allow(""):
+            with suppress(BrokenPipeError):  # `wait_for_broken_pipe` ends the command
+                show(PresenceChange(PresentPeer(key.role, parse_address(key.agent)), is_present))
+
+    appeared, gone = partial(changed, is_present=True), partial(changed, is_present=False)
+    channel.watch_presence(appeared, gone=gone, role="validator")
 
 
 @asynccontextmanager
@@ -125,7 +135,9 @@ async def _recording(out: Path, lighthouse: str) -> AsyncIterator[Recorder]:
         click.echo(f"{out}: {plural(summary.messages, 'reading')}", err=True)
 
 
-def _show_event(formatter: EventFormatter | None, recorder: Recorder | None, event: MarketEvent) -> None:
+def _show_event(
+    formatter: EventFormatter | None, recorder: Recorder | None, event: MarketEvent | PresenceChange
+) -> None:
     """Print an event: as a line by `formatter`, without one as JSON. Record it if it is a reading."""
     if isinstance(event, Reading) and recorder is not None:
         recorder.record(f"/{event.agent.lower()}{event.topic}", event.payload, event.type)
@@ -179,120 +191,3 @@ async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> 
         found = await statuses(session, channel, await present(channel, "provider"))
     named = {how.xrt for how in found.values() if isinstance(how, Status) and how.xrt}
     return named.pop() if len(named) == 1 else None
-
-
-def event_json(seen: MarketEvent, *, time: str) -> dict[str, Any]:
-    """An event at `time` (ISO 8601) for JSON. Amounts are text, in the smallest unit."""
-    match seen:
-        case Verified():
-            message = seen.message
-            about: dict[str, Any] = {"event": type(message).__name__.lower(), "hash": seen.hash.hex()}
-            about["signer"] = seen.signer
-            if isinstance(message, Result):
-                about |= {"liability": message.liability, "result": message.result, "success": message.success}
-            else:
-                about |= _order_facts(message)
-        case Rejection():
-            about = {"event": "rejected", "order": seen.order, "provider": seen.provider}
-            about |= {"reason": seen.reason, "detail": seen.detail}
-        case Decline():
-            about = {"event": "declined", "order": seen.order, "agent": seen.agent}
-            about |= {"code": seen.code, "detail": seen.detail}
-        case ValidatorReport():
-            about = {"event": "judged", **msgspec.json.decode(seen.encode())}
-        case Reading():
-            about = {"event": "reading", "agent": seen.agent, "topic": seen.topic, "value": _value(seen)}
-            if seen.result:
-                about |= {"signer": seen.agent, "result": seen.result}
-        case JobEvent(agent, event, liability):
-            about = {"event": event, "agent": agent, "liability": msgspec.json.decode(liability.encode())}
-    return {"time": time} | about
-
-
-def _order_facts(order: Demand | Offer) -> dict[str, Any]:
-    if isinstance(order, Demand):
-        fee = {"validatorFee": str(order.validator_fee)}
-    else:
-        fee = {"lighthouseFee": str(order.lighthouse_fee)}
-    return {
-        "model": order.model,
-        "objective": order.objective,
-        "token": order.token,
-        "cost": str(order.cost),
-        "lighthouse": order.lighthouse,
-        "validator": order.validator,
-        **fee,
-        "deadline": order.deadline,
-        "generation": order.generation,
-    }
-
-
-class EventFormatter:
-    """Formats events as lines for people. `xrt` is the address of XRT, None if unknown."""
-
-    def __init__(self, xrt: str | None) -> None:
-        self._xrt = xrt
-
-    def line(self, seen: MarketEvent) -> str:
-        """The line of an event, without the time."""
-        match seen:
-            case Verified():
-                message, kind = seen.message, type(seen.message).__name__.lower()
-                words = self._result(message, seen.signer) if isinstance(message, Result) else self._order(seen)
-            case Rejection():
-                why = printable(seen.detail[:LONGEST_TEXT] or seen.reason[:LONGEST_TEXT])
-                kind, words = "rejected", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.provider)}: {why}"
-            case Decline():
-                why = f"{printable(seen.detail[:LONGEST_TEXT])} ({seen.code})".lstrip()
-                kind, words = "declined", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.agent)}: {why}"
-            case ValidatorReport():
-                why = printable(verdict_words(seen)[:LONGEST_TEXT])
-                kind, words = "judged", f"{seen.liability} by juror {short_address(seen.juror)}: {why}"
-            case Reading():
-                kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.agent)}"
-            case JobEvent(_, kind, liability):
-                words = self._work(liability)
-        return f"{kind:<{EVENT_WIDTH}}  {words}"
-
-    def cost(self, amount: int, token: str) -> str:
-        """An amount of a token with its unit."""
-        return (XRT if token == self._xrt else Unit(f"units of {short_address(token)}", 0)).show(amount)
-
-    def _order(self, seen: Verified[Any]) -> str:
-        order: Demand | Offer = seen.message
-        if isinstance(order, Demand):
-            does, fee = "pays", ""
-        else:
-            does = "works for"
-            fee = f" and {XRT.show(order.lighthouse_fee)} to the provider" if order.lighthouse_fee else ""
-        terms = f"{self.cost(order.cost, order.token)}{fee}, model {_short_cid(order.model)}"
-        more = f"objective {_short_cid(order.objective)}, until block {order.deadline:,}"
-        return f"{seen.hash.hex()[:HASH_DIGITS]}  {seen.signer} {does} {terms}, {more}"
-
-    def _result(self, result: Result, signer: str) -> str:
-        return f"{result.result}  {_ended(result.success)}, for {result.liability}, signed by {short_address(signer)}"
-
-    def _work(self, job: Liability) -> str:
-        parties = f"{short_address(job.promisor)} for {short_address(job.promisee)}, {self.cost(job.cost, job.token)}"
-        return f"{job.address}  {parties}" + (f", {_ended(job.is_success)}: {job.result}" if job.result else "")
-
-
-def _value(reading: Reading) -> Any:
-    """The value of a reading for JSON, in which bytes become base64."""
-    value = reading.value
-    return value.data if isinstance(value, String) else None if isinstance(value, Empty) else value
-
-
-def _shown(reading: Reading) -> str:
-    value = _value(reading)
-    text = value if isinstance(value, str) else json_text(value)
-    return printable(text[:LONGEST_TEXT] + ("…" if len(text) > LONGEST_TEXT else ""))
-
-
-def _short_cid(cid: str) -> str:
-    """A CID shortened to its ends, for lines with a full one beside it."""
-    return f"{cid[:6]}…{cid[-4:]}"
-
-
-def _ended(success: bool) -> str:
-    return "done" if success else "not done"

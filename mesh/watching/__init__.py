@@ -3,5 +3,14 @@
 from __future__ import annotations
 
 from mesh.watching.market import JobEvent, MarketCounters, MarketEvent, MarketWatch
-from mesh.watching.presence import BRIDGE, PROVIDER, PresentPeer, RoleStatus, present, status_of, statuses
+from mesh.watching.presence import (
+    BRIDGE,
+    PROVIDER,
+    PresenceChange,
+    PresentPeer,
+    RoleStatus,
+    present,
+    status_of,
+    statuses,
+)
 from mesh.watching.readings import ReadingFetcher

@@ -37,6 +37,13 @@ class PresentPeer(NamedTuple):
     address: str
 
 
+class PresenceChange(NamedTuple):
+    """An agent has appeared on the channel, or is gone."""
+
+    peer: PresentPeer
+    is_present: bool
+
+
 async def present(channel: Channel, *roles: str) -> list[PresentPeer]:
     """The agents announced on the channel now, in these roles or in all: at most `PRESENT_LIMIT` for each.
 

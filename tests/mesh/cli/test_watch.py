@@ -23,6 +23,7 @@ from schemas.payloads import decode_value
 from schemas.signing import Rejection
 from tests.mesh.watching.test_market import EVENT, JOB
 from tests.support.commands import AIRA, environment, invoke, refused
+from tests.support.jurors import Juror
 from tests.support.log_events import logged_events
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
@@ -89,6 +90,20 @@ async def test_a_job_is_printed_from_the_demand_to_the_payment(place: Place, pri
     assert (events["result"]["liability"], events["result"]["result"]) == (contract.address, outcome.result)
     assert events["finalized"]["liability"]["isSuccess"] is True
     assert events["finalized"]["agent"] == place.address("robot")
+
+
+async def test_validators_are_printed_as_they_come_and_go(place: Place, printed: PrintedOutput) -> None:
+    lighthouse = place.market.deployment.lighthouse_name
+    first, second = (
+        Juror(endpoint=place.endpoint, lighthouse=lighthouse, signer=place.market.accounts[role].signer)
+        for role in ("provider", "robot")
+    )
+    async with first, watching(place.settings("watcher")):
+        await until(lambda: f"present    validator {first.signer.address}\n" in printed.read(), what="the first")
+        async with second:
+            await until(lambda: f"present    validator {second.signer.address}\n" in printed.read(), what="the second")
+        await until(lambda: f"gone       validator {second.signer.address}\n" in printed.read(), what="the end")
+    assert f"gone       validator {first.signer.address}" not in printed.out
 
 
 def robot(place: Place) -> Agent:

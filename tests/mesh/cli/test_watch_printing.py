@@ -6,9 +6,10 @@ from typing import Any
 
 import msgspec
 
-from mesh.cli.watch import EventFormatter, event_json, format_counters
+from mesh.cli.event_lines import EventFormatter, event_json
+from mesh.cli.watch import format_counters
 from mesh.network import Reading
-from mesh.watching import JobEvent, MarketCounters
+from mesh.watching import JobEvent, MarketCounters, PresenceChange, PresentPeer
 from schemas import Empty, String, verify_message
 from schemas.payloads import encode_value
 from schemas.signing import Decline, Rejection
@@ -125,3 +126,10 @@ def test_the_line_of_a_reading_is_short_and_has_no_control_characters() -> None:
     assert format_line(read({"CO": 1})).startswith('reading    /air  {"CO":1}, from 0x')
     assert format_line(read(Empty())).startswith("reading    /air  null, from 0x")
     assert format_line(read(b"ab")).startswith('reading    /air  "YWI=", from 0x')
+
+
+def test_a_validator_that_comes_or_goes_is_an_event() -> None:
+    peer = PresentPeer("validator", ROBOT.address)
+    facts = {"time": NOON, "role": "validator", "agent": ROBOT.address}
+    assert event_json(PresenceChange(peer, True), time=NOON) == facts | {"event": "present"}
+    assert event_json(PresenceChange(peer, False), time=NOON) == facts | {"event": "gone"}
