@@ -59,10 +59,10 @@ class Site:
             yield f"http://127.0.0.1:{port}"
 
     @contextmanager
-    def validator(self, *options: str) -> Iterator[None]:
-        """A validator at work, with the provider's account, which has ether."""
-        keyfile = f"{self.folder}/development/provider.json"
-        variables = self.variables | {"AIRA_KEYFILE": keyfile, "AIRA_DATA_DIR": str(self.folder / "validator")}
+    def validator(self, *options: str, role: str = "provider") -> Iterator[None]:
+        """A validator at work, with the account of a role, which has ether."""
+        keyfile = f"{self.folder}/development/{role}.json"
+        variables = self.variables | {"AIRA_KEYFILE": keyfile, "AIRA_DATA_DIR": str(self.folder / f"judge-{role}")}
         with Serving(*AIRA, "validator", *options, says=" judges by ", variables=variables):
             yield
 

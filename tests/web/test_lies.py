@@ -118,3 +118,26 @@ def test_scripts_in_names_and_recordings_are_text(browser: Browser, site: Site, 
     assert "\u202e" not in browser.text()
     assert browser.log() == []
     assert browser.violations() == []
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    "lie",
+    [
+        "body.policies[0].description = 'Whatever the robot does.'",
+        "body.announcedFee = body.fee = '1'",
+        "body.title = body.announcements[0].text = body.announcements[0].text.replace('Examiners', 'Friends')",
+        "body.announcements = []",
+    ],
+    ids=["policy", "fee", "title", "nothing"],
+)
+def test_a_lie_about_a_validator_is_caught(browser: Browser, site: Site, lie: str) -> None:
+    with site.validator("--validator-title", "Examiners", "--validator-fee", "0.25"):
+        browser.lie(r"validators\/", lie)
+        browser.go()
+        browser.connect()
+        fill_in(browser, site)
+        browser.press("With a validator")
+        browser.type("Validator", facts(site, "market")["providers"][0])
+        browser.sees("Don't trust this server")
+        assert not browser.find("#order").is_enabled()

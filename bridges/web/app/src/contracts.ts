@@ -22,10 +22,12 @@ const ABI = parseAbi([
   "function isSuccess() view returns (bool)",
   "function isLiability(address account) view returns (bool)",
   "function isValidator(address signer) view returns (bool)",
+  "function jurors() view returns (address[])",
+  "function quorum() view returns (uint256)",
 ]);
 
 type Getter =
-  | "model" | "objective" | "result" | "promisee" | "promisor" | "token" | "cost" | "demandHash" | "isFinalized" | "isSuccess";
+  | "model" | "objective" | "result" | "promisee" | "promisor" | "token" | "cost" | "demandHash" | "isFinalized" | "isSuccess" | "jurors" | "quorum";
 
 export const calls = {
   approve: (spender: Address, value: bigint) => encodeFunctionData({ abi: ABI, functionName: "approve", args: [spender, value] }),

@@ -114,7 +114,8 @@ async function throughServer(to: Address, data: Hex): Promise<Hex> {
  */
 export async function checkValidator(said: Validator, account: Account | null, market: Market): Promise<boolean> {
   const { reader, independent } = readerFor(account, market);
-  const records = await Promise.all(said.announcements.map((one) => signedAnnouncement(one, said.validator, reader)));
+  const accepts = await signersOf(said, reader);
+  const records = await Promise.all(said.announcements.map((one) => signedAnnouncement(one, said.validator, accepts)));
   const fees = records.map((one) => Number(one.fee)).sort((one, other) => one - other);
   const signed = {
     title: records[0]?.title ?? "",
@@ -140,11 +141,23 @@ interface Announcement {
 
 const policyText = (policy: { name: string; description: string }) => JSON.stringify([policy.name, policy.description]);
 
-async function signedAnnouncement(one: Validator["announcements"][number], validator: Address, reader: Reader): Promise<Announcement> {
+/** Whether the validator accepts an account's signature. The contract of a jury whose quorum is one says so itself. */
+async function signersOf(said: Validator, reader: Reader): Promise<(signer: Address) => Promise<boolean>> {
+  if (said.quorum === 1) return async (signer) => signer === said.validator || acceptsSigner(reader, said.validator, signer);
+  const [jurors, quorum] = await Promise.all([read(reader, said.validator, "jurors"), read(reader, said.validator, "quorum")]);
+  if (Number(quorum) !== said.quorum || jurors.length !== said.jurors) throw new ServerLies(texts.lieValidator);
+  return async (signer) => jurors.includes(signer);
+}
+
+async function signedAnnouncement(
+  one: Validator["announcements"][number],
+  validator: Address,
+  accepts: (signer: Address) => Promise<boolean>,
+): Promise<Announcement> {
   const record: Announcement = JSON.parse(one.text);
   const signer = await signerOf(announcementHash(one.text), one.signature).catch(() => null);
   const isJurors = signer !== null && signer === record.juror && record.validator === validator;
-  if (!isJurors || !(signer === validator || (await acceptsSigner(reader, validator, signer)))) throw new ServerLies(texts.lieValidator);
+  if (!isJurors || !(await accepts(signer))) throw new ServerLies(texts.lieValidator);
   return record;
 }
 
