@@ -233,6 +233,7 @@ def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_pa
             assert "Drive a circle" not in browser.text()
 
 
+@pytest.mark.full
 def test_a_validator_says_how_it_judges_before_it_is_named(browser: Browser, site: Site, pictures: Path) -> None:
     market = facts(site, "market")
     (validator,) = market["providers"]
