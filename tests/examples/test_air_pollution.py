@@ -39,7 +39,7 @@ def test_a_person_gets_the_measurements_of_the_sensors(protocol: str, market: di
         person = EXAMPLES / "air_pollution" / "person.py"
         done = run(sys.executable, person, "--times", "2", "--out", out, **as_role("person", market))
         shown = "reading    /measurements  "
-        asyncio.run(until(lambda: shown in watch.log(), what="the reading in `aira watch`", seconds=30))
+        asyncio.run(until(lambda: shown in watch.log(), what="the reading in `aira watch`", seconds=60))
         watched = watch.log()
     assert done.returncode == 0, done.stdout + done.stderr
     assert "done, for 0x" in watched

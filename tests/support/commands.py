@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mesh.errors import AiraError
 
 AIRA = (sys.executable, "-m", "mesh")
-SECONDS = 120.0
+SECONDS = 200.0
 SOON = 15
 """Seconds in which a signal ends a command: a fraction of one on a machine that has nothing else to do."""
 
