@@ -91,9 +91,9 @@ def follows_levels(evidence: Evidence) -> Iterator[str]:
 
 
 SHIPPED: Final = (
-    "acknowledged:command=/lamp:answer=/lamp/state:within=1s",
+    "acknowledged:command=/lamp:answer=/lamp/state:within=2s",
     "schema",
-    "rate:topic=/lamp/temperature:min=4:max=1000:gap=1s",
+    "rate:topic=/lamp/temperature:min=2.5:max=1000:gap=2s",
 )
 OWN: Final = OwnPolicy("levels", "The lamp shows each level that it was told to.", follows_levels)
 POLICIES: Final[tuple[Policy, ...]] = (*map(policy_of, SHIPPED), OWN)

@@ -227,7 +227,7 @@ def forged_messages() -> Kinds:
         ),
         "most temperatures are dropped, traces covered up": (
             "rate/rate",
-            covered(dropped("/lamp/temperature", *range(2, 19))),
+            covered(dropped("/lamp/temperature", *range(1, 19))),
         ),
         "thousands of temperatures are added": ("rate/rate", covered(flooded)),
         "three seconds are silent": ("rate/gaps", covered(late_answers)),
