@@ -7,6 +7,8 @@ import urllib.request
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tests.web.browser import Browser
     from tests.web.conftest import Site
 
@@ -56,3 +58,11 @@ def facts(site: Site, path: str) -> Any:
     """What the page's server answers."""
     with urllib.request.urlopen(f"{site.url}/api/v1/{path}", timeout=30) as response:
         return json.load(response)
+
+
+def check(browser: Browser, picture: Path) -> None:
+    """No violations, nothing wider than the screen; and a screenshot for people to look at."""
+    browser.picture(picture)
+    assert browser.violations() == [], picture.stem
+    wider = browser.driver.execute_script("return document.documentElement.scrollWidth - innerWidth")
+    assert wider <= 0, f"{picture.stem} is wider than the screen"

@@ -13,7 +13,7 @@ from selenium.webdriver.common.keys import Keys
 from tests.support.commands import Serving
 from tests.support.ports import free_port
 from tests.web.browser import DESKTOP, PHONE, Browser
-from tests.web.steps import facts, fill_in, order, review, sign
+from tests.web.steps import check, fill_in, order, review, sign
 
 UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
@@ -233,43 +233,6 @@ def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_pa
             assert "Drive a circle" not in browser.text()
 
 
-@pytest.mark.full
-def test_a_validator_says_how_it_judges_before_it_is_named(browser: Browser, site: Site, pictures: Path) -> None:
-    market = facts(site, "market")
-    (validator,) = market["providers"]
-    policies = ("--validator-policies", "acknowledged:within=5s", "--validator-title", "Driving examiners <b>")
-    with site.validator(*policies, "--validator-fee", "0.25"):
-        browser.go()
-        browser.connect()
-        fill_in(browser, site)
-        browser.press("With a validator")
-        for named, fee, refusal in (
-            (market["lighthouse"]["address"], "", "is a lighthouse"),
-            (site.wallet().address, "", "nobody answers as this validator on the mesh"),
-            (validator, "0.1", "the fee is 0.1 XRT, but the validator wants 0.25 XRT"),
-        ):
-            browser.type("Validator", named)
-            browser.type("Fee of the validator", fee or Keys.BACKSPACE)
-            browser.sees(refusal)
-            assert not browser.find("#order, #allow:not([disabled])").is_enabled()
-        browser.type("Fee of the validator", Keys.BACKSPACE)
-        browser.sees("Each command is answered by the device within 5 s.")
-        browser.sees("Driving examiners <b>")
-        browser.sees("0.25 XRT, on top of the price")
-        browser.sees("cost and fee can be refunded 50,400 blocks")
-        browser.sees("This browser checked it, through your wallet's node")
-        for look, size in (("phone", PHONE), ("desktop", DESKTOP)):
-            browser.resize(size)
-            check(browser, pictures / f"validator-{look}.png")
-        sign(browser)
-        browser.sees("the robot was paid")
-        browser.sees("the work counts")
-        browser.go("robots")
-        browser.click(f"tr:has([title='{validator}']):has([data-role='validator']) button[aria-expanded]")
-        browser.sees("complete, acknowledged")
-        check(browser, pictures / "validator-robots.png")
-
-
 @pytest.mark.sample("size", "dark")
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
@@ -297,11 +260,3 @@ def test_each_page_is_accessible(site: Site, paid_job: str, pictures: Path, size
         check(browser, pictures / f"review-{look}")
         browser.press("Not now")
         check(browser, pictures / f"form-{look}")
-
-
-def check(browser: Browser, picture: Path) -> None:
-    """No violations, nothing wider than the screen; and a screenshot for people to look at."""
-    browser.picture(picture)
-    assert browser.violations() == [], picture.stem
-    wider = browser.driver.execute_script("return document.documentElement.scrollWidth - innerWidth")
-    assert wider <= 0, f"{picture.stem} is wider than the screen"
