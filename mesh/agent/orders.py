@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from msgspec.structs import replace
+
 from mesh.agent.contract import fail_future
 from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.progress import Progress, nothing, report, stated
@@ -15,7 +17,7 @@ from mesh.market.book import Refusal
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Container, Mapping
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
@@ -233,13 +235,11 @@ class Order:
 
 
 class TermsWriter:
-    """Fills in and signs the orders of one account, in the generation of its settings."""
+    """Fills in and signs the orders of one account, in the generation of its settings. `known` are hashes of others."""
 
-    def __init__(self, parts: AgentComponents) -> None:
-        self._settings = parts.settings
-        self._chain = parts.chain
-        self._signer = parts.signer
-        self._chain_head = parts.chain_head
+    def __init__(self, parts: AgentComponents, known: Container[str]) -> None:
+        self._settings, self._signer, self._known = parts.settings, parts.signer, known
+        self._chain, self._chain_head = parts.chain, parts.chain_head
 
     async def terms(
         self, *, model: str, objective: str, cost: int | str, token: str, validator: str, lifetime: int | None
@@ -273,11 +273,13 @@ class TermsWriter:
         return {field: getattr(order, field) for field in (*REPEATED, "deadline")} | {"sender": sender}
 
     async def sign(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Demand | Offer:
-        """An order with these terms and a fresh nonce, signed. Raises `UnsafeValidator`."""
+        """An order with these terms and a fresh nonce, signed, unlike the known ones. Raises `UnsafeValidator`."""
         is_counted = terms["sender"] is not None
         nonce = await self._chain.liabilities.next_nonce(self._signer.address) if is_counted else secrets.token_hex(32)
         order = kind(**terms, nonce=nonce, **fee)
         await self._chain.validators.check(order)
+        while message_hash(order).hex() in self._known:  # equal orders have the same nonce until one is a contract
+            order = replace(order, deadline=order.deadline - 1)
         return self._signer.sign(order)
 
     async def sign_again(self, order: Demand | Offer) -> Demand | Offer:

@@ -54,8 +54,8 @@ class Trader(Lifecycle):
         self._chain = parts.chain
         self._address = parts.signer.address
         self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address)
-        self.writer = TermsWriter(parts)
         self._orders: dict[str, TradedOrder] = {}
+        self.writer = TermsWriter(parts, self._orders)
         self._hear_declines: Callable[[], None] = lambda: None
         self._answers = OpenOffers()
         self._changing = asyncio.Lock()

@@ -55,6 +55,14 @@ async def test_each_of_several_concurrent_demands_becomes_a_contract(place: Plac
     assert await place.balance("robot") == before + 3210
 
 
+async def test_equal_demands_of_generation_5_become_a_contract_each(place: Place) -> None:
+    """They would have the same nonce, and so the same hash."""
+    async with place.provider(), working(place.agent("robot")), place.agent("person", generation=5) as person:
+        async with asyncio.timeout(30):
+            contracts = await asyncio.gather(*(person.demand(job(place), cost=7) for _ in range(3)))
+        assert len({contract.address for contract in contracts}) == 3
+
+
 async def test_overtaken_offers_of_generation_5_are_signed_again(place: Place) -> None:
     """Both offers of the robot have the same nonce, because neither was taken when they were made."""
     robot = working(place.agent("robot"))
