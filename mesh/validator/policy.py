@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextvars
-import ctypes
 import inspect
 import logging
 import threading
@@ -171,18 +170,13 @@ class _CheckOverdueError(Exception):
     """A user's function did not end in time, or was not begun because others have not."""
 
 
-class _CheckInterruptedError(BaseException):
-    """Is raised in the thread of a function whose time is over."""
-
-
 _overdue: Final[set[threading.Thread]] = set()
 
 
 def _found_in_time(policy: OwnPolicy, evidence: Evidence) -> list[Finding]:
     """What a user's function finds. Raises what it raises, and `_CheckOverdueError`.
 
-    Nothing can stop a thread from outside. An exception is raised in it, which ends what runs in Python; a function
-    that waits for something else goes on, and the number of those is bounded.
+    Nothing can stop a thread from outside: a function whose time is over goes on, and the number of those is bounded.
     """
     _overdue.difference_update([thread for thread in tuple(_overdue) if not thread.is_alive()])
     if len(_overdue) >= MOST_OVERDUE:
@@ -200,8 +194,6 @@ def _found_in_time(policy: OwnPolicy, evidence: Evidence) -> list[Finding]:
     thread.join(policy.timeout)
     if thread.is_alive():
         _overdue.add(thread)
-        interrupt = ctypes.py_object(_CheckInterruptedError)
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident or 0), interrupt)
         raise _CheckOverdueError(f"it did not end within {policy.timeout:g} s")
     return outcome.result()
 

@@ -169,20 +169,19 @@ def test_files_beyond_the_limits_do_not_count(trial: Trial) -> None:
     assert set(failed(judgement)) == {"complete/readable"}
 
 
-def endless(evidence: Evidence) -> bool:
-    while True:
-        pass
-
-
 def test_a_check_that_takes_too_long_decides_nothing(trial: Trial) -> None:
-    overdue = OwnPolicy("own", "It ends.", endless, 0.05)
-    judgement = trial.judge(overdue)
+    end = threading.Event()
+    overdue = OwnPolicy("own", "It ends.", lambda evidence: end.wait(), 0.05)
+    try:
+        judgement = trial.judge(overdue)
+        # What fails for another reason fails all the same.
+        failing = trial.judge(overdue, own(lambda evidence: False))
+    finally:
+        end.set()
     assert (judgement.success, judgement.is_decided, judgement.overdue) == (False, False, ("own",))
     assert [one.detail for one in judgement.findings if one.code == "check-timeout"] == ["it did not end within 0.05 s"]
-    wait_until(lambda: not checking(), what="the end of the endless check")
-    # What fails for another reason fails all the same.
-    judgement = trial.judge(overdue, own(lambda evidence: False))
-    assert (judgement.success, judgement.is_decided) == (False, True)
+    assert (failing.success, failing.is_decided) == (False, True)
+    wait_until(lambda: not checking(), what="the end of the checks")
 
 
 def test_checks_that_never_end_are_bounded(trial: Trial) -> None:
