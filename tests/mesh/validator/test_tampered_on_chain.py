@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.validator.chain_jobs import IMPOSSIBLE, UNHEARD, hand_in_tampered
+from tests.mesh.validator.chain_jobs import UNHEARD, hand_in_tampered
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,14 +18,27 @@ SAMPLE = (
     "a forged answer shows another level",
     "it is of another job, renamed to this one",
 )
+MORE = (
+    "a message is there twice, traces covered up",
+    "all messages have the number 0",
+    "answers are said to be commands",
+    "the temperatures are texts",
+    "it names no liability",
+    "its recorder lost messages",
+    "it states a crash without a new begin",
+    "it is from yesterday",
+    "the Result names another recording",
+    "it is of another robot's job",
+)
+"""`python bench/validator.py --chain` hands in all of them."""
 
 
-@pytest.mark.parametrize("kinds", [SAMPLE, pytest.param((), marks=pytest.mark.full)], ids=["sample", "all"])
+@pytest.mark.parametrize("kinds", [SAMPLE, pytest.param(MORE, marks=pytest.mark.full)], ids=["sample", "more"])
 async def test_no_tampered_recording_is_paid_on_a_chain(
     router: EmbeddedRouter, tmp_path: Path, kinds: tuple[str, ...]
 ) -> None:
     jobs = await hand_in_tampered(router.endpoint, tmp_path, kinds)
-    assert len(jobs) == (len(kinds) or 142 - len(IMPOSSIBLE))
+    assert {job.tampering.kind for job in jobs} == set(kinds)
     assert all(job.liability.is_finalized and not job.liability.is_success for job in jobs)
     judged = [job for job in jobs if job.tampering.kind not in UNHEARD]
     assert {job.tampering.kind: job.codes for job in judged if job.tampering.code not in job.codes} == {}
