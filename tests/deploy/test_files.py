@@ -132,6 +132,17 @@ def test_no_volume_name_is_a_prefix_of_another() -> None:
         assert not [(one, two) for one in names for two in names if one != two and two.startswith(one)]
 
 
+def test_every_volume_that_a_service_mounts_is_defined() -> None:
+    """Also in the second file, whose services have the volumes of those they extend."""
+    for file in (ONE_SITE, TWO_SITES):
+        defined = compose(file)["volumes"]
+        for name, service in compose(file)["services"].items():
+            base = services()[service["extends"]["service"]] if "extends" in service else {}
+            for mount in service.get("volumes", []) + base.get("volumes", []):
+                source = VARIABLE.sub(r"\2", mount).partition(":")[0]
+                assert source in defined or source.startswith("."), f"{file.name}: {name}: {mount}"
+
+
 def test_the_second_file_builds_on_services_of_the_first() -> None:
     for name, service in compose(TWO_SITES)["services"].items():
         assert service["extends"]["file"] == ONE_SITE.name, name

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from mesh.validator import cases
 from schemas import Result, cid_of_bytes
 from tests.mesh.validator.courts import Court, liar
-from tests.support.waiting import until
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     import pytest
@@ -28,7 +28,11 @@ async def test_results_for_other_liabilities_cost_nothing(place: Place) -> None:
             contract = await court.demand(person, validator.address)
             assert (await contract.outcome()).success
             await until(lambda: validator.runtime.results.received >= 300)
-            assert await validator.runtime.parts.ledger.unended() == []
+
+            async def has_no_case() -> bool:
+                return await validator.runtime.parts.ledger.unended() == []
+
+            await until_found(has_no_case, what="the end of the only case")
 
 
 async def test_one_promisor_s_open_cases_are_limited(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
