@@ -170,6 +170,7 @@ class Cases:
         while not case.stored.result:
             await case.wait()
         if (decision := await self._judge.decide(case.stored)) is None:
+            self._judge.verdicts["none"] += 1
             return False
         report = decision.report
         signed = Result(liability=address, result=report.result, success=report.success)

@@ -83,7 +83,7 @@ class CaseJudge:
         """The liabilities of successes by the marks of their recordings, before the ledger has them."""
         self._models = Models(parts.store, parts.exchange)
         self.verdicts: Counter[str] = Counter()
-        """What was decided since the start: `success`, `no-success`."""
+        """What was decided since the start: `success`, `no-success`; `none` for cases given up until a restart."""
         self.seconds = 0.0
         """Seconds that judging took since the start."""
 

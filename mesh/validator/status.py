@@ -67,13 +67,13 @@ class ValidatorStatus:
         """The metrics now."""
         parts, judge = self._parts, self._judge
         usage = await asyncio.to_thread(parts.store.usage)
-        verdicts = {"success": 0.0, "no-success": 0.0} | dict(judge.verdicts)
+        verdicts = {"success": 0.0, "no-success": 0.0, "none": 0.0} | dict(judge.verdicts)
         stages = {stage: float(count) for stage, count in (await parts.ledger.stages()).items()}
         families = (
             *message_families([self._results]),
             drop_family(parts.drops),
             by_label("aira_validator_cases", "gauge", "Liabilities that name the validator, by stage", "stage", stages),
-            by_label("aira_verdicts_total", "counter", "Cases that the validator decided", "verdict", verdicts),
+            by_label("aira_verdicts_total", "counter", "Cases that it decided or gave up", "verdict", verdicts),
             counter("aira_judging_seconds_total", "Seconds that judging recordings took", judge.seconds),
             gauge("aira_content_files", "Files in the content store", usage.files),
             gauge("aira_content_bytes", "Bytes of the content store", usage.bytes),

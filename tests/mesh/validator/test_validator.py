@@ -112,6 +112,7 @@ async def test_a_check_that_never_returns_delays_no_other_case(place: Place, cap
                 await until(lambda: logged_facts(caplog, "case-not-judged"))
                 contract = await court.demand(person, validator.address)
                 assert (await contract.outcome()).success
+                assert dict(validator.runtime.judge.verdicts) == {"none": 1, "success": 1}
                 assert begun == [unjudged.address, contract.address]
                 assert not (await place.chains["person"].liabilities.get(unjudged.address)).is_finalized
                 assert await reports_on(person, unjudged) == []
