@@ -16,11 +16,13 @@ from schemas.selectors import report_selector
 from schemas.verdicts import ValidatorAnnouncement, ValidatorReport
 from tests.support.market import MODEL, QUICK, QUICK_RESEND, Place, offering_unseen
 from tests.support.objectives import objective
+from tests.support.waiting import until_answered, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.agent import Contract
+    from schemas import Liability
 
 PRICE = 7
 FEE = 3
@@ -102,9 +104,9 @@ class Court:
         return await person.demand(job, validator=validator, **options)
 
 
-async def liar(court: Court) -> Agent:
+async def liar(court: Court, *, account: Account | None = None) -> Agent:
     """A robot that offers for every demand and then does nothing."""
-    robot = await court.agent("robot")
+    robot = await court.agent("robot", account=account)
     robot.settings = dataclasses.replace(robot.settings, enable_executor=False)
     return offering_unseen(robot)
 
@@ -116,7 +118,8 @@ async def claim(robot: Agent, contract: Contract, recording: str, *, success: bo
 
 
 async def asked(agent: Agent, selector: str) -> list[bytes]:
-    """What others reply to a query."""
+    """What others reply to a query. There must be somebody who may."""
+    await until_answered(agent.network.session, selector.partition("?")[0])
     replies = await query_all(agent.network.session, [selector], timeout=30.0)
     return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
@@ -127,7 +130,30 @@ async def reports_on(agent: Agent, contract: Contract) -> list[ValidatorReport]:
     return [ValidatorReport.decode(payload) for payload in await asked(agent, selector)]
 
 
-async def announcements_of(agent: Agent, validator: str) -> list[ValidatorAnnouncement]:
-    """What the jurors of a validator announce."""
-    selector = str(ValidatorKey(agent.channel.lighthouse, validator))
-    return [ValidatorAnnouncement.decode(payload) for payload in await asked(agent, selector)]
+async def announcements_of(agent: Agent, validator: str, *, jurors: int = 1) -> list[ValidatorAnnouncement]:
+    """What the jurors of a validator announce, once so many do.
+
+    They hear Results then: they subscribe before.
+    """
+    selector, payloads = str(ValidatorKey(agent.channel.lighthouse, validator)), list[bytes]()
+
+    async def have_all_answered() -> bool:
+        payloads[:] = await asked(agent, selector)
+        return len(payloads) >= jurors
+
+    await until_found(have_all_answered, what=f"{jurors} announcements")
+    return [ValidatorAnnouncement.decode(payload) for payload in payloads]
+
+
+async def open_cases(validator: Validator) -> dict[str, Liability]:
+    """The cases of a validator that have not ended, by address: perhaps also some that earlier tests left open."""
+    return {one.liability.address: one.liability for one in await validator.runtime.parts.ledger.unended()}
+
+
+async def until_ended(validator: Validator, contract: Contract) -> None:
+    """Return when a validator has seen the end of its case on the chain."""
+
+    async def has_ended() -> bool:
+        return contract.address not in await open_cases(validator)
+
+    await until_found(has_ended, what="the end of the validator's case")

@@ -146,5 +146,5 @@ def plugged(place: Place, key: str) -> Any:
 
 def asked(place: Place, key: str, payload: bytes) -> bool:
     """Whether the lamp has answered."""
-    replies = place.session.get(key, payload=payload, timeout=0.3)
+    replies = place.session.get(key, payload=payload, timeout=5.0)
     return any(reply.ok is not None for reply in replies)

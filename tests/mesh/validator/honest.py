@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -32,6 +33,7 @@ from tests.mesh.validator.faults import (
 )
 from tests.mesh.validator.lamps import (
     LEVELS,
+    PATIENT,
     ROBOT,
     SLACK_NS,
     Crashed,
@@ -190,7 +192,7 @@ async def several_devices(place: Place, name: str) -> FinishedJob:
 async def signed_again(place: Place, name: str) -> FinishedJob:
     """A reorganisation took the contract back, and the robot signs and sends its Result again."""
     job = await place.robot(name).work(name, place.order(name))
-    first = job.judge({})
+    first = job.judge({}, PATIENT)
     assert first.success
     return replace(job, message=signed_by(ROBOT, job.liability.address, cid_of_file(job.recording)))
 
@@ -198,7 +200,7 @@ async def signed_again(place: Place, name: str) -> FinishedJob:
 async def killed(place: Place, name: str) -> FinishedJob:
     """`kill -9` of the robot's process in the middle; another one continues the job."""
     objective, since = place.order(name, step_ns=SLOW), time.time_ns()
-    process = await _process(place, name, objective)
+    process = await _process(place, name, objective, until=14)
     assert process.stdout is not None
     for _ in range(14):
         await process.stdout.readline()
@@ -219,8 +221,8 @@ async def killed(place: Place, name: str) -> FinishedJob:
     )
 
 
-async def _process(place: Place, name: str, objective: Path) -> asyncio.subprocess.Process:
-    words = [place.endpoint, str(place.folder / name), name, str(objective)]
+async def _process(place: Place, name: str, objective: Path, *, until: int = 0) -> asyncio.subprocess.Process:
+    words = [place.endpoint, str(place.folder / name), name, str(objective), str(until)]
     return await asyncio.create_subprocess_exec(
         sys.executable, "-m", "tests.mesh.validator.honest", *words, stdout=asyncio.subprocess.PIPE
     )
@@ -263,12 +265,18 @@ KINDS: Final = (
 
 
 def main() -> None:
-    """Do one job in a process of its own: endpoint, folder, name, objective. Prints a line for each command."""
-    endpoint, folder, name, objective = sys.argv[1:]
+    """Do one job in a process of its own: endpoint, folder, name, objective. Prints a line for each command.
+
+    After the command whose number is the last argument it waits to be killed.
+    """
+    endpoint, folder, name, objective, last = sys.argv[1:]
+    numbers = count(1)
 
     async def say(job: Job, message: Played) -> None:
         await shine(job, message)
         print(message.value, flush=True)
+        if next(numbers) == int(last):
+            await asyncio.Event().wait()
 
     with zenoh.open(client_config(endpoint)) as session:
         job = asyncio.run(LampRobot(session, Path(folder)).work(name, Path(objective), say))

@@ -10,7 +10,8 @@ import pytest
 
 from mesh.validator.components import NotAJuror, NotAValidator
 from schemas import Result, verify
-from tests.mesh.validator.courts import PRICE, Court, announcements_of, claim, liar, reports_on
+from tests.mesh.validator.courts import PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
+from tests.support.log_events import logged_facts
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
 
@@ -50,7 +51,7 @@ async def test_two_jurors_of_one_contract_may_both_answer(place: Place) -> None:
         jury = await court.jury(0, 1)
         members = await court.validator(0, jury), await court.validator(1, jury), await court.robot()
         async with court.at_work(*members) as person:
-            assert {one.juror for one in await announcements_of(person, jury)} == {
+            assert {one.juror for one in await announcements_of(person, jury, jurors=2)} == {
                 members[0].address,
                 members[1].address,
             }
@@ -80,6 +81,7 @@ async def test_what_others_sign_counts_for_nothing(place: Place) -> None:
             contract = await court.demand(person, jury)
             ledger = validator.runtime.parts.ledger
             await until_found(lambda: ledger.verdict(contract.address), what="the case")
+            await announcements_of(person, jury)
             for success in (True, False):
                 person.send(Result(liability=contract.address, result=contract.liability.model, success=success))
             await until(lambda: validator.runtime.results.received >= 2)
@@ -107,7 +109,7 @@ async def test_a_juror_that_signs_nonsense_is_outvoted(place: Place) -> None:
             assert outcome.result not in (contract.liability.objective, contract.liability.model)
 
 
-async def test_a_reverted_end_is_repeated(place: Place) -> None:
+async def test_a_reverted_end_is_repeated(place: Place, caplog: pytest.LogCaptureFixture) -> None:
     async with Court(place, 5) as court:
         jury = await court.jury(0)
         validator, robot = await court.validator(0, jury), await court.robot()
@@ -115,9 +117,11 @@ async def test_a_reverted_end_is_repeated(place: Place) -> None:
             before = await place.balance("robot")
             contract = await court.demand(person, jury)
             assert (await contract.outcome()).success
+            await until_ended(validator, contract)
             await place.forget_blocks(1)
+            reopened = {"liability": contract.address}
+            await until(lambda: reopened in logged_facts(caplog, "case-reopened"), what="the reorganisation")
             liabilities = place.chains["person"].liabilities
-            assert not (await liabilities.get(contract.address)).is_finalized
 
             async def is_paid() -> bool:
                 return (await liabilities.get(contract.address)).is_success

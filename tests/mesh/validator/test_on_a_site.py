@@ -17,6 +17,7 @@ from tests.mesh.operations.site import MODEL, QUICK_RESEND, events, has_event
 from tests.mesh.operations.site import Site as Market
 from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.sites import Site
+from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -83,7 +84,7 @@ async def test_a_site_s_jobs_are_judged_also_by_a_validator_that_was_killed(anvi
             first = await person.demand(judged.market.job("one"), cost=500, validator=judged.contract)
             assert (await first.outcome()).success
             assert has_event(validator, "verdict-signed", success="True")
-            assert await first.reports()
+            await until_found(first.reports, what="the report")
             await asyncio.to_thread(validator.kill)
             order = await person.order(judged.market.job("two"), cost=500, validator=judged.contract, validator_fee=0)
             second = await order.contract()

@@ -11,7 +11,7 @@ import pytest
 from mesh.chain import XRT
 from mesh.validator import publishing
 from mesh.validator.publishing import REFRESH, Announcements
-from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on
+from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
 from tests.support.log_events import logged_facts
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
@@ -101,7 +101,7 @@ async def test_a_check_that_never_returns_delays_no_other_case(place: Place, cap
     async with Court(place) as court:
         validator, robot = await court.validator(), await court.robot()
 
-        @validator.check("slow", description="It ends.", timeout=0.2)
+        @validator.check("slow", description="It ends.", timeout=2)
         def slow(evidence: Evidence) -> bool:
             begun.append(evidence.liability.address)
             return len(begun) > 1 or end.wait()
@@ -140,15 +140,17 @@ async def test_a_validator_that_comes_late_judges_what_it_missed(place: Place) -
                 assert (await contract.outcome()).success
 
 
-async def test_a_reverted_verdict_is_sent_again(place: Place) -> None:
+async def test_a_reverted_verdict_is_sent_again(place: Place, caplog: pytest.LogCaptureFixture) -> None:
     async with Court(place) as court:
         validator, robot = await court.validator(), await court.robot()
         async with court.at_work(validator, robot) as person:
             before = await place.balance("robot")
             contract = await court.demand(person, validator.address)
             assert (await contract.outcome()).success
+            await until_ended(validator, contract)
             await place.forget_blocks(1)
-            assert not (await place.chains["person"].liabilities.get(contract.address)).is_finalized
+            reopened = {"liability": contract.address}
+            await until(lambda: reopened in logged_facts(caplog, "case-reopened"), what="the reorganisation")
             await until_found(lambda: _is_paid(place, contract.address), what="a second payment")
             assert await place.balance("robot") == before + PRICE
 

@@ -9,7 +9,7 @@ import zenoh
 
 from tests.mesh.validator.faults import Place
 from tests.mesh.validator.honest import KINDS
-from tests.mesh.validator.lamps import THIEF, LampRobot, order
+from tests.mesh.validator.lamps import LEVELS, PATIENT, THIEF, LampRobot, order
 from tests.mesh.validator.tampered_claims import tampered, tamperings
 from tests.mesh.validator.tampering import Others
 from tests.support.routers import client_config
@@ -38,7 +38,7 @@ async def judge_tampered(endpoint: str, folder: Path) -> list[TamperedVerdict]:
 
     The juror has judged the jobs of the others before, which were honest.
     """
-    objective, easier = order(folder / "objective.mcap"), order(folder / "easier.mcap", (0.0, 0.05, 0.1))
+    objective, easier = order(folder / "objective.mcap"), order(folder / "easier.mcap", LEVELS[:8])
     with zenoh.open(client_config(endpoint)) as session:
         robot, thief = LampRobot(session, folder / "robot"), LampRobot(session, folder / "thief", robot=THIEF)
         job = await robot.work("ours", objective)
@@ -80,4 +80,4 @@ async def judge_honest(endpoint: str, folder: Path, *, of_each: int = 100) -> li
 
         jobs = await asyncio.gather(*(work(one, number) for one in KINDS for number in range(min(one.jobs, of_each))))
     judged: dict[str, str] = {}
-    return [HonestVerdict(kind, job, job.judge(judged)) for kind, job in jobs]
+    return [HonestVerdict(kind, job, job.judge(judged, PATIENT)) for kind, job in jobs]
