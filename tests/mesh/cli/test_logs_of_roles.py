@@ -93,7 +93,13 @@ class JsonMarket:
         assert done.returncode == 0, done.stderr
         found = re.search(r"contract (0x\w{40})", done.stdout)
         assert found
+        wait_until(lambda: self._has_noted_the_end(found[1]), what="the end in the robot's log", seconds=SECONDS)
         return found[1]
+
+    def _has_noted_the_end(self, liability: str) -> bool:
+        """Whether the robot has logged the end, and the failure of its handler that hears of it last."""
+        names = [event.get("event") for event in self.logs("robot", "--liability", liability)]
+        return "job-finalized" in names and names[-1] != "job-finalized"
 
     @property
     def addresses(self) -> dict[str, str]:

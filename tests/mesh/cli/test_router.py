@@ -131,9 +131,9 @@ async def test_a_roster_that_becomes_invalid_changes_nothing(site: Site) -> None
     with Serving(*AIRA, "router", *options(site), says="roster: 1 member admitted") as router:
         async with network(site, arm) as arms, aclosing(arms.changes()) as changes:
             change = asyncio.ensure_future(anext(changes))
-            site.roster.write_text("[[member]]\nname=")
+            put_roster(site, "[[member]]\nname=")
             await until(lambda: "the router keeps its previous roster" in router.log(), seconds=SECONDS)
-            site.roster.write_text(good)
+            put_roster(site, good)
             await until(lambda: "the roster is valid again" in router.log(), seconds=SECONDS)
             assert not change.done()
             change.cancel()
@@ -149,8 +149,13 @@ def network(site: Site, folder: MemberFolder) -> Network:
 
 def revoke(site: Site, name: str) -> None:
     text = site.roster.read_text()
+    put_roster(site, text.replace(f'name = "{name}"', f'name = "{name}"\nrevoked = true'))
+
+
+def put_roster(site: Site, text: str) -> None:
+    """Replace the roster at once: a router that reads it meanwhile sees no half of it."""
     fresh = site.roster.with_suffix(".fresh")
-    fresh.write_text(text.replace(f'name = "{name}"', f'name = "{name}"\nrevoked = true'))
+    fresh.write_text(text)
     fresh.replace(site.roster)
 
 

@@ -12,14 +12,15 @@ from mesh.cli import main
 from mesh.cli.errors import InvalidArgument, UnknownJob, UnknownService
 from mesh.cli.rpc import call_service, request_of
 from mesh.errors import InputError
-from mesh.network import ServiceFailed
+from mesh.network import Endpoints, Network, ServiceFailed
+from schemas import RpcKey
 from schemas.message_requests import SendDemand
 from schemas.rpc import GUARDED, SERVICES, FinishLiability, Nothing, ReadLiability, StartLiability, TransferRequest
 from tests.mesh.cli.served_chain import columns
 from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.orders import LIGHTHOUSE, STRANGER, demand
-from tests.support.waiting import until_found
+from tests.support.waiting import until_answered, until_found
 
 if TYPE_CHECKING:
     from tests.support.market import Place
@@ -112,7 +113,9 @@ def test_the_list_has_every_service_with_its_arguments() -> None:
 
 
 async def ask(place: Place, service: str, *arguments: str, as_json: bool = False) -> None:
-    """Call a service of the robot without an account."""
+    """Call a service of the robot without an account, once it can be called."""
+    async with Network(Endpoints(connect=(place.endpoint,))) as network:
+        await until_answered(network.session, str(RpcKey(place.address("robot"), service)))
     called = place.address("robot"), service, arguments
     await call_service(place.settings("watcher"), called, timeout=10.0, as_json=as_json)
 

@@ -103,7 +103,7 @@ def test_a_job_is_done_and_paid_between_processes(development: Development, tmp_
     )
     with watcher, development.agent(EXAMPLES / "robot.py", says="account 0x") as robot:
         done = development.demand(*order, "--out", out)
-        assert (done.returncode, done.stderr) == (0, "")
+        assert (done.returncode, without_silence(done.stderr)) == (0, [])
         first, checked, posted, *happened, end, kept = done.stdout.splitlines()
         assert first.startswith("demand by 0x")
         assert checked.startswith(f"objective {cid_of_file(EXAMPLES / 'blink.mcap')}: ")
@@ -112,7 +112,7 @@ def test_a_job_is_done_and_paid_between_processes(development: Development, tmp_
         assert end == f"paid, result {cid_of_file(out)}"
         assert kept == f"recording {out}"
         assert robot.log().count("the lamp is on") == 3
-        assert "you would pay 1000 for" in watcher.log()
+        watcher.wait_until_said("you would pay 1000 for")
         again = development.demand(*order, "--json")
         summed = json.loads(again.stdout.splitlines()[-1])
         assert set(summed) == {"liability", "success", "result", "recording"}
@@ -121,6 +121,11 @@ def test_a_job_is_done_and_paid_between_processes(development: Development, tmp_
         assert code == 0
         assert seconds < SOON
         assert "Traceback" not in robot.log()
+
+
+def without_silence(errors: str) -> list[str]:
+    """The lines on stderr, but for the one that says that a busy machine's robot has not offered yet."""
+    return [line for line in errors.splitlines() if not line.startswith("no robot has offered or declined yet; ")]
 
 
 def test_a_killed_robot_continues_its_job_after_a_restart(development: Development, tmp_path: Path) -> None:

@@ -15,8 +15,10 @@ from mesh.cli.errors import NoAnswer
 from mesh.cli.status import describe_status, show_all, show_one, summarize_status
 from mesh.devchain import JsonRpcServer
 from mesh.errors import InvalidAddress
+from mesh.network import Endpoints, Network
 from mesh.settings import Settings
 from mesh.validator.validator import Validator
+from schemas import RpcKey
 from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, ValidationStatus, Work
 from tests.mesh.cli.served_chain import columns
 from tests.mesh.market.local_market import QUICK
@@ -24,7 +26,7 @@ from tests.mesh.watching.test_presence import WAY, bridge_status, status
 from tests.support.market import MODEL, offering, offering_unseen
 from tests.support.objectives import objective
 from tests.support.orders import MARKET, OBJECTIVE, ROBOT, STRANGER
-from tests.support.waiting import until_found
+from tests.support.waiting import until_answered, until_found
 
 if TYPE_CHECKING:
     from tests.support.market import Place
@@ -58,6 +60,8 @@ VALIDATION = ValidationStatus(
 
 async def read_status(place: Place, role: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """The status of a role as `aira status --json` prints it."""
+    async with Network(Endpoints(connect=(place.endpoint,))) as network:
+        await until_answered(network.session, str(RpcKey(place.address(role), "status")))
     await show_one(place.settings("watcher"), place.address(role), timeout=5.0, as_json=True)
     (found,) = json.loads(capsys.readouterr().out)
     assert isinstance(found, dict)
@@ -139,6 +143,12 @@ async def test_a_part_that_waits_for_the_node_says_so(place: Place, capsys: pyte
 async def test_a_provider_reports_its_orders_and_earnings(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.at_work(offering_unseen(place.agent("robot"))) as person:
         await person.demand(place.save(objective(("/go", "x"))), cost=1)
+
+        async def has_created() -> bool:
+            market = (await read_status(place, "provider", capsys))["market"]
+            return bool(market["created"] and not market["openOrders"])
+
+        await until_found(has_created, what="the contract in the provider's count", seconds=60)
         found = await read_status(place, "provider", capsys)
         await show_one(place.settings("watcher"), place.address("provider"), timeout=5.0, as_json=False)
         shown = columns(capsys.readouterr().out)

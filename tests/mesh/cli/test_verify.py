@@ -11,7 +11,7 @@ import pytest
 import zenoh
 from click.testing import CliRunner
 
-from mesh.agent import Agent
+from mesh.agent import Agent, Phase
 from mesh.chain.errors import NodeUnreachable
 from mesh.cli import main
 from mesh.cli.demand import demand
@@ -31,7 +31,7 @@ from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
 from tests.support.routers import client_config, wait_until_declared
-from tests.support.waiting import until
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -168,6 +168,12 @@ def moving(robot: Settings) -> Agent:
     return agent
 
 
+async def has_finalized(robot: Agent, liability: str) -> bool:
+    """Whether a robot knows that its contract has ended, and has nothing to say of it any more."""
+    job = await robot.parts.ledger.job(liability)
+    return job is not None and job.phase is Phase.FINALIZED
+
+
 async def test_a_job_of_the_market_is_verified_from_its_address_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -183,9 +189,10 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
         )
         folder = str(tmp_path / "arbiter")
         nobody = Settings(connect=(endpoint,), fetch_timeout=10.0, web3_http_provider=url, data_dir=folder)
-        async with moving(robot):
+        async with moving(robot) as worker:
             await demand(person, objective=str(path), out=None, as_json=True, **order)
             liability = json.loads(capsys.readouterr().out.splitlines()[-1])["liability"]
+            await until_found(lambda: has_finalized(worker, liability), what="the robot's last word", seconds=60)
             assert await verify_job(nobody, liability, nothing, offline=False, as_json=True)
             said = json.loads(capsys.readouterr().out)
             assert [finding["holds"] for finding in said["findings"]] == [True] * 17

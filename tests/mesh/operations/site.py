@@ -142,8 +142,9 @@ class Site:
 
 
 def events(log: str) -> list[dict[str, Any]]:
-    """The events in a log of JSON lines."""
-    return [json.loads(line) for line in log.splitlines() if line.startswith("{")]
+    """The events in a log of JSON lines, of which the last may be half written."""
+    lines = log[: log.rfind("\n") + 1].splitlines()
+    return [json.loads(line) for line in lines if line.startswith("{")]
 
 
 def has_event(server: Serving, name: str, **facts: str) -> bool:

@@ -32,12 +32,15 @@ async def lasting_node(state: Path) -> AsyncIterator[Anvil]:
         yield node
 
 
-async def written(state: Path, block: int) -> None:
-    """Wait until a block is in the file; a killed node loses later ones."""
+async def written(state: Path, block: int) -> bytes:
+    """Wait until a block is in the file, and return the file's content; a killed node loses later blocks."""
+    content = b""
 
     def holds() -> bool:
+        nonlocal content
         try:
-            return int(json.loads(state.read_bytes())["best_block_number"]) >= block
+            content = state.read_bytes()
+            return int(json.loads(content)["best_block_number"]) >= block
         except (OSError, ValueError):
             return False  # it is being written
 
@@ -45,6 +48,7 @@ async def written(state: Path, block: int) -> None:
         return await asyncio.to_thread(holds)
 
     await until_found(look, what=f"block {block} in {state}", seconds=TIMEOUT)
+    return content
 
 
 def outages(caplog: pytest.LogCaptureFixture) -> int:
@@ -76,9 +80,11 @@ async def test_jobs_from_before_and_after_an_outage_of_the_node_are_done(
             before = await person.parts.chain.tokens.balance(site.address("robot"))
             early = await person.demand(site.job("early"), cost=COST)
             await until(lambda: done, what="the early job under way", seconds=TIMEOUT)
-            await written(state, await person.parts.chain.block_number())
+            content = await written(state, await person.parts.chain.block_number())
 
             await asyncio.to_thread(getattr(node, end))
+            if end == "kill":
+                state.write_bytes(content)  # it may have been killed while it wrote
             await until(lambda: has_event(provider, "chain-outage"), what="the provider's outage", seconds=TIMEOUT)
             await until(lambda: outages(caplog) >= 2, what="the agents' outages", seconds=TIMEOUT)
             may_work.set()

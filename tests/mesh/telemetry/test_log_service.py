@@ -82,6 +82,11 @@ async def test_agent_and_provider_serve_the_events_of_a_liability(place: Place, 
 
         await until_found(is_told, what="the end of the job", seconds=30)
         reply = await logs(place, "robot", liability=contract.address)
+
+        async def is_noted() -> bool:
+            return len((await logs(place, "provider", liability=contract.address)).entries) > 1
+
+        await until_found(is_noted, what="the end in the provider's log", seconds=60)
         provided = await logs(place, "provider", liability=contract.address)
         asked = await logs(place, "person", liability=contract.address)
     words = [entry.message for entry in reply.entries]

@@ -16,6 +16,7 @@ from mesh.telemetry.server import MetricsNotServed
 from mesh.telemetry.serving import Telemetry
 from schemas.status import ALIVE
 from tests.support.scraping import SECONDS, get, health, scraped
+from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -83,7 +84,11 @@ async def test_a_blocked_event_loop_is_unhealthy_and_requests_do_not_wait_for_it
             of_health, of_metrics = [asking.result(SECONDS) for asking in asked]
             assert (of_health.status, of_metrics.status) == (503, 503)
             assert "event loop" in of_health.text
-            assert await health(telemetry.url) == (200, {"channel": ALIVE})
+
+            async def is_well() -> bool:
+                return await health(telemetry.url) == (200, {"channel": ALIVE})
+
+            await until_found(is_well, what="the loop's answer")
 
 
 async def test_an_expected_error_of_a_measurement_is_503(caplog: pytest.LogCaptureFixture) -> None:
