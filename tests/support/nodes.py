@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from tests.support.peers import require
@@ -46,3 +48,21 @@ class Anvil(Server):
     @property
     def _facts(self) -> Path:
         return self.folder / "anvil.json"
+
+
+def written_state(state: Path) -> bytes:
+    """The file of an anvil's state with all blocks of now: what it writes the second time from now."""
+
+    def written_at() -> int:
+        return state.stat().st_mtime_ns if state.exists() else 0
+
+    for _ in range(2):
+        before = written_at()
+        while written_at() == before:
+            time.sleep(0.02)
+    while True:
+        written = state.read_bytes()
+        with suppress(ValueError):  # while it is being written
+            json.loads(written)
+            return written
+        time.sleep(0.02)

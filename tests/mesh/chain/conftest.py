@@ -175,8 +175,10 @@ class Flaky(EmbeddedProvider):
     """An embedded chain behind a wire that can be cut."""
 
     is_lost = False
+    asked = 0
 
     async def make_request(self, method: str, params: Any) -> Any:
+        self.asked += 1
         if self.is_lost:
             raise ConnectionError("the wire is cut")
         return await super().make_request(method, params)

@@ -43,10 +43,15 @@ def unused_address() -> str:
     return Account.from_key(new_private_key()).address
 
 
+async def pending_transactions(node: Node) -> dict[int, Any]:
+    """The node's pending transactions, by nonce."""
+    senders = (await node.request("txpool_content"))["pending"].values()
+    return {int(nonce): sent for by_nonce in senders for nonce, sent in by_nonce.items()}
+
+
 async def pending_hashes(node: Node) -> dict[int, str]:
     """The hashes of the node's pending transactions, by nonce."""
-    senders = (await node.request("txpool_content"))["pending"].values()
-    return {int(nonce): sent["hash"] for by_nonce in senders for nonce, sent in by_nonce.items()}
+    return {nonce: sent["hash"] for nonce, sent in (await pending_transactions(node)).items()}
 
 
 async def until_pending(node: Node, count: int) -> dict[int, str]:
@@ -55,3 +60,15 @@ async def until_pending(node: Node, count: int) -> dict[int, str]:
         while len(found := await pending_hashes(node)) < count:
             await asyncio.sleep(0.01)
     return found
+
+
+async def make_too_cheap(node: Node) -> tuple[str, int]:
+    """Have the next block not take the first pending transaction; its hash, and what it offers.
+
+    Another version of it, which offers more, may come at any time.
+    """
+    await until_pending(node, 1)
+    sent = (await pending_transactions(node))[0]
+    offered = int(sent["maxFeePerGas"], 16)
+    await node.request("anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
+    return sent["hash"], offered

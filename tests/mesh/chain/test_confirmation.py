@@ -11,7 +11,7 @@ import pytest
 from mesh.chain import GWEI, Account, FeePolicy, Node, NodeUnreachable, TransactionSender, TransactionTimeout
 from mesh.chain.transports import HttpTransport
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.chain.senders import SHORT, anvil, open_sender, until_pending, unused_address
+from tests.mesh.chain.senders import SHORT, anvil, make_too_cheap, open_sender, until_pending, unused_address
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,10 +25,7 @@ async def test_a_stuck_transaction_is_replaced_with_higher_fees_and_takes_effect
     async with open_sender(anvil, replace(QUICK, replace_after=0.1)) as (node, sender):
         friend = unused_address()
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
-        first = (await until_pending(node, 1))[0]
-        offered = int((await node.request("eth_getTransactionByHash", first))["maxFeePerGas"], 16)
-        # No block takes the first any more.
-        await node.request("anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
+        first, offered = await make_too_cheap(node)
         async with asyncio.timeout(60):
             while not sending.done():
                 await node.request("evm_mine")
@@ -41,16 +38,18 @@ async def test_a_stuck_transaction_is_replaced_with_higher_fees_and_takes_effect
 
 
 class _Swallowing(HttpTransport):
-    """A node that takes transactions, and from some moment on only says so."""
-
-    swallows = False
+    """A node that takes one transaction, and of others only says so."""
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
+        self.taken = False
         self.swallowed: list[str] = []
 
     async def make_request(self, method: str, params: Any) -> Any:
-        if method == "eth_sendRawTransaction" and self.swallows:
+        if method == "eth_sendRawTransaction":
+            taken, self.taken = self.taken, True
+            if not taken:
+                return await super().make_request(method, params)
             self.swallowed.append(params[0])
             return {"jsonrpc": "2.0", "id": 1, "result": "0x" + "00" * 32}
         return await super().make_request(method, params)
@@ -63,7 +62,6 @@ async def test_the_replaced_version_may_be_the_one_that_is_mined(anvil: Anvil) -
             TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
         )
         first = (await until_pending(node, 1))[0]
-        wire.swallows = True
         async with asyncio.timeout(60):
             while not wire.swallowed:
                 await asyncio.sleep(0.01)
@@ -138,10 +136,10 @@ async def test_a_confirmed_transaction_that_a_reorganisation_left_in_the_pool_is
         sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
         before = await node.request("evm_snapshot")
         sending = asyncio.create_task(sender.send(to=friends[0], data=b"", value=5))
-        first = (await until_pending(node, 1))[0]
+        await until_pending(node, 1)
         await node.request("evm_mine")
-        await sending
-        offered = int((await node.request("eth_getTransactionByHash", first))["maxFeePerGas"], 16)
+        mined = (await sending).tx
+        offered = int((await node.request("eth_getTransactionByHash", mined))["maxFeePerGas"], 16)
         await node.request("evm_revert", before)
         await node.request("eth_sendRawTransaction", wire.sent[0])
         sending = asyncio.create_task(sender.send(to=friends[1], data=b"", value=7))
@@ -176,7 +174,7 @@ async def test_a_node_that_is_still_indexing_is_asked_for_the_receipt_again(anvi
         await node.request("evm_setAutomine", True)
         await TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
         assert await node.eth_balance(friend) == 5
-        assert wire.asked == 5
+        assert wire.asked >= 5
     await wire.close()
 
 
@@ -219,5 +217,6 @@ async def test_sending_again_after_a_timeout_continues_the_first_transaction(anv
         with pytest.raises(TransactionTimeout) as caught:
             await sender.send(to=friend, data=b"", value=5)
         await node.request("evm_mine")
+        node.timing = QUICK
         assert (await sender.send(to=friend, data=b"", value=5)).tx == caught.value.tx
         assert await node.eth_balance(friend) == 5

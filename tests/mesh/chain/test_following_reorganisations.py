@@ -26,7 +26,7 @@ from mesh.devchain import EmbeddedChain
 from mesh.errors import ConfigurationError, InputError
 from tests.mesh.chain.conftest import QUICK
 from tests.support.log_events import logged_events
-from tests.support.nodes import Anvil
+from tests.support.nodes import Anvil, written_state
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -253,14 +253,11 @@ async def test_events_that_a_killed_node_lost_are_reverted(tmp_path: Path, caplo
             kept = await fork.approve(1)
             async with aclosing(chain.follow(kept, history=history)) as events:
                 await _until(events, _reaches(kept))
-                # The file is written once a second: two writings later it holds the block.
-                for _ in range(2):
-                    written = state.stat().st_mtime_ns if state.exists() else 0
-                    while not state.exists() or state.stat().st_mtime_ns == written:
-                        await asyncio.sleep(0.02)
+                written = await asyncio.to_thread(written_state, state)
                 lost = await fork.approve(2)
                 await _until(events, _reaches(lost))
                 await asyncio.to_thread(anvil.kill)
+                state.write_bytes(written)  # it may have been quick enough to write the block as well
                 following = asyncio.create_task(_until(events, _reaches(lost)))
                 await until(lambda: "chain-outage" in logged_events(caplog))
                 await asyncio.to_thread(anvil.start)

@@ -13,6 +13,7 @@ from mesh.devchain import EmbeddedChain
 from mesh.errors import InvalidMessage
 from schemas import cancellation_hash, message_hash
 from tests.mesh.chain.conftest import QUICK, Flaky, cid, prepare, raises_with, reverted
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from schemas import Demand, Offer
@@ -188,13 +189,14 @@ async def test_watching_waits_for_confirmations(market: DeployedMarket) -> None:
 
 
 async def test_watching_survives_an_outage() -> None:
-    async with EmbeddedChain() as node, asyncio.timeout(30):
+    async with EmbeddedChain() as node, asyncio.timeout(60):
         market = await prepare(node.provider, node.funded_keys)
         liability = await _made(market)
         flaky = Flaky(node)
         async with market.chain(market.provider) as chain, Chain(flaky, timing=QUICK) as reader:
+            asked = flaky.asked
             watching = asyncio.create_task(reader.liabilities.watch(liability))
-            await asyncio.sleep(5 * QUICK.poll_interval)
+            await until(lambda: flaky.asked > asked + 10, what="it looks again and again")
             flaky.is_lost = True
             await chain.liabilities.finalize("airalab", market.result(liability))
             await asyncio.sleep(5 * QUICK.poll_interval)

@@ -13,7 +13,7 @@ from mesh.chain.metrics import TransactionOutcome
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.embedded import EmbeddedProvider
 from tests.mesh.chain.conftest import QUICK, reverted
-from tests.mesh.chain.senders import anvil, open_sender, until_pending, unused_address
+from tests.mesh.chain.senders import anvil, make_too_cheap, open_sender, unused_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -83,10 +83,8 @@ async def test_an_outage_counts_once_and_each_failed_request(node: EmbeddedChain
 async def test_a_stuck_transaction_is_replaced_and_mined_once(anvil: Anvil) -> None:
     async with open_sender(anvil, replace(QUICK, replace_after=0.1)) as (way, sender):
         sending = asyncio.create_task(sender.send(to=unused_address(), data=b"", value=5))
-        first = (await until_pending(way, 1))[0]
-        offered = int((await way.request("eth_getTransactionByHash", first))["maxFeePerGas"], 16)
-        await way.request("anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
-        async with asyncio.timeout(30):
+        await make_too_cheap(way)
+        async with asyncio.timeout(60):
             while not sending.done():
                 await way.request("evm_mine")
                 await asyncio.sleep(0.05)

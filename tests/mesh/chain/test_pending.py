@@ -33,6 +33,7 @@ async def test_a_transaction_that_was_mined_long_ago_is_sent_as_a_new_one(anvil:
             await sender.send(to=friend, data=b"", value=5)
         await node.request("evm_mine")
         await node.request("evm_setAutomine", True)
+        node.timing = replace(QUICK, repeat_within=0)
         await sender.send(to=friend, data=b"", value=5)
         assert await node.eth_balance(friend) == 10
 

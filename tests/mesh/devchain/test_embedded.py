@@ -130,7 +130,7 @@ async def test_blocks_are_mined_on_demand(node: EmbeddedChain) -> None:
 async def test_blocks_are_mined_with_a_block_time() -> None:
     async with EmbeddedChain(block_time=0.01) as node:
         web3 = web3_of(node)
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while await web3.eth.block_number < 3:
                 await asyncio.sleep(0.01)
 

@@ -25,7 +25,7 @@ from tests.mesh.identity.players import (
     WHO,
 )
 from tests.support.sites import Site
-from tests.support.waiting import until
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -115,22 +115,19 @@ async def heard_by_witness(stage: Stage, kind: zenoh.SampleKind, expected: dict[
 
     for selector in ALL_TOKENS:
         stage.keep(stage.witness.declare_subscriber(selector, hear))
-    await until(lambda: all(known(stage, who) for who in WHO if expected[who]), seconds=SECONDS)
-    for who in WHO:
-        for key in KEYS[who].values():
-            if kind == zenoh.SampleKind.PUT:
-                stage.sessions[who].put(key, b"", attachment=who, congestion_control=zenoh.CongestionControl.BLOCK)
-            else:
-                stage.sessions[who].delete(key, attachment=who, congestion_control=zenoh.CongestionControl.BLOCK)
-    await until(lambda: all(expected[who] <= named(who, heard[who]) for who in WHO), seconds=SECONDS)
+
+    def all_heard() -> bool:
+        for who in WHO:
+            for key in KEYS[who].values():
+                if kind == zenoh.SampleKind.PUT:
+                    stage.sessions[who].put(key, b"", attachment=who, congestion_control=zenoh.CongestionControl.BLOCK)
+                else:
+                    stage.sessions[who].delete(key, attachment=who, congestion_control=zenoh.CongestionControl.BLOCK)
+        return all(expected[who] <= named(who, heard[who]) for who in WHO)
+
+    await until(all_heard, seconds=SECONDS, pause=0.1)
     stage.are_past()
     return {who: named(who, heard[who]) for who in WHO}
-
-
-def known(stage: Stage, who: str) -> bool:
-    """Whether an identity that may publish sees the witness's subscriber."""
-    with stage.sessions[who].declare_publisher(next(iter(KEYS[who].values()))) as publisher:
-        return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(("kind", "expected"), [(zenoh.SampleKind.PUT, PUT), (zenoh.SampleKind.DELETE, DELETE)])
@@ -213,10 +210,13 @@ async def test_each_member_receives_what_it_may_read(stage: Stage) -> None:
 
             stage.keep(stage.sessions[who].declare_subscriber(key, hear))
     stage.are_past()
-    for key in {key for who in WHO for key in KEYS[who].values()}:
-        stage.witness.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
 
-    await until(lambda: all(SUBSCRIBE[who] <= named(who, heard[who]) for who in WHO), seconds=SECONDS)
+    def all_heard() -> bool:
+        for key in {key for who in WHO for key in KEYS[who].values()}:
+            stage.witness.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+        return all(SUBSCRIBE[who] <= named(who, heard[who]) for who in WHO)
+
+    await until(all_heard, seconds=SECONDS, pause=0.1)
     stage.are_past()
     assert {who: named(who, heard[who]) for who in WHO} == SUBSCRIBE
 
@@ -253,7 +253,7 @@ async def test_a_wildcard_write_reaches_only_permitted_keys(stage: Stage) -> Non
     published, answered = set[str](), set[str]()
     for selector in ALL_TOKENS:
         stage.keep(stage.witness.declare_subscriber(selector, lambda sample: published.add(str(sample.key_expr))))
-    await until(lambda: known(stage, "arm"), seconds=SECONDS)
+    await until_heard(stage.sessions["arm"], KEYS["arm"]["demand"])
     for who in WHO:
         for key in WILD:
 
@@ -284,12 +284,14 @@ async def test_a_wildcard_read_reaches_only_permitted_keys(stage: Stage) -> None
 
             stage.keep(stage.sessions[who].declare_subscriber(key, hear))
     stage.are_past()
-    for who, selectors in ask_all(
-        {who: [("", key) for key in WILD] for who in WHO}, stage.sessions, seconds=REFUSED
-    ).items():
-        answered.update({who} if selectors else ())
-    stage.witness.put(OTHERS_KEY, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+    questions = {who: [("", key) for key in WILD] for who in WHO}
 
-    await until(lambda: heard >= {"boss", "screen"}, seconds=SECONDS)
+    def all_tried() -> bool:
+        for who, selectors in ask_all(questions, stage.sessions, seconds=REFUSED).items():
+            answered.update({who} if selectors else ())
+        stage.witness.put(OTHERS_KEY, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+        return "boss" in answered and heard >= {"boss", "screen"}
+
+    await until(all_tried, seconds=SECONDS, pause=0.1)
     stage.are_past()
     assert (heard, answered) == ({"boss", "screen"}, {"boss"})

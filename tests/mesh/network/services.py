@@ -26,7 +26,7 @@ REQUEST = StartLiability(LIGHTHOUSE)
 @asynccontextmanager
 async def offering(there: zenoh.Session, here: zenoh.Session, **handlers: Any) -> AsyncIterator[Services]:
     """Services of the agent `there`, already visible `here`."""
-    async with asyncio.timeout(20), Services(there, ADDRESS) as services:
+    async with asyncio.timeout(60), Services(there, ADDRESS) as services:
         for name, handler in handlers.items():
             services.offer(name.replace("__", "/"), handler)
             await until_answered(here, str(RpcKey(ADDRESS, name.replace("__", "/"))))

@@ -77,8 +77,9 @@ async def test_each_session_has_its_own_quiet(here: zenoh.Session, there: zenoh.
     sending.put(here, KEY, b"")
     await until(lambda: len(heard) == 2)
     there_heard: list[bool] = []
-    other: Any = there.declare_subscriber(KEY, lambda sample: there_heard.append(sample.express))
-    sending.put(there, KEY, b"")
+    # On a key of its own: what was put here may still be under way.
+    other: Any = there.declare_subscriber(f"{KEY}/there", lambda sample: there_heard.append(sample.express))
+    sending.put(there, f"{KEY}/there", b"")
     await until(lambda: there_heard)
     assert (heard[:2], there_heard[0]) == ([True, False], True)
     other.undeclare()

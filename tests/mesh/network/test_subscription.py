@@ -11,7 +11,7 @@ import pytest
 
 from mesh.errors import RemoteError
 from mesh.flood import Drops
-from mesh.network import ValidationStatistics, message_key
+from mesh.network import ValidationStatistics, channel, message_key
 from mesh.network.channel import LOOKUP_LIMIT, RECALL_LIMIT
 from schemas import Demand, SignedMessage, encode, message_hash
 from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
@@ -25,6 +25,12 @@ if TYPE_CHECKING:
 
 
 NAME = "token.robonomics.eth"
+
+
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may take long for the thousands of replies of a test."""
+    monkeypatch.setattr(channel, "RECALL_TIMEOUT", 60.0)
 
 
 def with_name(message: Demand, name: str = NAME) -> bytes:
@@ -134,7 +140,7 @@ async def test_recall_does_not_wait_for_a_consumer(here: zenoh.Session, there: z
     async with listening(here, there) as (demands, _), answering(there, *many):
         await until_answered(here, demands.selector)
 
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             await demands.recall()
 
         assert {one.hash for one in await take(demands, len(many))} == {message_hash(message) for message in many}

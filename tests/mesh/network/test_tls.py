@@ -189,9 +189,9 @@ async def heard(listener: zenoh.Session, speaker: zenoh.Session, key: str) -> No
 async def test_a_session_outlives_its_certificate_when_that_was_renewed(site: Site, kind: str) -> None:
     site.roster.write_text(site.roster.read_text() + f'[[member]]\nname="arm"\naddress="{ARM}"\nroles=["agent"]\n')
     seconds = 8.0
-    arm = site.certify("arm", ARM, "agent", days=seconds / 86_400)
     key = f"aira/agent/{ARM}/device/arm/state"
     with site.open_router(kind):
+        arm = site.certify("arm", ARM, "agent", days=seconds / 86_400)  # it runs from now
         async with Network(site.client(arm)) as network:
             session = network.session
             got: list[str] = []

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 QUICK = 0.5
+PATIENT = 60.0
 WAY = DirectionStatus(
     received=0,
     invalid={},
@@ -145,7 +146,7 @@ async def test_an_address_reports_the_status_of_each_role(meeting: Meeting) -> N
             return len(await status_of(meeting.session, ROBOT.address, MARKET)) == len(both)
 
         await until_found(all_answered, what="both answers", seconds=30)
-        found = await status_of(meeting.session, ROBOT.address.lower(), MARKET)
+        found = await status_of(meeting.session, ROBOT.address.lower(), MARKET, timeout=PATIENT)
         assert sorted(found, key=str) == sorted(both, key=str)
 
 
@@ -153,9 +154,9 @@ async def test_a_bridge_reports_its_status(meeting: Meeting) -> None:
     key = bridge_status_key(STRANGER.address, MARKET)
     with answering(meeting.writer.session, key, bridge_status().encode()):
         await until_answered(meeting.session, key)
-        assert await status_of(meeting.session, STRANGER.address, MARKET) == [bridge_status()]
+        assert await status_of(meeting.session, STRANGER.address, MARKET, timeout=PATIENT) == [bridge_status()]
         peer = PresentPeer("bridge", STRANGER.address)
-        assert await statuses(meeting.session, meeting.seen, [peer]) == {peer: bridge_status()}
+        assert await statuses(meeting.session, meeting.seen, [peer], timeout=PATIENT) == {peer: bridge_status()}
 
 
 async def test_no_reply_is_no_status(meeting: Meeting) -> None:
