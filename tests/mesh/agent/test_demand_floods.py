@@ -78,7 +78,7 @@ async def test_an_honest_demand_is_offered_during_a_flood_of_dead_objectives(pla
 
 
 async def test_the_same_dead_objective_takes_one_fetch(place: Place) -> None:
-    robot = offering(place.agent("robot", fetch_timeout=1.0))
+    robot = offering(place.agent("robot", fetch_timeout=5.0))
     missing = cid_of_bytes(b"nobody has this one")
     async with place.at_work(robot) as person, stranger(place) as channel:
         for _ in range(100):

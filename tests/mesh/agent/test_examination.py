@@ -101,8 +101,7 @@ async def test_demands_with_unavailable_objectives_do_not_delay_others(place: Pl
 
 
 async def test_an_objective_may_be_examined_by_hand(place: Place) -> None:
-    robot = going(place.agent("robot", fetch_timeout=0.2))
-    async with robot, place.agent("person") as person:
+    async with going(place.agent("robot", fetch_timeout=60.0)) as robot, place.agent("person") as person:
         fit, unfit = (place.save(objective((topic, Empty())), f"{topic[1:]}.mcap") for topic in ("/go", "/fly"))
         for path in (fit, unfit):
             await asyncio.to_thread(person.parts.store.put_file, path)
@@ -110,5 +109,6 @@ async def test_an_objective_may_be_examined_by_hand(place: Place) -> None:
         with pytest.raises(ObjectiveUnfit) as caught:
             await robot.examine(cid_of_file(unfit))
         assert caught.value.reason == "unknown-topic"
+    async with going(place.agent("robot", fetch_timeout=0.2)) as robot:
         with pytest.raises(ContentUnavailable):
             await robot.examine(MISSING)

@@ -10,6 +10,7 @@ import pytest
 from mesh.agent import Phase
 from mesh.agent.components import ChainHead
 from mesh.chain import DeploymentPlan
+from mesh.chain.liabilities import Liabilities
 from mesh.devchain.development import deploy_market
 from mesh.devchain.embedded import EmbeddedChain
 from tests.mesh.work.restarts import COST, made_by_a_provider_that_leaves, speaking, words
@@ -42,10 +43,9 @@ async def test_a_robot_brings_its_own_result_before_the_refund_if_no_provider_do
 ) -> None:
     before = await place.balance("robot")
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), []) as robot:
-        contract = await made_by_a_provider_that_leaves(place, person)
+        contract = await made_by_a_provider_that_leaves(place, person, robot)
         await in_phase(robot, contract, Phase.COMPLETE)
-        await place.node.mine(1)  # the result is seen with the next block
-        await until_found(lambda: _has_read(robot, place), what="the next block read")
+        await _deadline_known(robot, place)
         liabilities = place.chains["person"].liabilities
         refundable = await liabilities.refundable_from(contract.address)
         head = await place.chains["person"].block_number()
@@ -73,6 +73,26 @@ async def test_a_robot_that_begins_after_a_newer_block_than_it_opened_at_waits_f
         await head.reached(head.head)
 
 
+async def _deadline_known(robot: Agent, place: Place) -> None:
+    """Mine until the robot has asked the chain when its result is late: some blocks after it has seen the result."""
+    asked: list[str] = []
+    refundable_from = Liabilities.refundable_from
+
+    async def noted(liabilities: Liabilities, liability: str) -> int:
+        block = await refundable_from(liabilities, liability)
+        asked.append(liability)
+        return block
+
+    async def is_known() -> bool:
+        await place.node.mine(1)
+        await until_found(lambda: _has_read(robot, place), what="the next block read")
+        return bool(asked)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Liabilities, "refundable_from", noted)
+        await until_found(is_known, what="the block at which the result is late")
+
+
 async def _has_read(robot: Agent, place: Place) -> bool:
     return robot.parts.chain_head.head == await place.chains["person"].block_number()
 
@@ -85,8 +105,7 @@ async def test_the_parties_of_a_silent_validator_are_told_and_the_cost_is_refund
             silent = place.address("provider")
             contract = await person.demand(words(place), cost=COST, validator=silent, validator_fee=0)
         await in_phase(robot, contract, Phase.COMPLETE)
-        await place.node.mine(1)
-        await until_found(lambda: _has_read(robot, place), what="the next block read")
+        await _deadline_known(robot, place)
         refundable = await place.chains["person"].liabilities.refundable_from(contract.address)
         await place.node.mine(refundable - await place.chains["person"].block_number() - 2)
         await until(lambda: [one["code"] for one in logged_facts(caplog, "verdict-late")] == ["NotTheValidator"])

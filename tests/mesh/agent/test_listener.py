@@ -15,6 +15,7 @@ from schemas import message_hash
 from tests.mesh.agent.listeners import RecordingListener, contract, finalize, ledger, listening, opened, started
 from tests.support.log_events import logged_events
 from tests.support.orders import RECORDING
+from tests.support.ports import free_port
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -125,8 +126,8 @@ async def test_an_outage_of_the_node_is_survived_and_logged_once(
     place: Place, ledger: Ledger, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "mesh.agent")
-    async with JsonRpcServer(place.node.provider) as server:
-        port = int(server.url.rpartition(":")[2])
+    port = free_port()
+    async with JsonRpcServer(place.node.provider, port=port) as server:
         chain = Chain(server.url, ens=place.market.deployment.ens, timing=QUICK_TO_GIVE_UP)
         async with chain, listening(place, ledger, chain=chain) as listener:
             await started(ledger)

@@ -15,6 +15,7 @@ from schemas.keys import market_key
 from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.rpc import Approve
 from tests.mesh.agent.conftest import Asker, asking
+from tests.mesh.agent.trades import all_posted
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until_found, until_heard
@@ -118,7 +119,7 @@ async def test_a_result_that_the_agent_signed_ends_the_contract_and_is_sent_unti
         async with place.provider():
             contract = await person.demand(place.save(objective(("/say", "x"))))
         await asker.ask("sign/result", SignResult(liability=contract.address, result=RECORDING, success=False))
-        assert len(await waiting(robot)) == 1, "there was no provider to hear it"
+        await until_found(lambda: all_posted(robot, 1), what="only the result: there was no provider to hear it")
         async with place.provider():
             outcome = await contract.outcome()
         assert (outcome.success, outcome.result) == (False, RECORDING)

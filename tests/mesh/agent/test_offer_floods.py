@@ -60,11 +60,11 @@ async def test_three_thousand_offers_are_not_sent_at_once_after_a_restart(place:
         offers = [outgoing(orders.offer(signer=signer, **terms)) for _ in range(3000)]
         await asyncio.gather(*map(robot.parts.ledger.post, offers))
     heard: list[float] = []
+    began = time.monotonic()
     async with Network(Endpoints(connect=(place.endpoint,))) as network, place.agent("robot") as robot:
         selector = market_selector(place.market.deployment.lighthouse_name, "offer")
         network.session.declare_subscriber(selector, lambda _sample: heard.append(time.monotonic()))
         await until(lambda: len(heard) >= RESEND_RATE.burst)
-        began = heard[0]
         await asyncio.sleep(3)
         allowed = RESEND_RATE.burst + RESEND_RATE.per_second * (heard[-1] - began + 1)
         assert len(heard) <= allowed

@@ -13,7 +13,7 @@ from tests.mesh.agent.trades import job, working
 from tests.support.log_events import logged_facts
 from tests.support.market import Place, offering
 from tests.support.objectives import objective
-from tests.support.waiting import until
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     import pytest
@@ -29,10 +29,21 @@ def kinds(heard: list[Progress]) -> list[str]:
 
 async def test_a_person_sees_a_job_from_the_offer_to_the_payment(place: Place) -> None:
     heard: list[Progress] = []
-    robot = working(place.agent("robot"))
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(objective(*[("/go", "on")] * 5)), on_progress=heard.append)
-        outcome = await contract.outcome(on_progress=heard.append)
+    robot, watched = offering(place.agent("robot")), asyncio.Event()
+
+    @robot.on("/go")
+    async def go(job: Job, message: Any) -> None:
+        await watched.wait()
+
+    async with robot, place.agent("person") as person:
+        async with place.provider():
+            contract = await person.demand(place.save(objective(*[("/go", "on")] * 5)), on_progress=heard.append)
+        ending = asyncio.create_task(contract.outcome(on_progress=heard.append))
+        await until_heard(robot.parts.network.session, str(ProgressKey(robot.address, contract.address)))
+        watched.set()
+        await until(lambda: "result" in kinds(heard))
+        async with place.provider():
+            outcome = await ending
         assert [kind for kind in kinds(heard) if kind != "offer"] == ["contract", "ready", "playing", "result", "paid"]
         assert {progress.agent for progress in heard} == {robot.address}
         said = {progress.kind: progress for progress in heard}
@@ -43,15 +54,22 @@ async def test_a_person_sees_a_job_from_the_offer_to_the_payment(place: Place) -
 
 async def test_a_person_sees_why_a_job_failed(place: Place) -> None:
     heard: list[Progress] = []
-    robot = offering(place.agent("robot"))
+    robot, watched = offering(place.agent("robot")), asyncio.Event()
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
+        await watched.wait()
         raise JobFailed("the lamp is broken")
 
-    async with place.at_work(robot) as person:
-        contract = await person.demand(job(place))
-        await contract.outcome(on_progress=heard.append)
+    async with robot, place.agent("person") as person:
+        async with place.provider():
+            contract = await person.demand(job(place))
+        ending = asyncio.create_task(contract.outcome(on_progress=heard.append))
+        await until_heard(robot.parts.network.session, str(ProgressKey(robot.address, contract.address)))
+        watched.set()
+        await until(lambda: "result" in kinds(heard))
+        async with place.provider():
+            await ending
         said = {progress.kind: progress for progress in heard}
         assert said["result"].code == "failed"
         assert (said["refunded"].code, said["refunded"].detail) == ("job-failed", "the lamp is broken")

@@ -70,7 +70,7 @@ async def test_a_job_may_be_finished_before_it_was_started(place: Place, control
 
 async def test_a_playback_in_progress_is_ended_by_finish(place: Place) -> None:
     robot = offering(place.agent("robot", playback="recorded"))
-    async with controlled(place, robot) as control, place.agent("person") as person, asyncio.timeout(20):
+    async with controlled(place, robot) as control, place.agent("person") as person, asyncio.timeout(60):
         contract = await ready(control, person, place, step_ns=HOUR_NS)
         await control.start(contract.address)
         await control.position(contract.address, 1)
@@ -182,14 +182,18 @@ async def test_a_device_receives_the_objective_and_answers_within_the_job(
     contract = await ready(control, person, place)
     said = str(LiabilityTopicKey(control.robot.address, contract.address, "/echo"))
 
+    answered: list[str] = []
+
     def echo(sample: zenoh.Sample) -> None:
         control.session.put(said, sample.payload.to_bytes(), encoding=sample.encoding)
+        answered.append(said)
 
     heard = str(ObjectiveTopicKey(control.robot.address, contract.address, "/say"))
     subscriber: Any = control.session.declare_subscriber(heard, echo)
     await until_heard(control.robot.parts.network.session, heard)
     await control.start(contract.address)
     await control.played(contract.address)
+    await until(lambda: len(answered) == len(WORDS), what="the device's answers")
     await control.say(contract.address, "/end", "x")
     await control.finish(contract.address)
     subscriber.undeclare()

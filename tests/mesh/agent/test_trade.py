@@ -228,7 +228,7 @@ async def test_the_lighthouse_fee_of_an_offer_is_paid_and_then_promised_no_more(
         await contract.outcome()
         assert contract.liability.lighthouse_fee == 77
         await until(lambda: not robot.orders())
-        assert provider.earnings().fees == 77
+        await until(lambda: provider.earnings().fees == 77, what="the fee")
     assert await place.balance("robot") == before + 100 - 77
 
 

@@ -17,7 +17,7 @@ from schemas.signing import Rejection
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
 from tests.support.log_events import logged_facts
 from tests.support.market import MODEL, Place
-from tests.support.waiting import until, until_found
+from tests.support.waiting import until, until_found, until_heard
 
 
 async def test_a_demand_without_a_match_expires_at_its_deadline(place: Place) -> None:
@@ -46,6 +46,7 @@ async def test_a_rejection_is_information_and_the_order_stays_valid(
         await posted(person)
         (order,) = person.orders()
         key = str(RejectKey(person.channel.lighthouse, place.address("person")))
+        await until_heard(network.session, key)
         for _ in range(2):
             network.session.put(key, rejection(place, "provider", order.hash).encode())
         await until(lambda: heard)
@@ -113,6 +114,7 @@ async def test_a_rejection_is_believed_of_the_lighthouses_providers_only(
         await posted(person)
         (identity,) = (order.hash for order in person.orders())
         key = str(RejectKey(person.channel.lighthouse, place.address("person")))
+        await until_heard(stranger.session, key)
         stranger.session.put(key, b"no rejection at all")
         for untrue in untrue_rejections(place, identity):
             stranger.session.put(key, untrue.encode())
@@ -148,9 +150,10 @@ async def test_a_rejection_of_an_order_that_became_a_contract_is_ignored(place: 
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
         (identity,) = (order.hash for order in person.orders())
+        key = str(RejectKey(person.channel.lighthouse, place.address("person")))
+        await until_heard(network.session, key)
         async with place.provider() as provider:
             await until(lambda: provider.earnings().created == 1)
-            key = str(RejectKey(person.channel.lighthouse, place.address("person")))
             network.session.put(key, rejection(place, "provider", identity, reason="WrongSigner").encode())
             contract = await demand
         demand_hash, _ = await chain.liabilities.order_hashes(contract.address)
@@ -166,6 +169,7 @@ async def test_an_order_is_sent_again_to_a_provider_whose_book_was_full(
         await posted(person)
         (identity,) = (order.hash for order in person.orders())
         key = str(RejectKey(person.channel.lighthouse, place.address("person")))
+        await until_heard(network.session, key)
         network.session.put(key, rejection(place, "provider", identity, reason="full").encode())
         await until(lambda: logged_facts(caplog, "order-deferred"))
         assert await waiting(person) == ["demand"]
@@ -175,7 +179,7 @@ async def test_an_order_is_sent_again_to_a_provider_whose_book_was_full(
 
 async def test_orders_of_a_reverted_contract_are_sent_again(place: Place) -> None:
     """The provider that created it is gone, and another one does not know the orders."""
-    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+    async with working(place.agent("robot", fetch_timeout=60.0)) as robot, place.agent("person") as person:
         async with place.provider():
             contract = await person.demand(cid_of_bytes(b"a job that nobody can begin"))
             await known(robot, contract.address)
@@ -189,7 +193,7 @@ async def test_orders_of_a_reverted_contract_are_sent_again(place: Place) -> Non
 
 
 async def test_a_reverted_contract_that_is_not_created_again_fails_at_its_deadline(place: Place) -> None:
-    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+    async with working(place.agent("robot", fetch_timeout=60.0)) as robot, place.agent("person") as person:
         async with place.provider():
             contract = await person.demand(cid_of_bytes(b"a job that is made once"), lifetime=50)
             await known(robot, contract.address)
@@ -211,7 +215,7 @@ async def test_a_reverted_contract_that_is_not_created_again_fails_at_its_deadli
 
 
 async def test_a_contract_that_is_created_again_does_not_fail_at_the_deadline(place: Place) -> None:
-    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+    async with working(place.agent("robot", fetch_timeout=60.0)) as robot, place.agent("person") as person:
         async with place.provider():
             contract = await person.demand(cid_of_bytes(b"a job that is made twice"), lifetime=50)
             await known(robot, contract.address)

@@ -21,7 +21,7 @@ from mesh import (
     ValidatorSilent,
     Verified,
 )
-from mesh.agent import Phase, reports
+from mesh.agent import Phase, reports, validators
 from mesh.agent.validators import OLDEST
 from mesh.chain import UnsafeValidator, ValidatorWithoutCode
 from schemas import Demand, ReportKey, Result, Signer, decode
@@ -37,6 +37,13 @@ if TYPE_CHECKING:
     from mesh import Agent, Contract
 
 STRANGER = Signer(b"\x07" * 32)
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jurors have long to answer: a busy machine must not make them silent."""
+    monkeypatch.setattr(reports, "ASK_TIMEOUT", 60.0)
+    monkeypatch.setattr(validators, "ANSWER_TIMEOUT", 60.0)
 
 
 def juror_of(place: Place, **fields: Any) -> Juror:
@@ -104,6 +111,7 @@ async def test_a_refusal_gives_its_reason_to_both(place: Place, caplog: pytest.L
         ending = asyncio.create_task(contract.outcome(on_progress=heard.append))
         report = await judge(place, juror, robot, contract, success=False)
         outcome = await ending
+        await until(lambda: len(logged_facts(caplog, "result-judged")) == 2, what="the report at both")
     assert (outcome.success, outcome.code, outcome.reports) == (False, MISSING.code, (report,))
     assert MISSING.detail in outcome.reason
     judged = next(one for one in heard if one.kind == "judged")
@@ -286,6 +294,7 @@ async def test_jurors_that_disagree_are_shown_to_both(place: Place, monkeypatch:
         assert contract.liability.validator_fee == 100
         ending = asyncio.create_task(contract.outcome(on_progress=heard.append))
         result = await signed_result(robot, contract)
+        await until(lambda: any(one.kind == "unjudged" for one in heard), what="the person's knowledge of the result")
         first.judge(contract, result.result, success=True)
         await until(lambda: [one.position for one in heard if one.kind == "unjudged"][-1:] == [1])
         second.judge(contract, result.result, success=False)

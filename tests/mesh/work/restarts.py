@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from schemas import ZERO_ADDRESS
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ async def paid(place: Place) -> Paying:
     return Paying(place, await place.balance("robot"))
 
 
-async def made_by_a_provider_that_leaves(place: Place, person: Agent) -> Contract:
-    """A contract whose provider is gone when its result is sent."""
-    async with place.provider():
+async def made_by_a_provider_that_leaves(place: Place, person: Agent, robot: Agent) -> Contract:
+    """A contract whose provider is gone when its result is sent: the robot does no job before."""
+    async with robot.runtime.executor.halted(ZERO_ADDRESS), place.provider():
         return await person.demand(words(place), cost=COST)

@@ -178,7 +178,7 @@ async def held(robot: Agent, contract: Contract) -> bool:
 async def test_a_finished_job_that_was_set_aside_sends_its_result_again(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
-        contract = await made_by_a_provider_that_leaves(place, person)
+        contract = await made_by_a_provider_that_leaves(place, person, robot)
         await in_phase(robot, contract, Phase.COMPLETE)
         await created_again(robot, contract)
         async with place.provider():

@@ -63,7 +63,7 @@ async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(p
 async def test_a_finished_job_is_paid_when_the_provider_starts_late(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
-        contract = await made_by_a_provider_that_leaves(place, person)
+        contract = await made_by_a_provider_that_leaves(place, person, robot)
         await in_phase(robot, contract, Phase.COMPLETE)
         assert not await paid.once()
         async with place.provider():
@@ -77,7 +77,7 @@ async def test_a_finished_job_is_paid_after_a_restart(place: Place, paid: Paying
     said: list[str] = []
     async with place.agent("person") as person:
         async with speaking(offering(place.agent("robot")), said) as robot:
-            contract = await made_by_a_provider_that_leaves(place, person)
+            contract = await made_by_a_provider_that_leaves(place, person, robot)
             await in_phase(robot, contract, Phase.COMPLETE)
         async with speaking(place.agent("robot"), said) as robot, place.provider():
             outcome = await contract.outcome()
@@ -212,13 +212,17 @@ async def test_a_contract_created_again_at_another_address_is_paid_once(place: P
             await in_phase(robot, contract, Phase.READY)
             await place.forget_blocks(1)
             await until(lambda: contract.address != first)
-            assert await robot.parts.ledger.job(first) is None
+            await until_found(lambda: is_gone(robot, first), what="the end of the job of the first contract")
             await in_phase(robot, contract, Phase.READY)
         async with speaking(place.agent("robot"), said) as robot:
             assert (await contract.outcome()).success
             await in_phase(robot, contract, Phase.FINALIZED)
     assert said == WORDS
     assert await paid.once()
+
+
+async def is_gone(robot: Agent, address: str) -> bool:
+    return await robot.parts.ledger.job(address) is None
 
 
 async def test_a_contract_that_is_gone_when_it_is_read_does_not_stop_the_reading(
