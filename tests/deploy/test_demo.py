@@ -36,7 +36,8 @@ async def test_a_new_market_starts_and_does_a_job_that_the_logs_show(
     assert "paid, result Qm" in story
     assert demo.log("agent").count("the lamp is on") == 3
     liability = story.split("contract ")[1].split()[0]
-    assert f"{liability}: finalized, success True" in demo.log("provider")
+    finalized = f"{liability}: finalized, success True"
+    await demo.until(lambda: finalized in demo.log("provider"), what="the provider's word", seconds=60)
     assert liability in demo.log("agent")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import threading
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +20,11 @@ from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import RAW, STRING, String
 from tests.mesh.cli.calls import call
-from tests.support.commands import Interrupted, aira, refused
+from tests.support.commands import AIRA, SECONDS, Serving, aira, refused
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
 from tests.support.routers import client_config
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -65,7 +67,8 @@ async def test_a_file_is_fetched_from_a_peer(router: EmbeddedRouter, tmp_path: P
     async with Holder(router.endpoint, tmp_path / "theirs", content) as cid:
         words: list[str | Path] = ["objective", "get", cid, "--out", tmp_path / "it.mcap", "--connect", router.endpoint]
         done = await asyncio.to_thread(aira, *words)
-        assert (done.returncode, done.stderr) == (0, "")
+        asking = f"aira: {cid} is not in the store; asking "  # said only if that takes a while
+        assert (done.returncode, [line for line in done.stderr.splitlines() if not line.startswith(asking)]) == (0, [])
         assert (tmp_path / "it.mcap").read_bytes() == content
         done = await asyncio.to_thread(aira, "objective", "show", cid, "--connect", router.endpoint)
         assert done.stdout.splitlines()[0].split() == ["cid", cid]
@@ -97,16 +100,17 @@ async def test_a_fetch_says_whom_it_asks_and_when_it_gives_up(router: EmbeddedRo
 
 
 class Speaker:
-    """A device that publishes the same messages repeatedly until the context ends."""
+    """A device that publishes the same messages repeatedly until the context ends, and has begun with it."""
 
     def __init__(self, endpoint: str, key: str) -> None:
         self._endpoint = endpoint
         self._key = key
-        self._stopped = threading.Event()
+        self._speaks, self._stopped = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._speak, name="speaker of the test")
 
     def __enter__(self) -> None:
         self._thread.start()
+        assert self._speaks.wait(SECONDS)
 
     def __exit__(self, *exc_info: object) -> None:
         self._stopped.set()
@@ -117,6 +121,7 @@ class Speaker:
             while not self._stopped.wait(0.02):
                 session.put(self._key, String("on").encode(), encoding=STRING.zenoh_encoding)
                 session.put("elsewhere/x", b"\1")
+                self._speaks.set()
 
 
 DEVICE = f"aira/agent/0x{'1' * 40}/device/lamp"
@@ -145,8 +150,11 @@ def test_live_messages_are_packed_into_an_objective(router: EmbeddedRouter, tmp_
 def test_ctrl_c_ends_the_capture_with_a_complete_file(router: EmbeddedRouter, tmp_path: Path) -> None:
     out = tmp_path / "heard.mcap"
     words: list[str | Path] = ["--hear", f"{DEVICE}/**", "--out", out, "--connect", router.endpoint]
-    done = Interrupted("objective", "pack", *words, after=3.0)
-    assert (done.code, done.output.split()[0]) == (0, cid_of_file(out)), done.errors
+    with Serving(*AIRA, "objective", "pack", *words, says="Ctrl-C stops it") as packing:
+        wait_until(lambda: any(file.stat().st_size for file in tmp_path.glob("*heard.mcap*")), what="messages in it")
+        code, _ = packing.end(signal.SIGINT)
+        said = packing.log()
+    assert (code, cid_of_file(out) in said.split()) == (0, True), said
     assert open_objective(out).count > 0
 
 

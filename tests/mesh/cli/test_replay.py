@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -117,10 +118,11 @@ def test_only_messages_of_the_device_are_published(stage: Stage, listener: Liste
 
 def test_messages_are_published_at_their_own_times(stage: Stage, listener: Listener) -> None:
     stage.path.write_bytes(timed([("/go", "one", 0), ("/go", "two", SECOND // 2), ("/go", "three", SECOND)]))
+    started = time.monotonic()
     assert stage.play(stage.path, "--to", "lab/stage").exit_code == 0
-    heard = listener.heard(3)
-    assert heard[1][3] - heard[0][3] > 0.4
-    assert heard[2][3] - heard[0][3] > 0.9
+    # Not between two of them: each may be heard late.
+    after = [at - started for *_, at in listener.heard(3)]
+    assert (after[1] > 0.5, after[2] > 1.0) == (True, True), after
 
 
 @pytest.mark.parametrize(

@@ -18,12 +18,12 @@ from mesh.cli.up import serve_market as serve_up
 from mesh.composition import load_account
 from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.settings import Settings
-from schemas import cid_of_bytes, cid_of_file
+from schemas import EventKey, cid_of_bytes, cid_of_file
 from tests.support.development import settings_of
 from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
-from tests.support.waiting import until
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -118,6 +118,9 @@ def progress_and_end(text: str) -> tuple[list[str], dict[str, Any]]:
 def moving(robot: Agent) -> Agent:
     @robot.on("/go")
     async def go(job: Job, message: object) -> None:
+        # What a robot says of its job is lost before somebody listens, and the person may see the contract later.
+        key = EventKey(robot.address.lower(), job.liability.address.lower(), "complete")
+        await until_heard(robot.parts.network.session, str(key))
         job.publish("/gone", message)
 
     return robot

@@ -160,6 +160,7 @@ async def publish_to(router: EmbeddedRouter) -> None:
     async with Network(Endpoints(connect=(router.endpoint,))) as network, Channel(network.session, MARKET) as channel:
         forged = msgspec.structs.replace(demand(), signature="11" * 65)
         await until_heard(network.session, message_key(MARKET, forged))
+        await until_heard(network.session, str(RejectKey(MARKET, PERSON.address)))
         channel.put(message_key(MARKET, forged), encode(forged))
         channel.publish(order)
         rejected = Rejection(

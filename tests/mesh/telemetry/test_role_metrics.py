@@ -20,7 +20,7 @@ from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.orders import demand
 from tests.support.scraping import Scrape, health, scraped
-from tests.support.waiting import until, until_found
+from tests.support.waiting import until, until_found, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -177,6 +177,7 @@ async def test_refused_messages_are_counted_by_reason(place: Place) -> None:
     async with provider_at(place) as url, place.agent("person") as person:
         before, session = await scraped(url), person.parts.network.session
         name = place.market.deployment.lighthouse_name
+        await until_heard(session, f"aira/{name}/demand/{MODEL}")
         for payload in (b"rubbish", b"{}"):
             session.put(f"aira/{name}/demand/{MODEL}", payload)
         person.channel.publish(demand(model=MODEL, deadline=1, lighthouse=place.market.deployment.lighthouse))
@@ -240,6 +241,8 @@ async def test_rejected_orders_are_counted_by_reason(place: Place) -> None:
             model=MODEL, objective=cid_of_bytes(b"x"), cost=10**15, token="", validator="", lifetime=1000
         )
         signed = await person.runtime.trader.writer.sign(Demand, terms, validator_fee=0)
+        name = place.market.deployment.lighthouse_name
+        await until_heard(person.parts.network.session, f"aira/{name}/demand/{MODEL}")
         person.channel.publish(signed)
         await robot.runtime.trader.post(Offer, robot.runtime.trader.writer.terms_of(signed), lighthouse_fee=0)
 
