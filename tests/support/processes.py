@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 START_SECONDS = 180.0
 STOP_SECONDS = 10.0
+KILL_SECONDS = 60.0
+"""In which a killed process ends, however busy the machine is."""
 POLL_SECONDS = 0.02
 LOG_LINES = 40
 
@@ -151,7 +153,7 @@ class Server(ABC):
             process.wait(self.stop_seconds)
         except subprocess.TimeoutExpired:
             process.kill()
-            process.wait(self.stop_seconds)
+            process.wait(KILL_SECONDS)
 
     def _wait_until_ready(self, process: subprocess.Popen[bytes]) -> None:
         deadline = time.monotonic() + self.start_seconds

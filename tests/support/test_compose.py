@@ -53,7 +53,7 @@ def is_answered(project: Project, file: str = "") -> bool:
 
 async def test_services_find_each_other_by_name_and_their_logs_are_kept(project: Project) -> None:
     await until(lambda: is_answered(project), what="an answer of web")
-    assert '"GET / HTTP/1.1" 200' in project.log("web")
+    await until(lambda: '"GET / HTTP/1.1" 200' in project.log("web"), what="its log")
 
 
 async def test_a_killed_service_comes_back_with_its_state(project: Project) -> None:

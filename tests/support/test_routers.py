@@ -25,7 +25,7 @@ def wait_until_matched(publisher: zenoh.Publisher) -> None:
     """Return when a subscriber of the publisher's key is known; a put before that may reach nobody."""
     changes: queue.SimpleQueue[bool] = queue.SimpleQueue()
     publisher.declare_matching_listener(lambda status: changes.put(status.matching))
-    while not (is_matched(publisher) or changes.get(timeout=10)):
+    while not (is_matched(publisher) or changes.get(timeout=60)):
         pass
 
 
@@ -43,7 +43,7 @@ def routed(endpoint: str) -> bytes:
         publisher = speaker.declare_publisher(KEY)
         wait_until_matched(publisher)
         publisher.put(b"over the router")
-        return heard.get(timeout=10)
+        return heard.get(timeout=60)
 
 
 def test_a_router_carries_a_message_between_two_clients(any_router: EmbeddedRouter | Zenohd) -> None:

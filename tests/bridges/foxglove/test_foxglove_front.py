@@ -132,7 +132,7 @@ async def test_a_client_that_sends_nonsense_hurts_no_other(serve: Any) -> None:
 
 
 async def test_a_client_that_does_not_read_is_disconnected(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(front_module, "STALLED", 0.2)
+    monkeypatch.setattr(front_module, "STALLED", 2.0)
     async with serve() as server, viewing(server.front.url, "/x") as viewer, viewing(server.front.url, "/x") as slow:
         server.publish("/x", bytes(10), RAW)
         await viewer.until_seen("/x")
@@ -144,7 +144,7 @@ async def test_a_client_that_does_not_read_is_disconnected(serve: Any, monkeypat
             server.publish("/x", picture, RAW)
             return len(server.front._clients) == 1
 
-        await until(sent, what="the end of the slow client")
+        await until(sent, what="the end of the slow client", pause=0.05)
         server.publish("/y", *encode_value("on"))
         await until(lambda: "/y" in viewer.topics)
 

@@ -195,6 +195,11 @@ class RecentDaemon(Replay):
         self.busy = busy
         self.refused_as_replay = 0
         """Messages of its own that it refused."""
+        self.numbered = 0
+        """The number of its own last message."""
+        self.validates = asyncio.Event()
+        """While it is cleared, every second message of its own waits to be validated."""
+        self.validates.set()
         self.lost = 0
         """Messages of others that it dropped."""
         self._highest: dict[Replay, int] = {}
@@ -234,8 +239,10 @@ class RecentDaemon(Replay):
         topic = self.topic_of(request)
         part = await (await request.multipart()).next()
         data = await part.read()  # type: ignore[union-attr]
-        sequence = next(self._sequence)
-        await asyncio.sleep(self.slow * (sequence % 2))
+        self.numbered = sequence = next(self._sequence)
+        if sequence % 2:
+            await asyncio.sleep(self.slow)
+            await self.validates.wait()
         if not self._is_next(self, sequence):
             self.refused_as_replay += 1
             return refusal("validation ignored")

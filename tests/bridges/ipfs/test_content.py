@@ -164,7 +164,7 @@ async def test_a_file_named_before_it_exists_is_added_later(
             swarm.a.api,
             tmp_path / "bridge",
             timeout=2.0,
-            add_retry=RetryPolicy(initial=0.5, factor=1.0, attempts=4),
+            add_retry=RetryPolicy(initial=0.5, factor=1.0, attempts=40),
         ) as bridge,
     ):
         bridge.content.schedule_add(cid_of_bytes(content))

@@ -51,7 +51,11 @@ async def test_version_and_identity(daemon: Daemon, swarm: Swarm) -> None:
     identity = await daemon.identity()
     assert identity.id == swarm.a.peer_id
     assert swarm.a.swarm_address in (identity.addresses or [])
-    assert swarm.b.peer_id in await daemon.swarm_peers()
+
+    async def is_connected() -> bool:
+        return swarm.b.peer_id in await daemon.swarm_peers()
+
+    await until_found(is_connected, what="the other daemon", seconds=30)
 
 
 async def test_a_message_reaches_a_client_of_another_daemon_unchanged(

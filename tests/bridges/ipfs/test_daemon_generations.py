@@ -174,8 +174,13 @@ async def test_a_message_published_out_of_order_is_published_again(
 ) -> None:
     async with RecentDaemon(slow=0.2) as recent, Daemon(recent.api) as daemon, Daemon(recent.api) as other:
         await daemon.detect_version()
+        recent.validates.clear()
+        earlier = asyncio.create_task(daemon.publish(topic, b"one"))
+        await until(lambda: recent.numbered % 2, what="a number", seconds=SECONDS)
+        await other.publish(topic, b"two")
+        recent.validates.set()
         with pytest.raises(PublishedOutOfOrder) as refused:
-            await asyncio.gather(daemon.publish(topic, b"one"), other.publish(topic, b"two"))
+            await earlier
         assert refused.value.status == 500
         async with (
             on_mesh(router.endpoint, topic) as mesh,

@@ -65,11 +65,12 @@ async def test_no_accepted_message_is_lost_by_outages_of_the_daemon(
             mesh.channel.publish(order)
         await until(lambda: bridge.status().to_ipfs.waiting == 20, seconds=SECONDS)
         assert bridge.status().state == "no daemon"
-        assert own_daemon.api in bridge.status().last_error
+        await until(lambda: own_daemon.api in bridge.status().last_error, seconds=SECONDS)
 
         await asyncio.to_thread(own_daemon.start)
         await until(lambda: len(set(bob.heard)) == 20, what="the waiting messages", seconds=SECONDS)
-        assert (bridge.status().state, bridge.status().last_error) == ("connected", "")
+        await until(lambda: bridge.status().state == "connected", seconds=SECONDS)
+        assert bridge.status().last_error == ""
 
         for order in orders[20:40]:
             mesh.channel.publish(order)
@@ -211,7 +212,7 @@ async def test_another_bridge_takes_over_when_the_active_one_loses_its_daemon(
             mesh.channel.publish(two := demand())
             await until(lambda: legacy_json(two) in bob.heard, seconds=SECONDS)
             assert [heard for heard in bob.heard if b"tx" not in heard] == [legacy_json(one), legacy_json(two)]
-            assert second.status().to_ipfs.carried == 1
+            await until(lambda: second.status().to_ipfs.carried == 1, what="the daemon's answer", seconds=SECONDS)
 
 
 async def test_messages_from_ipfs_wait_for_the_router(

@@ -13,7 +13,7 @@ from schemas import Offer, verify_message
 from tests.bridges.ipfs.replays import OldDaemon
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, demand, offer
 from tests.support.sites import MARKET, Site
-from tests.support.waiting import until
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,6 +47,11 @@ async def test_a_bridge_relays_both_ways_on_a_locked_site(tmp_path: Path) -> Non
             ):
                 tasks.start(bridge.run(), "bridge of the test")
                 await until(lambda: bridge.status().carries, seconds=SECONDS)
+
+                async def is_seen() -> bool:
+                    return any(key.role == "bridge" for key in await channel.present())
+
+                await until_found(is_seen, what="the bridge's token", seconds=SECONDS)
                 channel.publish(order := demand())
                 await until(lambda: bridge.status().to_ipfs.carried == 1, seconds=SECONDS)
                 async with Daemon(there.api) as legacy:

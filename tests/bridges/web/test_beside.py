@@ -43,8 +43,10 @@ def test_the_demo_leaves_the_page_open_on_its_finished_job() -> None:
     with Serving(*AIRA, "demo", "--web", "--web-port", "0", says="Ctrl-C ends everything") as demo:
         found = re.search(r"(http://\S+)/#/job/(0x\w{40})", demo.log())
         assert found
-        job = answer(f"{found[1]}/api/v1/liabilities/{found[2]}")
-        assert [step["kind"] for step in job["timeline"]] == ["created", "ready", "playing", "result", "paid"]
+        url = f"{found[1]}/api/v1/liabilities/{found[2]}"
+        wait_until(lambda: answer(url)["timeline"][-1]["kind"] == "paid", what="the payment on the page")
+        kinds = [step["kind"] for step in answer(url)["timeline"]]
+        assert kinds == ["created", "ready", "playing", "result", "paid"]
         assert answer(f"{found[1]}/api/v1/liabilities/{found[2]}/verification")["holds"]
         code, _ = demo.end(signal.SIGINT)
         assert code == 0, demo.log()
@@ -85,7 +87,7 @@ def test_the_page_goes_on_when_its_market_is_started_afresh(tmp_path: Path) -> N
             return False  # it opens again
 
     with Serving(*AIRA, *up, says="provider    0x") as market, Serving(*AIRA, *web, says="page  ") as page:
-        assert is_connected()
+        wait_until(is_connected, what="the page on the chain")
         market.end(signal.SIGINT)
         market.start()
         page.wait_until_said("the chain was started afresh")

@@ -94,10 +94,11 @@ async def test_the_stream_tells_each_step_of_a_job(place: Place, serve: Any) -> 
         wanted = {"model": MODEL, "objective": made["cid"], "cost": str(COST)}
         async with browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket:
             await socket.send_json({"subscribe": ["market"]})
+            await socket.receive()  # it is subscribed
             posted = await browser.post("local/orders", wanted, status=202)
             assert posted["order"]["signer"] == place.address("person")
             kinds: list[str] = []
-            async with asyncio.timeout(30):
+            async with asyncio.timeout(120):
                 while "matched" not in kinds:
                     for event in json.loads((await socket.receive()).data):
                         kinds.append(event["kind"])
@@ -107,9 +108,13 @@ async def test_the_stream_tells_each_step_of_a_job(place: Place, serve: Any) -> 
                 while "paid" not in kinds:
                     kinds += [event["kind"] for event in json.loads((await socket.receive()).data)]
         assert kinds.index("order") < kinds.index("matched") < kinds.index("paid")
-        agents = (await browser.get("agents"))["agents"]
-        about = next(agent for agent in agents if agent["address"] == place.address("robot"))
-        assert about["health"] == "alive"
+
+        async def answering() -> list[Any]:
+            agents = (await browser.get("agents"))["agents"]
+            return [one for one in agents if one["address"] == place.address("robot") and one["health"] == "alive"]
+
+        await until_found(answering, what="the robot's answer")
+        (about,) = await answering()
         assert about["models"] == [MODEL]
         assert about["record"]["done"] >= 1
         jobs = await browser.get("liabilities", party=place.address("person"), limit=1)
@@ -201,7 +206,7 @@ async def test_a_form_becomes_an_objective_that_its_model_accepts(serve: Any) ->
 
 async def test_a_model_that_nobody_has_is_soon_reported_and_can_be_ordered(serve: Any) -> None:
     unknown = cid_of_bytes(b"nobody has this")
-    async with asyncio.timeout(30), serve() as browser:
+    async with asyncio.timeout(60), serve() as browser:
         refused = await browser.get(f"models/{unknown}", status=404)
         assert refused["error"]["code"] == "content-unavailable"
         made = await browser.post(f"objectives?model={unknown}", objective(("/go", "on")), headers=DATA)
@@ -240,8 +245,9 @@ async def test_what_a_reorganisation_reverts_is_open_again(place: Place, serve: 
         events: list[str] = []
         async with browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket:
             await socket.send_json({"subscribe": [f"order/{order_hash}"]})
+            await socket.receive()  # it is subscribed
             await place.forget_blocks(head - before)
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 while "open" not in events or "contract" not in events[events.index("open") :]:
                     events += [event["kind"] for event in json.loads((await socket.receive()).data)]
 

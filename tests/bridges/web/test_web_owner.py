@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from mesh import Demand, String, Verified
+from schemas import RpcKey
 from tests.bridges.web.conftest import OWN
 from tests.bridges.web.test_page_server import DATA, signed_demand
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
-from tests.support.waiting import until_found
+from tests.support.waiting import until_answered, until_found
 
 if TYPE_CHECKING:
     from tests.support.market import Place
@@ -60,6 +61,7 @@ async def test_a_job_that_may_still_be_done_is_not_refunded(place: Place, serve:
 async def test_logs_are_read_by_operators_where_people_log_in(place: Place, serve: Any) -> None:
     async with place.agent("robot", open_services=True), serve() as browser:
         robot = place.address("robot")
+        await until_answered(browser.server.components.network.session, str(RpcKey(robot, "logs")))
         assert (await browser.get(f"agents/{robot}/logs", level="loud", status=400))["error"]["code"] == (
             "invalid-request"
         )
@@ -70,6 +72,7 @@ async def test_logs_are_read_by_operators_where_people_log_in(place: Place, serv
         session = f"{browser.server.url}/api/v1/session"
         async with browser.session.post(session, json={"token": OPERATOR}, headers=OWN) as response:
             headers = {"Cookie": response.headers["Set-Cookie"].partition(";")[0]}
+        await until_answered(browser.server.components.network.session, str(RpcKey(robot, "logs")))
         async with browser.session.get(f"{browser.server.url}/api/v1/agents/{robot}/logs", headers=headers) as response:
             assert (await response.json())["error"]["code"] == "service-failed"
 

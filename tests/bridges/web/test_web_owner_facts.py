@@ -20,7 +20,12 @@ ROBOT = "0x70997970C51812dc3A010C7d01b50e0d17dc79C8"
 
 async def test_a_robot_that_waits_for_demands_shows_its_model(place: Place, serve: Any) -> None:
     async with place.agent("robot"), serve() as browser:
-        (robot,) = (await browser.get("agents"))["agents"]
+
+        async def answering() -> list[Any]:
+            return [agent for agent in (await browser.get("agents"))["agents"] if agent["status"]]
+
+        await until_found(answering, what="the robot's answer")
+        (robot,) = await answering()
         assert (robot["offers"], robot["models"]) == ([], [MODEL])
         assert robot["status"]["model"] == MODEL
 

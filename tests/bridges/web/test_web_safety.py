@@ -12,9 +12,11 @@ from bridges.web.api import Api
 from bridges.web.errors import NotOpenToOthers
 from bridges.web.options import WebOptions
 from bridges.web.reference import reference
+from schemas import RpcKey
 from tests.bridges.web.conftest import OWN
 from tests.bridges.web.openapi import DOCUMENT
 from tests.support.objectives import objective
+from tests.support.waiting import until_answered
 
 if TYPE_CHECKING:
     from tests.support.market import Place
@@ -80,6 +82,7 @@ async def test_only_operators_drive_jobs(place: Place, serve: Any) -> None:
         session = f"{browser.server.url}/api/v1/session"
         async with browser.session.post(session, json={"token": OPERATOR}, headers=OWN) as response:
             headers = OWN | {"Cookie": response.headers["Set-Cookie"].partition(";")[0]}
+        await until_answered(browser.server.components.network.session, str(RpcKey(robot, "start")))
         done = await browser.post(f"agents/{robot}/start", job, headers=headers)
         assert done["success"] is False  # it has no such job
 

@@ -20,6 +20,16 @@ if TYPE_CHECKING:
     from tests.support.market import Place
 
 
+async def until_online(browser: Any, juror: Juror) -> None:
+    """Return when the page knows of a juror, and has its announcement."""
+
+    async def is_online() -> bool:
+        said = await browser.get(f"validators/{juror.signer.address}")
+        return bool(said["online"] and said["announcements"])
+
+    await until_found(is_online, what="the juror")
+
+
 async def test_a_job_shows_its_verdict_and_why_it_was_refused(place: Place, serve: Any) -> None:
     robot = working(place.agent("robot"))
     async with juror_of(place) as juror, place.at_work(robot) as person, serve() as browser:
@@ -40,7 +50,8 @@ async def test_a_job_shows_its_verdict_and_why_it_was_refused(place: Place, serv
 
         async def refused() -> Any:
             shown = await browser.get(f"liabilities/{contract.address}")
-            return shown if shown["liability"]["state"] == "failed" else None
+            is_judged = any(step["kind"] == "judged" for step in shown["timeline"])
+            return shown if is_judged and shown["liability"]["state"] == "failed" else None
 
         await until_found(refused, what="the refusal")
         shown = await refused()
@@ -52,6 +63,7 @@ async def test_a_job_shows_its_verdict_and_why_it_was_refused(place: Place, serv
 
 async def test_the_page_says_how_a_validator_judges_before_a_demand_is_signed(place: Place, serve: Any) -> None:
     async with juror_of(place) as juror, serve() as browser:
+        await until_online(browser, juror)
         said = await browser.get(f"validators/{juror.signer.address}")
         assert (said["title"], said["online"]) == (juror.title, [juror.signer.address])
         assert said["policies"] == [{"name": COMPLETE.name, "description": COMPLETE.description}]
@@ -71,6 +83,7 @@ async def test_the_page_says_how_a_validator_judges_before_a_demand_is_signed(pl
 @pytest.mark.parametrize("doubt", ["silent", "low-fee"])
 async def test_the_local_account_orders_from_no_doubtful_validator(place: Place, serve: Any, doubt: str) -> None:
     async with juror_of(place) as juror, serve("person") as browser:
+        await until_online(browser, juror)
         validator = juror.signer.address if doubt == "low-fee" else place.market.accounts["robot"].signer.address
         wanted = {"model": MODEL, "objective": MODEL, "cost": "5", "validator": validator, "validatorFee": "1"}
         refused = await browser.post("local/orders", wanted, status=400)
