@@ -37,7 +37,7 @@ def holding(*orders: Verified[object]) -> OrderBook:  # type: ignore[type-var]
 
 def ask(session: zenoh.Session, selector: str) -> list[str]:
     """The keys of the answers."""
-    return [str(reply.ok.key_expr) for reply in session.get(selector, timeout=5) if reply.ok is not None]
+    return [str(reply.ok.key_expr) for reply in session.get(selector, timeout=60) if reply.ok is not None]
 
 
 async def test_it_answers_with_the_orders_that_match_the_query(router: EmbeddedRouter) -> None:
@@ -74,7 +74,7 @@ async def test_it_answers_with_the_withdrawals_of_one_order(router: EmbeddedRout
         await until_answered(two.session, f"aira/{MARKET}/**")
 
         def orders(selector: str) -> list[str]:
-            replies = two.session.get(selector, timeout=5, consolidation=zenoh.ConsolidationMode.NONE)
+            replies = two.session.get(selector, timeout=60, consolidation=zenoh.ConsolidationMode.NONE)
             withdrawn = [decode(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
             return sorted(message.order for message in withdrawn if isinstance(message, Withdrawal))
 

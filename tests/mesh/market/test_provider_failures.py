@@ -37,7 +37,7 @@ async def test_an_unused_turn_is_taken_over_after_the_timeout(local: LocalMarket
     async with local.provider("rival") as rival:
         demand = local.demand()
         local.publish(demand, local.offer())
-        await until(lambda: len(rival.book) == 0)
+        await until(lambda: rival.queue.waiting == 1 and rival.ledger.turnover().matches == 1)
         assert rival.earnings().created == 0
 
         await local.mine(8)
@@ -67,7 +67,7 @@ async def test_orders_that_were_used_during_another_providers_turn_leave(local: 
     async with local.provider("rival") as rival:
         demand, offer = local.demand(), local.offer()
         local.publish(demand, offer)
-        await until(lambda: len(rival.book) == 0)
+        await until(lambda: rival.queue.waiting == 1 and rival.ledger.turnover().matches == 1)
         async with local.chain_of("provider") as chain:
             await chain.liabilities.create(local.lighthouse, demand, offer)
 
@@ -147,6 +147,7 @@ async def test_transactions_that_a_reorganisation_reverts_are_sent_again(local: 
             return (await local.chain.liabilities.get(liability.address)).is_finalized
 
         await until_found(finalized)
+        await local.liability_of(late)
         await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (2, 1))
         assert len(await local.liabilities_of(late)) == 1
 

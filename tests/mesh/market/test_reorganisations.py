@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 COST = 5
 TIMING = replace(QUICK, replace_after=1.0)
 BEFORE_THE_RECEIPT, BEFORE_THE_EVENT = "eth_getTransactionReceipt", "eth_getLogs"
+REPAIR = "eth_sendRawTransaction"
 MOMENTS = {"before the receipt": BEFORE_THE_RECEIPT, "before the event is read": BEFORE_THE_EVENT}
 
 
@@ -95,8 +96,9 @@ async def test_a_contract_that_vanishes_before_it_is_confirmed_is_created_again(
             await local.liability_of(demand)
             if MOMENTS[moment] is BEFORE_THE_EVENT:
                 await until(lambda: provider.earnings().created == 1)
-            await reorganise(forking)
-            assert await local.liabilities_of(demand) == []
+            with forking.node.back(REPAIR):
+                await reorganise(forking)
+                assert await local.liabilities_of(demand) == []
 
         await local.liability_of(demand)
         await until_read(local, provider)
@@ -134,8 +136,9 @@ async def test_a_finalization_that_vanishes_before_it_is_confirmed_is_made_again
             await until_found(lambda: forking.is_finalized(liability))
             if MOMENTS[moment] is BEFORE_THE_EVENT:
                 await until(lambda: provider.earnings().finalized == 1)
-            await reorganise(forking)
-            assert not await forking.is_finalized(liability)
+            with forking.node.back(REPAIR):
+                await reorganise(forking)
+                assert not await forking.is_finalized(liability)
 
         await until_found(lambda: forking.is_finalized(liability))
         await until_read(local, provider)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 from mesh.agent import Phase
 from schemas import Empty, String, cid_of_file
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
@@ -67,6 +65,11 @@ async def test_messages_are_played_at_their_recorded_times(place: Place) -> None
     robot = offering(place.agent("robot", playback="recorded"))
     times: list[float] = []
 
+    @robot.on_liability
+    async def begin(phase: Phase, liability: Liability) -> None:
+        if phase is Phase.RUNNING:
+            times.append(asyncio.get_running_loop().time())
+
     @robot.on("/tick")
     async def tick(job: Job, message: Empty) -> None:
         times.append(asyncio.get_running_loop().time())
@@ -74,14 +77,16 @@ async def test_messages_are_played_at_their_recorded_times(place: Place) -> None
     path = place.save(timed([("/tick", Empty(), at * MILLISECOND) for at in (0, 150, 200)]))
     async with place.at_work(robot) as person:
         assert (await (await person.demand(path)).outcome()).success
-    assert times[1] - times[0] >= 0.1
-    assert times[2] - times[0] == pytest.approx(0.2, abs=0.1)
+    began, first, second, third = times
+    assert first >= began
+    assert second - began > 0.149, "a busy machine may only be late"
+    assert third - began > 0.199
 
 
 async def test_at_once_means_without_waiting_for_recorded_times(place: Place) -> None:
     robot = doing_nothing(offering(place.agent("robot", playback="at-once")))
     path = place.save(timed([("/tick", Empty(), hour * 3600 * 1000 * MILLISECOND) for hour in range(3)]))
-    async with place.at_work(robot) as person, asyncio.timeout(20):
+    async with place.at_work(robot) as person, asyncio.timeout(60):
         assert (await (await person.demand(path)).outcome()).success
 
 
@@ -101,6 +106,7 @@ async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
     path = place.save(objective(("/go", Empty()), ("/go", Empty())))
     async with place.at_work(robot) as person:
         contracts = await asyncio.gather(*(person.demand(path, cost=cost) for cost in (1, 2, 3)))
+        await until(lambda: begun)
         await until_found(others_are_ready)
         assert len(begun) == 1
         release.set()
@@ -137,13 +143,14 @@ async def test_a_handler_may_end_its_own_job(place: Place) -> None:
         cid = await robot.finish(job.liability.address, success=False)
         done.append(f"{message.data} {cid}")
 
-    async with place.at_work(robot) as person, asyncio.timeout(20):
+    async with place.at_work(robot) as person, asyncio.timeout(60):
         contract = await person.demand(place.save(objective(*(("/go", str(n)) for n in range(50)), step_ns=0)))
         outcome = await contract.outcome()
         assert not outcome.success
         await until(lambda: done)
         second = await person.demand(place.save(objective(("/go", "again")), "second.mcap"))
         await second.outcome()
+        await until(lambda: len(done) == 2)
     assert done[0] == f"0 {outcome.result}"
     assert len(done) == 2, "nothing is played after the end"
 
@@ -156,7 +163,7 @@ async def test_a_phase_handler_may_end_the_job_that_has_just_started(place: Plac
         if phase is Phase.RUNNING:
             await robot.finish(liability.address, success=False)
 
-    async with place.at_work(robot) as person, asyncio.timeout(20):
+    async with place.at_work(robot) as person, asyncio.timeout(60):
         contract = await person.demand(place.save(objective(("/go", Empty()))))
         assert not (await contract.outcome()).success
 

@@ -141,8 +141,8 @@ async def test_an_objective_over_the_size_limit_is_refused(place: Place) -> None
 
 
 async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place: Place) -> None:
-    robot = doing_nothing(offering_unseen(place.agent("robot", fetch_timeout=30.0)))
-    async with place.at_work(robot) as person, asyncio.timeout(25):
+    robot = doing_nothing(offering_unseen(place.agent("robot", fetch_timeout=120.0)))
+    async with place.at_work(robot) as person, asyncio.timeout(60):
         missing = await person.demand(cid_of_bytes(b"nobody has this"))
         good = await person.demand(place.save(objective(("/go", Empty()))))
         assert (await good.outcome()).success

@@ -102,10 +102,12 @@ async def test_a_handler_that_ends_cancelled_fails_without_cancelling_the_playba
 async def test_cancelling_the_playback_cancels_the_handler_and_counts_handled_messages(making: Making) -> None:
     run = making.run(objective(("/a", "0"), ("/a", "1"), ("/a", "2")))
     run.open()
+    begun: list[str] = []
     ended: list[str] = []
 
     async def stay_at_the_second(_: Job, message: Played) -> None:
         if message.payload == String("1").encode():
+            begun.append("the second")
             try:
                 await asyncio.sleep(60)
             except asyncio.CancelledError:
@@ -113,7 +115,7 @@ async def test_cancelling_the_playback_cancels_the_handler_and_counts_handled_me
                 raise
 
     playing = asyncio.create_task(run.play(stay_at_the_second))
-    await until(lambda: run.position == 1)
+    await until(lambda: begun)
     playing.cancel()
     with pytest.raises(asyncio.CancelledError):
         await playing
