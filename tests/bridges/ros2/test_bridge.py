@@ -223,10 +223,11 @@ async def test_a_paid_job_drives_the_robot_and_others_open_its_recording(
     robot = offering(place.agent("robot"))
     driven: list[float] = []
     answered: list[Any] = []
+    levels: list[Any] = []
 
     @robot.on("/cmd_vel")
     async def wait(job: Job, message: object) -> None:
-        await until(lambda: len(answered) > job.position, what="the robot's answer", seconds=60)
+        await until(lambda: min(len(answered), len(levels)) > job.position, what="the robot's answers", seconds=60)
 
     pack([Played("/cmd_vel", twist(n / 4).data, n, n, 0, twist(0).type) for n in range(3)], tmp_path / "drive.mcap")
     places = ("--agent", place.address("robot"), "--connect", place.endpoint, "--ros2-connect", field.endpoint)
@@ -250,8 +251,9 @@ async def test_a_paid_job_drives_the_robot_and_others_open_its_recording(
             tasks.start(drive(), "rover")
             await until(lambda: odometer.is_heard and tank.is_heard, what="the bridge")
             async with place.at_work(robot) as person:
-                selector = topic_selector(place.address("robot"), topic="/odom")
-                robot.parts.network.session.declare_subscriber(selector, answered.append)
+                for topic, heard in (("/odom", answered), ("/own/level", levels)):
+                    selector = topic_selector(place.address("robot"), topic=topic)
+                    robot.parts.network.session.declare_subscriber(selector, heard.append)
                 contract = await person.demand(tmp_path / "drive.mcap", cost=1)
                 assert (await contract.outcome()).success
                 recording = (await contract.recording()).rename(tmp_path / "result.mcap")

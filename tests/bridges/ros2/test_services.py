@@ -80,7 +80,7 @@ async def test_request_and_reply_are_those_of_rmw_zenoh(
 
         def ask(attachment: bytes | None) -> list[zenoh.Reply]:
             options: dict[str, Any] = {} if attachment is None else {"attachment": attachment}
-            return list(here.get(key, payload=request, timeout=5, target=zenoh.QueryTarget.ALL_COMPLETE, **options))
+            return list(here.get(key, payload=request, timeout=30, target=zenoh.QueryTarget.ALL_COMPLETE, **options))
 
         (reply,) = await asyncio.to_thread(ask, RosAttachment(7, 1, gid).encode())
         (refused,) = await asyncio.to_thread(ask, None)

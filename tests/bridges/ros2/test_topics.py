@@ -65,8 +65,7 @@ async def test_what_leaves_is_forgotten(here: zenoh.Session, there: zenoh.Sessio
             talker.advertise("/chatter", "std_msgs/String")
             await ours.ready("/chatter")
         await until(lambda: ours.graph.nodes() == ["/aira"])
-
-        assert ours.graph.topics() == {}
+        await until(lambda: ours.graph.topics() == {}, what="the topic's end")
         with pytest.raises(RosUnavailable) as error:
             await ours.ready("/chatter", timeout=0.05)
         assert error.value.name == "/chatter"

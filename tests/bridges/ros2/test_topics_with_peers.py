@@ -148,7 +148,7 @@ async def test_what_a_peer_has_is_in_our_graph_until_it_goes(router: EmbeddedRou
             assert "/mathematician" in robot.graph.nodes()
             await until(lambda: "/mathematician/get_parameters" in robot.graph.services(), what="its services")
         await until(lambda: "/mathematician" not in robot.graph.nodes(), what="the node's end")
-        assert robot.graph.actions() == {}
+        await until(lambda: robot.graph.actions() == {}, what="the action's end")
 
 
 async def test_a_peer_sees_our_node_and_what_it_has_until_we_go(router: EmbeddedRouter, our_robot: OurRobot) -> None:
@@ -160,7 +160,10 @@ async def test_a_peer_sees_our_node_and_what_it_has_until_we_go(router: Embedded
             robot.advertise("/cmd_vel", "geometry_msgs/msg/Twist")
             robot.serve("/add", ADD_TWO_INTS, refuse)
             robot.serve_action("/count", FIBONACCI, refuse)
-            seen = await _graph(graph, lambda seen: "/count/_action/send_goal" in dict(seen["services"]))
+            wanted = {"/add", "/count/_action/send_goal"}
+            seen = await _graph(
+                graph, lambda seen: "/count" in dict(seen["actions"]) and wanted <= dict(seen["services"]).keys()
+            )
             assert ["ours", "/mesh"] in seen["nodes"]
             assert dict(seen["topics"])["/cmd_vel"] == "geometry_msgs::msg::dds_::Twist_"
             assert dict(seen["services"])["/add"] == "example_interfaces::srv::dds_::AddTwoInts_"
@@ -170,7 +173,7 @@ async def test_a_peer_sees_our_node_and_what_it_has_until_we_go(router: Embedded
         robot.advertise("/cmd_vel", "geometry_msgs/msg/Twist")
         robot.serve("/add", ADD_TWO_INTS, refuse)
         async with sdk("graph", router.endpoint) as graph:
-            seen = await graph.next_line()
+            seen = await _graph(graph, lambda seen: "/add" in seen["services"] and "/cmd_vel" in seen["topics"])
             assert seen["topics"]["/cmd_vel"] == ["geometry_msgs/msg/Twist"]
             assert seen["services"]["/add"] == [ADD_TWO_INTS]
 

@@ -114,7 +114,7 @@ async def test_two_boards_of_two_agents_do_not_affect_each_other(place: Place) -
             assert (reply.value, reply.status) == (None, CallStatus.READ)
             assert (await Device(person).call("/twice", b"")).status is CallStatus.DONE
             with pytest.raises((CallRefused, CallInDoubt)):
-                await Device(robot, patience=2.0).call("/hear", String("hello"))
+                await Device(robot, patience=LONG).call("/hear", String("hello"))
 
 
 def loaded_by(dialects: str, *suspects: str) -> list[str]:

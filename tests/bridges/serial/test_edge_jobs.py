@@ -84,7 +84,7 @@ async def test_a_job_whose_board_was_reset_fails_and_never_hangs(place: Place) -
             await asyncio.to_thread(uno.reset)
             assert not (await contract.outcome()).success
             recording = await contract.recording()
-        assert "restarted" in process.log()
+        await until(lambda: "restarted" in process.log(), what="the loss in the log", seconds=LONG)
     [note] = recorded(recording, "/aira/note")
     assert "(doubt)" in note.data
     # The failed command ends the recording, perhaps before the device is reported absent.

@@ -34,7 +34,7 @@ def demo(folder: Path, recorder: Recorder, **options: Any) -> Demo:
 
 async def test_two_demos_in_one_process_do_not_disturb_each_other(tmp_path: Path) -> None:
     runs = {3: Recorder(), 5: Recorder()}
-    async with asyncio.timeout(60), asyncio.TaskGroup() as demos:
+    async with asyncio.timeout(180), asyncio.TaskGroup() as demos:
         for generation, recorder in runs.items():
             folder, out = tmp_path / f"files of {generation}", tmp_path / str(generation)
             folder.mkdir()

@@ -10,7 +10,7 @@ import pytest
 
 from mesh.demo.narration import JsonNarrator, TextNarrator
 from schemas import Empty, String
-from tests.support.commands import AIRA, aira, environment
+from tests.support.commands import AIRA, SECONDS, aira, environment
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def test_a_demo_goes_on_after_its_reader_closed_stdout(form: tuple[str, ...]) ->
         assert process.stderr is not None
         process.stdout.readline()
         process.stdout.close()
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=SECONDS) == 0
         assert process.stderr.read() == b""
 
 
