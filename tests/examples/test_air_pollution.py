@@ -40,6 +40,7 @@ def test_a_person_gets_the_measurements_of_the_sensors(protocol: str, market: di
         done = run(sys.executable, person, "--times", "2", "--out", out, **as_role("person", market))
         shown = "reading    /measurements  "
         asyncio.run(until(lambda: shown in watch.log(), what="the reading in `aira watch`", seconds=60))
+        watch.wait_until_said("done, for 0x")
         watched = watch.log()
     assert done.returncode == 0, done.stdout + done.stderr
     assert "done, for 0x" in watched

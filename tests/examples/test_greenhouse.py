@@ -39,6 +39,7 @@ def test_two_jobs_at_once_one_of_which_fails_and_the_readings_beside_them(market
     ):
         done = run(sys.executable, PROGRAM, **as_role("person", market))
         asyncio.run(until(lambda: "reading    /tank  10.0, from 0x" in watch.log(), what="a reading"))
+        asyncio.run(until(lambda: watch.log().count(" pays 5 XRT, model ") >= 2, what="both demands"))
         watched = watch.log()
     assert done.stdout.splitlines() == ["done", "the tank has 10 litres"], done.stderr
     assert watched.count(" pays 5 XRT, model ") == 2

@@ -46,6 +46,7 @@ def test_the_flow_of_the_readme_ends_paid(market: dict[str, str], tmp_path: Path
         assert any(re.fullmatch(r"contract 0x\w{40} with 0x\w{40}", line) for line in happened)
         assert (outcome, kept) == (f"paid, result {cid_of_file(out)}", f"recording {out}")
         greeting = f"Hello {person.split()[2]}, you would pay 1000 for {cid_of_file(EXAMPLE / 'blink.mcap')}."
+        greeter.wait_until_said(f"{greeting}\n")
         assert greeting in greeter.log().splitlines()
         assert robot.log().count("the lamp is on") == 3
     said = [message.payload for message in open_objective(out).messages() if message.topic == "/led"]

@@ -16,13 +16,13 @@ from mesh import Job, String  # noqa: TC001  handlers are read at run time
 from mesh.agent.components import watching
 from mesh.background import Background
 from mesh.cli.errors import NoRecording
-from schemas.agent_keys import DeviceTopicKey
+from schemas.agent_keys import DeviceTopicKey, ReadingKey
 from schemas.definitions import with_definition
 from schemas.payloads import Payload, PayloadType
 from tests.bridges.foxglove.viewer import PLAY, viewing
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
-from tests.support.waiting import until
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -72,8 +72,10 @@ async def test_the_market_is_seen_as_a_stream(place: Place, front: Any) -> None:
         robot.publish("/battery", 0.5)
         await viewer.until_seen(f"/{robot.address.lower()}/battery")
         await until(lambda: any(counts["reading"] for counts in viewer.values("/aira/counts")))
-        lines = [line["message"] for line in viewer.values("/aira/log")]
-        assert any(str(contract.address) in line for line in lines)
+        await until(
+            lambda: any(str(contract.address) in line["message"] for line in viewer.values("/aira/log")),
+            what="the contract in the log",
+        )
 
 
 async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, front: Any) -> None:
@@ -90,6 +92,8 @@ async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, fron
         viewer = await enter(viewing(view.url))
         (status, *_) = await viewer.until_seen("/aira/status")
         assert status["address"] == robot.address
+        for heard in (ReadingKey(robot.address, "/battery"), DeviceTopicKey(robot.address, "arm", "/angle")):
+            await until_heard(robot.parts.network.session, str(heard))
         robot.publish("/battery", 0.5)
         assert (await viewer.until_seen("/reading/battery"))[0].data == 0.5
         key = str(DeviceTopicKey(robot.address, "arm", "/angle"))
