@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 START_SECONDS = 180.0
-STOP_SECONDS = 10.0
+STOP_SECONDS = 30.0
 KILL_SECONDS = 60.0
 """In which a killed process ends, however busy the machine is."""
 POLL_SECONDS = 0.02
@@ -96,7 +96,7 @@ class Server(ABC):
             raise
 
     def stop(self) -> None:
-        """Ask the process to end, and kill it if it does not within ten seconds; nothing happens if none runs."""
+        """Ask the process to end, and kill it if it does not within `stop_seconds`; nothing happens if none runs."""
         self._end(signal.SIGTERM)
 
     def kill(self) -> None:

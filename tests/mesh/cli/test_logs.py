@@ -132,6 +132,8 @@ def test_on_a_closed_site_an_operator_can_read_logs_and_an_agent_can_not(tmp_pat
     reply = LogsRead(instance="one", began="", entries=(event("a word of the site"),), last=1).encode()
     with site.open_router("wheel"), zenoh.open(site.client(folders["robot"]).config()) as session:
         queryable: Any = session.declare_queryable(key, lambda query: answer(query, key, reply))
+        with zenoh.open(site.client(folders["chief"]).config()) as other, other.declare_querier(key) as querier:
+            wait_until(lambda: querier.matching_status.matching, what="the queryable")  # type: ignore[attr-defined]
         seen = invoke("logs", ROBOT.address, **credentials("chief"))
         assert (seen.returncode, "a word of the site" in seen.stdout) == (0, True), seen.stderr
         hidden = invoke("logs", ROBOT.address, **credentials("person"))
