@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
 LINE = re.compile(r"(?P<mark>ok|warn|FAIL) +(?P<name>\S+(?: \S+)*)  +(?P<found>\S.*)")
 ARM = "0x" + "0a" * 20
+PATIENT = ("--timeout", "90")
+"""For checks that pass, also on a busy machine."""
+BUSY_DISK = "; with warnings: data folder"
+"""What is said of a disk that others keep busy."""
 
 
 def objects(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -36,7 +40,8 @@ def objects(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
 
 
 def test_a_sound_machine_has_a_line_for_each_check_and_ends_with_0(town: ServedChain, router: EmbeddedRouter) -> None:
-    done = aira("doctor", "--role", "provider", "--connect", router.endpoint, **town.variables("provider"))
+    words = ("--role", "provider", "--connect", router.endpoint, *PATIENT)
+    done = aira("doctor", *words, **town.variables("provider"))
 
     assert (done.returncode, done.stderr) == (0, "")
     *lines, last = [line for line in done.stdout.splitlines() if line and "->" not in line]
@@ -47,7 +52,7 @@ def test_a_sound_machine_has_a_line_for_each_check_and_ends_with_0(town: ServedC
         *("node", "chain", "node clock", "chain clock", "contracts", "lighthouse", "token"),
         *("keyfile", "ether", "tokens", "stake", "turn", "data folder", "disk space"),
     ]
-    assert last == "all 19 checks passed for the role provider"
+    assert last.removesuffix(BUSY_DISK) == "all 19 checks passed for the role provider"
     assert "\x1b" not in done.stdout
     assert PASSWORD not in done.stdout
 
@@ -59,10 +64,10 @@ def test_a_warning_ends_with_0_and_is_named_at_the_end(
     password.write_text(PASSWORD)
     password.chmod(0o644)
     variables = town.variables("robot") | {"AIRA_KEYFILE_PASSWORD_FILE": str(password)}
-    done = aira("doctor", "--connect", router.endpoint, **variables)
+    done = aira("doctor", "--connect", router.endpoint, *PATIENT, **variables)
 
     assert done.returncode == 0, done.stdout
-    assert done.stdout.endswith("checks passed for the role agent; with warnings: keyfile\n")
+    assert re.search(r"checks passed for the role agent; with warnings: keyfile(, data folder)?\n$", done.stdout)
     assert f"-> chmod 600 {password}\n" in done.stdout
 
 
@@ -83,17 +88,18 @@ def test_a_failure_prints_a_hint_and_the_skipped_checks_and_exits_with_1(tmp_pat
 
 def test_json_has_one_object_per_check_with_four_fields(town: ServedChain, router: EmbeddedRouter) -> None:
     variables = town.variables("robot") | {"AIRA_CONNECT": router.endpoint}
-    done = aira("doctor", "--json", **variables)
+    done = aira("doctor", "--json", *PATIENT, **variables)
     found = objects(done)
 
     assert (done.returncode, done.stderr) == (0, "")
     assert all(list(each) == ["name", "ok", "found", "do", "code"] for each in found)
     assert all(each["ok"] is True and each["found"] for each in found)
-    assert {each["do"] for each in found} == {""}
+    assert {each["do"] for each in found if each["code"] != "disk-slow"} == {""}
 
 
 def test_json_of_a_failure_has_a_hint(town: ServedChain, router: EmbeddedRouter) -> None:
-    done = aira("doctor", "--json", "--role", "provider", "--connect", router.endpoint, **town.variables("stranger"))
+    words = ("--json", "--role", "provider", "--connect", router.endpoint, *PATIENT)
+    done = aira("doctor", *words, **town.variables("stranger"))
 
     assert done.returncode == 1
     (failed,) = [each for each in objects(done) if not each["ok"]]
@@ -154,7 +160,7 @@ def test_the_default_role_is_that_of_the_certificate(tmp_path: Path) -> None:
     settings = settings_of(site.client(folder))
     files = ("--tls-ca", settings.tls_ca, "--tls-certificate", settings.tls_certificate, "--tls-key", settings.tls_key)
     with site.open_router("wheel"):
-        done = aira("doctor", "--connect", site.endpoint, *files)
+        done = aira("doctor", "--connect", site.endpoint, *PATIENT, *files)
 
     assert done.returncode == 0, done.stdout
     assert "for the role operator" in done.stdout
@@ -181,7 +187,7 @@ def test_the_role_follows_from_the_settings() -> None:
 def test_nothing_is_left_behind(town: ServedChain, router: EmbeddedRouter, tmp_path: Path) -> None:
     before = sorted(os.listdir(tmp_path))
     variables = town.variables("robot") | {"AIRA_DATA_DIR": str(tmp_path / "state")}
-    done = aira("doctor", "--connect", router.endpoint, **variables)
+    done = aira("doctor", "--connect", router.endpoint, *PATIENT, **variables)
 
     assert done.returncode == 0, done.stdout
     assert sorted(os.listdir(tmp_path)) == before
@@ -204,7 +210,8 @@ def test_an_edge_machine_is_checked_without_the_packages_of_other_roles(tmp_path
     files = ("--tls-ca", settings.tls_ca, "--tls-certificate", settings.tls_certificate, "--tls-key", settings.tls_key)
     with site.open_router("wheel"):
         done = run(
-            sys.executable, "-c", SMALL, "doctor", "--json", "--port", "/dev/null", "--connect", site.endpoint, *files
+            *(sys.executable, "-c", SMALL, "doctor", "--json", "--port", "/dev/null", *PATIENT),
+            *("--connect", site.endpoint, *files),
         )
 
     found = {each["name"]: each for each in objects(done)}

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from tests.support.routers import EmbeddedRouter
 
+PATIENCE = 60.0
+"""Seconds in which a board that is there answers, on a busy machine."""
 IMPORTS = """
 import os, sys
 from bridges.serial.check import check_port
@@ -102,7 +104,7 @@ def test_a_port_without_an_answering_board_fails(silent: str) -> None:
 
 def test_an_answering_board_is_reported_with_its_protocol() -> None:
     with board(COUNTER) as there:
-        result = check.check_board(SerialSettings(port=str(there.port)))
+        result = check.check_board(SerialSettings(port=str(there.port)), timeout=PATIENCE)
 
     assert result.ok, result
     assert "answered in frames at 57600 baud" in result.message
@@ -110,9 +112,9 @@ def test_an_answering_board_is_reported_with_its_protocol() -> None:
 
 def test_a_rosserial_board_answers_in_rosserial_only() -> None:
     with board(ROSSERIAL_ECHO) as there:
-        as_rosserial = check.check_board(SerialSettings(port=str(there.port), protocol="rosserial"))
+        as_rosserial = check.check_board(SerialSettings(port=str(there.port), protocol="rosserial"), timeout=PATIENCE)
         as_frames = check.check_board(SerialSettings(port=str(there.port), protocol="frames", baud=57_600))
-        as_found = check.check_board(SerialSettings(port=str(there.port)))
+        as_found = check.check_board(SerialSettings(port=str(there.port)), timeout=PATIENCE)
 
     assert as_rosserial.ok, as_rosserial
     assert "answered in rosserial" in as_rosserial.message
