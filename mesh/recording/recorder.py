@@ -268,7 +268,7 @@ class Recorder:
             self._lost += len(refused)
             self._lost_played += sum(message[3] == "objective" for message, _ in refused)
             self._recorded += len(messages) - len(refused)
-        self._taken -= len(messages)
+            self._taken -= len(messages)
         for _, error in refused:
             event = log_event("recording-message-refused", path=self.path, error=error)
             log.warning("%s lacks a message: %s", self.path.name, error, extra=event)

@@ -160,8 +160,12 @@ async def test_blocks_of_an_unfinished_fetch_are_served(
             query.reply(query.key_expr, some_of_them[requested_cid(query)])
 
     async with Exchange(session, store) as exchange:
-        with answer_queries(other_session, give), pytest.raises(ContentUnavailable):
-            await exchange.fetch(root, timeout=0.3)
+        with answer_queries(other_session, give):
+            fetching = asyncio.create_task(exchange.fetch(root, timeout=600))
+            await until(lambda: all(map(store.get_block, some_of_them)), what="the blocks")
+            fetching.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await fetching
         replies = await asyncio.to_thread(lambda: list(other_session.get(cid_selector(cid=first), timeout=30.0)))
         assert [reply.ok.payload.to_bytes() for reply in replies if reply.ok] == [blocks[first]]
 

@@ -12,7 +12,7 @@ from mesh.errors import ClosedError, InvalidCid
 from schemas.selectors import cid_selector
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream, cid_of_bytes
 from tests.support.content import answer_queries, sample_bytes, until_held
-from tests.support.waiting import until
+from tests.support.waiting import at_most, until
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -138,11 +138,9 @@ async def test_a_cancelled_fetch_ends_and_can_be_repeated(
         fetching = asyncio.create_task(exchange.fetch(cid, timeout=600))
         while not holder.statistics().missed:
             await asyncio.sleep(0.01)
-        begin = time.monotonic()
         fetching.cancel()
-        with pytest.raises(asyncio.CancelledError):
+        with at_most(5), pytest.raises(asyncio.CancelledError):
             await fetching
-        assert time.monotonic() - begin < 5
         await asyncio.to_thread(holder_store.put_bytes, b"wanted")
         assert (await exchange.fetch(cid)).read_bytes() == b"wanted"
 

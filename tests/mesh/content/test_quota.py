@@ -274,7 +274,7 @@ def test_processes_together_stay_within_the_quota(tmp_path: Path) -> None:
         subprocess.Popen([sys.executable, "-c", GREEDY_WRITER, str(number), str(tmp_path), str(quota)], cwd=ROOT)
         for number in range(3)
     ]
-    assert [writer.wait(120) for writer in writers] == [0, 0, 0]
+    assert [writer.wait(300) for writer in writers] == [0, 0, 0]
     with Store(tmp_path, quota=quota) as store:
         assert store.usage().bytes == bytes_on_disk(store) <= quota
         assert store.check().damaged == ()

@@ -232,7 +232,7 @@ def test_processes_may_share_a_directory(tmp_path: Path) -> None:
     writers = [
         subprocess.Popen([sys.executable, "-c", WRITER, str(number), str(tmp_path)], cwd=ROOT) for number in range(3)
     ]
-    assert [writer.wait(60) for writer in writers] == [0, 0, 0]
+    assert [writer.wait(300) for writer in writers] == [0, 0, 0]
     with Store(tmp_path) as store:
         held = store.list()
         assert len(held) == 4 * 39
