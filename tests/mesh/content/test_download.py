@@ -161,8 +161,11 @@ async def test_blocks_of_an_unfinished_fetch_are_served(
 
     async with Exchange(session, store) as exchange:
         with answer_queries(other_session, give):
-            fetching = asyncio.create_task(exchange.fetch(root, timeout=600))
-            await until(lambda: all(map(store.get_block, some_of_them)), what="the blocks")
+            reported: list[tuple[int, int | None]] = []
+            fetching = asyncio.create_task(
+                exchange.fetch(root, timeout=600, progress=lambda done, total: reported.append((done, total)))
+            )
+            await until(lambda: (CHUNK_SIZE, len(data)) in reported, what="the first block")
             fetching.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await fetching
