@@ -102,8 +102,8 @@ async def open_when_ready(
         except RemoteError as error:
             if not waits_forever(settings):
                 raise
+            on_wait(str(error))  # before it is logged: who has read that asks for the health
             outages.failed(error, f"the {role} waits")
-            on_wait(str(error))
             if not await backoff.wait():
                 raise
         else:

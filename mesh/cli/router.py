@@ -129,14 +129,15 @@ async def serve(settings: Settings) -> None:
         while True:
             certificate = _own_certificate(endpoints)
             async with Network(endpoints) as network:
-                announce(
-                    log,
-                    "router-started",
-                    f"router {network.id} listens at {', '.join(settings.listen)}",
-                    zenoh=network.id,
-                )
-                announce(log, "access-loaded", _describe_access(endpoints))
+                # Before it is announced: who has read that finds it healthy.
                 with _serve_metrics(telemetry, network, drops):
+                    announce(
+                        log,
+                        "router-started",
+                        f"router {network.id} listens at {', '.join(settings.listen)}",
+                        zenoh=network.id,
+                    )
+                    announce(log, "access-loaded", _describe_access(endpoints))
                     async with Background() as tasks:
                         if blocked is not None:
                             tasks.start(guard(network.session, blocked, drops), "blocked sessions")
