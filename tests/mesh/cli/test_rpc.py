@@ -117,7 +117,7 @@ async def ask(place: Place, service: str, *arguments: str, as_json: bool = False
     async with Network(Endpoints(connect=(place.endpoint,))) as network:
         await until_answered(network.session, str(RpcKey(place.address("robot"), service)))
     called = place.address("robot"), service, arguments
-    await call_service(place.settings("watcher"), called, timeout=10.0, as_json=as_json)
+    await call_service(place.settings("watcher"), called, timeout=60.0, as_json=as_json)
 
 
 async def test_a_reply_is_printed_as_columns_or_json(place: Place, capsys: pytest.CaptureFixture[str]) -> None:

@@ -62,7 +62,7 @@ async def read_status(place: Place, role: str, capsys: pytest.CaptureFixture[str
     """The status of a role as `aira status --json` prints it."""
     async with Network(Endpoints(connect=(place.endpoint,))) as network:
         await until_answered(network.session, str(RpcKey(place.address(role), "status")))
-    await show_one(place.settings("watcher"), place.address(role), timeout=5.0, as_json=True)
+    await show_one(place.settings("watcher"), place.address(role), timeout=60.0, as_json=True)
     (found,) = json.loads(capsys.readouterr().out)
     assert isinstance(found, dict)
     return found
@@ -150,7 +150,7 @@ async def test_a_provider_reports_its_orders_and_earnings(place: Place, capsys: 
 
         await until_found(has_created, what="the contract in the provider's count", seconds=60)
         found = await read_status(place, "provider", capsys)
-        await show_one(place.settings("watcher"), place.address("provider"), timeout=5.0, as_json=False)
+        await show_one(place.settings("watcher"), place.address("provider"), timeout=60.0, as_json=False)
         shown = columns(capsys.readouterr().out)
     assert (found["role"], found["market"]["created"], found["market"]["openOrders"]) == ("provider", 1, 0)
     assert int(found["market"]["spent"]) > 0
@@ -162,12 +162,12 @@ async def test_each_peer_on_the_lighthouse_has_a_line(place: Place, capsys: pyte
     async with place.at_work(place.agent("robot")):
 
         async def all_there() -> bool:
-            await show_all(place.settings("watcher"), timeout=5.0, as_json=True)
+            await show_all(place.settings("watcher"), timeout=60.0, as_json=True)
             people = json.loads(capsys.readouterr().out)["peers"]
             return len(people) == 3 and all(person["status"] for person in people)
 
         await until_found(all_there, what="three peers", seconds=30)
-        await show_all(place.settings("watcher"), timeout=5.0, as_json=False)
+        await show_all(place.settings("watcher"), timeout=60.0, as_json=False)
     head, *rows = capsys.readouterr().out.splitlines()
     assert head.split() == ["role", "address", "status"]
     assert sorted(row.split()[0] for row in rows) == ["agent", "agent", "provider"]
@@ -179,7 +179,7 @@ async def test_a_peer_that_does_not_answer_is_listed(place: Place, capsys: pytes
         robot.channel.announce("person", STRANGER.address)
 
         async def is_there() -> bool:
-            await show_all(place.settings("watcher"), timeout=5.0, as_json=False)
+            await show_all(place.settings("watcher"), timeout=60.0, as_json=False)
             return f"person  {STRANGER.address}  no answer\n" in capsys.readouterr().out
 
         await until_found(is_there, what="the silent one", seconds=30)
