@@ -154,7 +154,7 @@ async def test_a_late_agent_receives_all_of_many_open_orders(place: Place) -> No
         for order in orders:
             provider.book.add(order)
         async with late:
-            await until(lambda: len(heard) + late.drops.totals().get("free-rate", 0) == len(orders), seconds=30)
+            await until(lambda: len(heard) + late.drops.totals().get("free-rate", 0) == len(orders), seconds=150)
 
 
 async def test_a_periodic_handler_is_called_at_the_start_and_again_after_failures(settings: Settings) -> None:

@@ -148,10 +148,10 @@ async def test_an_agent_that_goes_on_declining_is_not_heard(place: Place) -> Non
 
 async def test_declines_are_limited_for_each_maker(place: Place) -> None:
     drops = Drops()
+    demands = [orders.demand(signer=Signer(b"\x05" * 32)) for _ in range(int(PER_MAKER.burst) + 60)]
     async with place.agent("robot") as robot:
         publisher = DeclinePublisher(robot.channel, robot.parts.signer, drops)
-        for _ in range(int(PER_MAKER.burst) + 5):
-            signed = orders.demand(signer=Signer(b"\x05" * 32))
+        for signed in demands:
             publisher.decline(Verified(signed, secrets.token_bytes(32), place.address("person")), Grounds("busy", ""))
     assert drops.totals()["declines"] >= 4
 
