@@ -65,7 +65,13 @@ class LineClient:
 
     def call(self, topic: str, payload: bytes = b"") -> CommandFinished:
         """Submit a command and wait for its outcome."""
-        command = self.submit(topic, payload)
+        return self.ended(self.submit(topic, payload))
+
+    def ended(self, command: Command) -> CommandFinished:
+        """The outcome of a command, now or already."""
+        for event in self.events:
+            if isinstance(event, CommandFinished) and event.command is command:
+                return event
         while (ended := self.next(CommandFinished)).command is not command:
             pass
         return ended

@@ -21,6 +21,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
 from tests.support.peers import require
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,11 +111,12 @@ class Wallet:
         return self.rpc(method, *params)
 
     def give(self, address: str, *, wei: int = 0, token: str = "", units: int = 0) -> None:
-        """Send an account ether, or units of a token."""
+        """Send an account ether, or units of a token; it has them when this returns."""
         if token:
-            self._send({"to": token, "data": f"0xa9059cbb{int(address, 16):064x}{units:064x}"})
+            sent = self._send({"to": token, "data": f"0xa9059cbb{int(address, 16):064x}{units:064x}"})
         else:
-            self._send({"to": address, "data": "0x", "value": wei})
+            sent = self._send({"to": address, "data": "0x", "value": wei})
+        wait_until(lambda: self.rpc("eth_getTransactionReceipt", sent), what="the transaction's receipt")
 
     def _send(self, call: dict[str, Any]) -> Any:
         transaction = {

@@ -84,7 +84,7 @@ def test_hello_blink_colours_and_sensor(lesson: Browser, market: dict[str, str])
         sign(lesson)
         lesson.sees("the robot was paid")
         assert [change.high for change in uno.changes(13)].count(True) >= 3
-        assert "off" in recorded(lesson)
+        lesson.until(lambda: "off" in recorded(lesson), "the lamp's end")
     with at_work("blink_arguments", "colours", "frames", market) as uno:
         choose(lesson, "blink_arguments", "blue.mcap")
         sign(lesson)

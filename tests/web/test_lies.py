@@ -41,7 +41,7 @@ def test_a_lie_about_a_job_is_caught(site: Site, paid_job: str, lie: str) -> Non
         browser.go(f"job/{paid_job}")
         browser.driver.refresh()
         assert "Don't trust this server" in browser.find("#lie").text
-        assert browser.all(".findings .badge.bad")
+        browser.until(lambda: browser.all(".findings .badge.bad"), "the failed check")
 
 
 @pytest.mark.sample("path", "change", "said")

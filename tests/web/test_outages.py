@@ -96,8 +96,7 @@ def test_a_job_goes_on_when_router_and_node_come_back(fragile: Fragile) -> None:
 def test_an_owner_is_alerted_when_a_robot_does_not_answer(fragile: Fragile) -> None:
     with Browser(fragile.site.url) as browser:
         browser.go("robots")
-        browser.sees("agent")
-        assert "No answer:" not in browser.text()
+        browser.until(lambda: browser.all("td .dot.good") and "No answer:" not in browser.text(), "the robot's health")
         fragile.robot.pause()
         try:
             browser.sees("No answer:")

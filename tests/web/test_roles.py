@@ -77,11 +77,11 @@ def test_an_owner_sees_health_money_jobs_and_logs(browser: Browser, site: Site) 
     robot = facts(site, f"liabilities/{address}")["liability"]["promisor"]
     row = f"//tr[.//*[@title='{robot}']]"
     browser.until(lambda: "done" in browser.driver.find_element("xpath", row).text, "the robot's record")
-    browser.driver.find_element("xpath", f"{row}//button[contains(., 'Details')]").click()
+    browser.click(f"tr:has([title='{robot}']) button[aria-expanded]")
     browser.until(lambda: "Earned" in browser.find(".panel").text, "what the robot earned")
     browser.until(lambda: browser.all(f".panel [title='{address}']"), "the job")
     provider = facts(site, "lighthouse")["providers"][0]["address"]
-    browser.driver.find_element("xpath", f"//tr[.//*[@title='{provider}']]//button[contains(., 'Details')]").click()
+    browser.click(f"tr:has([title='{provider}']) button[aria-expanded]")
     browser.click("#log summary")
     browser.until(lambda: "contract-created" in browser.find("#log").text, "an event of the provider's log")
     assert browser.violations() == []
