@@ -43,7 +43,9 @@ if TYPE_CHECKING:
 
 E = TypeVar("E", bound=Exception)
 
-QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=2, retry_delay=0.01, receipt_timeout=30)
+QUICK = Timing(
+    poll_interval=0.02, receipt_interval=0.01, attempts=2, retry_delay=0.01, receipt_timeout=30, first_timeout=15
+)
 PLAN = DeploymentPlan(refund_delay=10, timeout_blocks=5)
 
 

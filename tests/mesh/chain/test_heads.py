@@ -22,6 +22,7 @@ from schemas.address import address_bytes
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.senders import NO_MINING
 from tests.support.nodes import Anvil
+from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -148,7 +149,12 @@ async def test_a_node_over_websocket_pushes_its_blocks(anvil: Anvil) -> None:
             await node.request("evm_mine")
             head = await waiting
             assert head.number == number
-        assert node.heads.is_pushed
+
+        async def pushed() -> bool:
+            await node.request("evm_mine")
+            return node.heads.is_pushed
+
+        await until_found(pushed, what="a block that the node pushes")
         assert node.heads.are_timely
 
 
