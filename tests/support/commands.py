@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 AIRA = (sys.executable, "-m", "mesh")
 SECONDS = 200.0
-SOON = 15
-"""Seconds in which a signal ends a command: a fraction of one on a machine that has nothing else to do."""
+SOON = 40
+"""Seconds in which a signal ends a command, however busy the machine is: else a fraction of one."""
 
 
 def aira(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:

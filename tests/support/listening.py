@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     import zenoh
 
-SOON: Final = 30.0
+SOON: Final = 60.0
 """Seconds in which messages arrive."""
 
 

@@ -63,7 +63,7 @@ async def stopped(serving: asyncio.Task[None]) -> None:
 
 
 async def said(serving: asyncio.Task[None], words: str, printed: Printed) -> None:
-    await until(lambda: serving.done() or words in printed, what=words, seconds=30)
+    await until(lambda: serving.done() or words in printed, what=words)
     if serving.done():
         await serving
 

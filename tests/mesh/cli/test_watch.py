@@ -81,7 +81,7 @@ async def test_a_job_is_printed_from_the_demand_to_the_payment(place: Place, pri
         await until_heard(person.parts.network.session, EVENT)
         contract = await person.demand(place.save(objective(("/go", "there"))), cost=5 * 10**9)
         outcome = await contract.outcome()
-        await until(lambda: {event["event"] for event in printed.events()} >= set(kinds), what="all events", seconds=30)
+        await until(lambda: {event["event"] for event in printed.events()} >= set(kinds), what="all events")
     events = {event["event"]: event for event in printed.events()}
     assert events["demand"]["signer"] == place.address("person")
     assert events["offer"]["signer"] == place.address("robot")
@@ -120,7 +120,7 @@ async def test_costs_are_printed_in_xrt_when_the_provider_names_the_token(place:
     async with place.provider(), place.agent("person") as person:
         demanding = asyncio.create_task(person.demand(place.save(objective(("/go", "x"))), cost=2_500_000_000))
         async with watching(place.settings("watcher")):
-            await until(lambda: "demand " in printed.read(), what="the open demand", seconds=30)
+            await until(lambda: "demand " in printed.read(), what="the open demand")
         demanding.cancel()
     assert f"{place.address('person')} pays 2.5 XRT, model {MODEL[:6]}…{MODEL[-4:]}, objective " in printed.out
 
@@ -129,7 +129,7 @@ async def test_an_order_that_was_open_before_is_printed_when_asked_for(place: Pl
     async with place.provider(), place.agent("person") as person:
         demanding = asyncio.create_task(person.demand(place.save(objective(("/go", "x"))), cost=1))
         async with watching(place.settings("watcher"), MODEL, json=True):
-            await until(lambda: [event["event"] for event in printed.events()] == ["demand"], what="it", seconds=30)
+            await until(lambda: [event["event"] for event in printed.events()] == ["demand"], what="it")
         demanding.cancel()
 
 
@@ -219,7 +219,7 @@ async def test_the_readings_of_a_result_without_a_contract_are_printed(place: Pl
         cid = sensor.parts.store.put_file(place.save(readings))
         signed = sensor.parts.signer.sign(Result(liability=place.address("robot"), result=cid, success=True))
         sensor.channel.publish(signed)
-        await until(lambda: len(printed.events()) >= 3, what="the Result and two readings", seconds=30)
+        await until(lambda: len(printed.events()) >= 3, what="the Result and two readings")
     work.cancel()
     with pytest.raises(asyncio.CancelledError):
         await work
@@ -242,7 +242,7 @@ async def test_the_readings_of_agents_are_printed_and_recorded(
         robot.network.session.put(stranger, b"1.5", encoding="application/json")  # is not present on the market
         for volts in (98.5, 98.25):
             robot.publish("/battery", volts)
-        await until(lambda: len(printed.events()) >= 2, what="the readings", seconds=30)
+        await until(lambda: len(printed.events()) >= 2, what="the readings")
     work.cancel()
     with pytest.raises(asyncio.CancelledError):
         await work
@@ -265,7 +265,7 @@ async def test_a_result_that_cannot_be_fetched_is_logged_and_blocks_nothing(
         ReadingFetcher(network.session, readings.append, timeout=0.5) as fetcher,
     ):
         fetcher.handle(verify_message(result(liability=CONTRACT)))
-        await until(lambda: "result-unreadable" in logged_events(caplog), what="the warning", seconds=30)
+        await until(lambda: "result-unreadable" in logged_events(caplog), what="the warning")
         fetcher.handle(JobEvent(ROBOT.address, "incoming", JOB))
         fetcher.handle(verify_message(result(liability=CONTRACT)))
         assert fetcher.pending == 0
