@@ -213,15 +213,26 @@ class CrashMarket:
         return [liability for liability in found if liability.objective == cid]
 
     async def _reorganise(self) -> None:
-        """Drop the last blocks. What anvil mines at the same moment may be left without its state: drop that, too."""
-        node = self._chain.node
+        """Drop the last blocks.
+
+        What anvil mines at the same moment may leave a gap in its chain, or be left without its state: drop that, too.
+        """
+        node, depth = self._chain.node, REORGANISED
         while True:
-            await node.request("anvil_reorg", REORGANISED, [])
-            events = await list_created(node, self._chain.factory, await node.block_number() - 2 * REORGANISED)
+            await node.request("anvil_reorg", depth, [])
+            head = await node.block_number()
+            recent = range(head - 4 * REORGANISED, head)
+            gaps = [number for number in recent if not await node.request("eth_getBlockByNumber", hex(number), False)]
+            if gaps:
+                print(f"anvil lost the blocks {gaps}", file=sys.stderr)
+                depth = head + 2 - gaps[0]
+                continue
+            events = await list_created(node, self._chain.factory, head - 2 * REORGANISED)
             made = [event.liability for event in events if isinstance(event, NewLiability)]
             if all([await node.code(liability) for liability in made]):
                 return
             print("anvil keeps logs without their state", file=sys.stderr)
+            depth = REORGANISED
 
     @contextmanager
     def _disk(self, cell: Cell) -> Iterator[Path | None]:
