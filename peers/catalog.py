@@ -28,7 +28,12 @@ SLITHER = PipRecipe(name="slither 0.11.6", manifest="slither")
 COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
 ROS2_SDK = PipRecipe(name="zenoh-ros2-sdk 0.1.8", manifest="zenoh-ros2-sdk")
 PAMOJA = PipRecipe(name="pamoja-ros2 0.2.0", manifest="pamoja-ros2")
-ROUTER = CargoRecipe(crate="zenohd", version="1.10.2")
+ROUTER = CargoRecipe(
+    crate="zenohd",
+    version="1.10.2",
+    # Tests wait for messages, not for the processor: this takes a third of the time of a release build.
+    environment={"CARGO_PROFILE_RELEASE_OPT_LEVEL": "1", "CARGO_PROFILE_RELEASE_CODEGEN_UNITS": "256"},
+)
 ROS2 = SourceRecipe(
     name="ros2-peer with hiroz 0.2.1",
     source=TESTS / "bridges" / "ros2" / "peer",
