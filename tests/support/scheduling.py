@@ -13,17 +13,24 @@ TOGETHER: Final = ("tests/web", "tests/bridges/ipfs", "tests/contracts")
 """Folders whose files share servers: one process runs all of them, and its servers end with the last file."""
 
 SECONDS: Final[dict[str, int]] = {
-    "tests/web": 400,
-    "tests/bridges/ipfs": 200,
+    "tests/web": 500,
+    "tests/bridges/ipfs": 380,
+    "tests/simulation/test_simulation.py": 190,
     "tests/contracts": 120,
     "tests/mesh/cli/test_serving.py": 115,
-    "tests/simulation/test_simulation.py": 105,
+    "tests/examples/test_blink.py": 110,
     "tests/mesh/market/test_provider_judgements.py": 85,
     "tests/mesh/cli/test_demand_validator.py": 80,
-    "tests/mesh/cli/test_chain_up.py": 60,
+    "tests/mesh/cli/test_killed_validator.py": 80,
+    "tests/simulation/test_markets.py": 80,
+    "tests/mesh/cli/test_chain_up.py": 70,
+    "tests/bridges/serial/test_firmware.py": 70,
+    "tests/simulation/test_model.py": 60,
+    "tests/mesh/operations/test_killed_demand.py": 55,
     "tests/mesh/cli/test_logs_of_roles.py": 50,
     "tests/peers/test_install.py": 50,
     "tests/mesh/demo/test_demo.py": 50,
+    "tests/mesh/cli/test_restarts.py": 50,
     "tests/mesh/validator/test_juries.py": 45,
     "tests/bridges/serial/test_edge_jobs.py": 40,
     "tests/mesh/agent/test_services.py": 40,
@@ -33,9 +40,12 @@ SECONDS: Final[dict[str, int]] = {
     "tests/mesh/doctor/test_command.py": 35,
     "tests/bridges/serial/test_detection.py": 35,
     "tests/mesh/cli/test_liability.py": 30,
-    "tests/examples/test_blink.py": 30,
+    "tests/packaging/test_wheel.py": 30,
+    "tests/mesh/content/test_names.py": 30,
+    "tests/examples/test_ros2_patrol.py": 30,
+    "tests/examples/test_rover.py": 30,
 }
-"""Roughly how long the longest files and folders take on a busy machine. All others are short."""
+"""Roughly how long the longest files and folders take in CI. All others are short."""
 
 
 class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
