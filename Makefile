@@ -18,9 +18,8 @@ BENCHES := $(shell grep -l __main__ bench/*.py)
 JOBS ?= $(shell echo $$((2 * $$(getconf _NPROCESSORS_ONLN))))
 # CI measures coverage, which takes time.
 COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
-# A busy machine may delay or drop what a test waits for. A failed test runs again, at most twice, and at most eight in all;
-# each is shown with its traceback.
-RERUNS := --reruns 2 --max-suite-reruns 8 --rerun-show-tracebacks
+# A busy machine may delay or drop what a test waits for. At most three tests run a second time, each with its traceback.
+RERUNS := --reruns 1 --max-suite-reruns 3 --rerun-show-tracebacks
 
 .PHONY: help setup demo test simulate simulate-mutants compose-test crash-test lint peers bench contracts contracts-check \
 	page page-check slither firmware lock clean

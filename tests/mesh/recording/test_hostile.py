@@ -24,9 +24,9 @@ ROOT = Path(__file__).parents[3]
 MUTANTS = 40
 """Of each of the eight valid files."""
 MEMORY = 256 << 20
-SECONDS = 15.0
-"""Of the processor, which others at work on the machine at most double. The slowest file takes a fifth of it where this
-was written; reading it once more when it is played is measured apart."""
+SECONDS = 5.0
+"""Of the processor, which others at work on the machine hardly change. The slowest file takes half of it where this was
+written; reading it once more when it is played is measured apart."""
 REASONS = {"not-a-recording", "corrupt", "expands-too-much", "too-long", "unreadable-message", "unplayable-topic"}
 OPENING = """
 import json, sys, time

@@ -33,7 +33,6 @@ from tests.mesh.validator.faults import (
 )
 from tests.mesh.validator.lamps import (
     LEVELS,
-    PATIENT,
     ROBOT,
     SLACK_NS,
     Crashed,
@@ -192,7 +191,7 @@ async def several_devices(place: Place, name: str) -> FinishedJob:
 async def signed_again(place: Place, name: str) -> FinishedJob:
     """A reorganisation took the contract back, and the robot signs and sends its Result again."""
     job = await place.robot(name).work(name, place.order(name))
-    first = job.judge({}, PATIENT)
+    first = job.judge({})
     assert first.success
     return replace(job, message=signed_by(ROBOT, job.liability.address, cid_of_file(job.recording)))
 

@@ -97,13 +97,6 @@ SHIPPED: Final = (
 )
 OWN: Final = OwnPolicy("levels", "The lamp shows each level that it was told to.", follows_levels)
 POLICIES: Final[tuple[Policy, ...]] = (*map(policy_of, SHIPPED), OWN)
-PATIENT: Final[tuple[Policy, ...]] = (
-    policy_of("acknowledged:command=/lamp:answer=/lamp/state:within=1m"),
-    policy_of("schema"),
-    policy_of("rate:topic=/lamp/temperature:min=0.05:max=1000:gap=1m"),
-    OWN,
-)
-"""The same for robots on a machine that may do nothing for them for seconds."""
 
 
 def order(path: Path, levels: tuple[float, ...] = LEVELS, *, step_ns: int = 5 * MILLISECOND) -> Path:

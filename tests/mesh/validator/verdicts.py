@@ -9,7 +9,7 @@ import zenoh
 
 from tests.mesh.validator.faults import Place
 from tests.mesh.validator.honest import KINDS
-from tests.mesh.validator.lamps import LEVELS, PATIENT, THIEF, LampRobot, order
+from tests.mesh.validator.lamps import LEVELS, THIEF, LampRobot, order
 from tests.mesh.validator.tampered_claims import tampered, tamperings
 from tests.mesh.validator.tampering import Others
 from tests.support.routers import client_config
@@ -80,4 +80,4 @@ async def judge_honest(endpoint: str, folder: Path, *, of_each: int = 100) -> li
 
         jobs = await asyncio.gather(*(work(one, number) for one in KINDS for number in range(min(one.jobs, of_each))))
     judged: dict[str, str] = {}
-    return [HonestVerdict(kind, job, job.judge(judged, PATIENT)) for kind, job in jobs]
+    return [HonestVerdict(kind, job, job.judge(judged)) for kind, job in jobs]
