@@ -6,12 +6,14 @@ import asyncio
 import os
 import time
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
     import zenoh
+
+T = TypeVar("T")
 
 SECONDS = 60.0
 PAUSE = 0.005
@@ -37,12 +39,13 @@ def wait_until(condition: Callable[[], object], *, what: str = "", seconds: floa
         time.sleep(PAUSE)
 
 
-async def until_found(search: Callable[[], Awaitable[object]], *, what: str = "", seconds: float = SECONDS) -> None:
-    """As `until`, for a question that is itself waited for."""
+async def until_found(search: Callable[[], Awaitable[T]], *, what: str = "", seconds: float = SECONDS) -> T:
+    """As `until`, for a question that is itself waited for; returns its answer."""
     deadline = time.monotonic() + seconds
-    while not await search():
+    while not (found := await search()):
         assert time.monotonic() < deadline, f"{what or 'the condition'} did not come about within {seconds:g} s"
         await asyncio.sleep(PAUSE)
+    return found
 
 
 async def until_heard(session: zenoh.Session, key: str) -> None:

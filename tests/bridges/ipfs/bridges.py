@@ -95,15 +95,12 @@ async def status_of_the_bridge(session: zenoh.Session, topic: str) -> BridgeStat
     """What the only bridge of a market replies for its status."""
     nobody = "0x" + "0" * 40
     key = bridge_status_key(nobody, topic).replace(nobody, "*")
-    replies: list[zenoh.Sample] = []
 
-    async def has_answered() -> bool:
-        asked = await asyncio.to_thread(lambda: list(session.get(key, timeout=30.0)))
-        replies[:] = [reply.ok for reply in asked if reply.ok is not None]
-        return bool(replies)
+    async def answers() -> list[zenoh.Sample]:
+        replies = await asyncio.to_thread(lambda: list(session.get(key, timeout=30.0)))
+        return [reply.ok for reply in replies if reply.ok is not None]
 
-    await until_found(has_answered, what="the bridge's status")  # it is declared after the bridge's token
-    (reply,) = replies
+    (reply,) = await until_found(answers, what="the bridge's status")  # it is declared after the bridge's token
     status = BridgeStatus.decode(reply.payload.to_bytes())
     assert str(reply.key_expr) == bridge_status_key(status.bridge, topic)
     return status

@@ -113,8 +113,7 @@ async def test_the_stream_tells_each_step_of_a_job(place: Place, serve: Any) -> 
             agents = (await browser.get("agents"))["agents"]
             return [one for one in agents if one["address"] == place.address("robot") and one["health"] == "alive"]
 
-        await until_found(answering, what="the robot's answer")
-        (about,) = await answering()
+        (about,) = await until_found(answering, what="the robot's answer")
         assert about["models"] == [MODEL]
         assert about["record"]["done"] >= 1
         jobs = await browser.get("liabilities", party=place.address("person"), limit=1)

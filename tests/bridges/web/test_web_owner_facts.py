@@ -24,8 +24,7 @@ async def test_a_robot_that_waits_for_demands_shows_its_model(place: Place, serv
         async def answering() -> list[Any]:
             return [agent for agent in (await browser.get("agents"))["agents"] if agent["status"]]
 
-        await until_found(answering, what="the robot's answer")
-        (robot,) = await answering()
+        (robot,) = await until_found(answering, what="the robot's answer")
         assert (robot["offers"], robot["models"]) == ([], [MODEL])
         assert robot["status"]["model"] == MODEL
 

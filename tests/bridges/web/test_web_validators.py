@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from tests.support.market import Place
 
 
-async def until_online(browser: Any, juror: Juror) -> None:
-    """Return when the page knows of a juror, and has its announcement."""
+async def once_online(browser: Any, juror: Juror) -> Any:
+    """What the page knows of a validator once its juror is present and has announced itself."""
 
-    async def is_online() -> bool:
+    async def online() -> Any:
         said = await browser.get(f"validators/{juror.signer.address}")
-        return bool(said["online"] and said["announcements"])
+        return said if said["online"] and said["announcements"] else None
 
-    await until_found(is_online, what="the juror")
+    return await until_found(online, what="the juror")
 
 
 async def test_a_job_shows_its_verdict_and_why_it_was_refused(place: Place, serve: Any) -> None:
@@ -53,8 +53,7 @@ async def test_a_job_shows_its_verdict_and_why_it_was_refused(place: Place, serv
             is_judged = any(step["kind"] == "judged" for step in shown["timeline"])
             return shown if is_judged and shown["liability"]["state"] == "failed" else None
 
-        await until_found(refused, what="the refusal")
-        shown = await refused()
+        shown = await until_found(refused, what="the refusal")
         (judged,) = [step for step in shown["timeline"] if step["kind"] == "judged"]
         assert judged["agent"] == report.juror
         assert MISSING.detail in judged["detail"]
@@ -63,8 +62,7 @@ async def test_a_job_shows_its_verdict_and_why_it_was_refused(place: Place, serv
 
 async def test_the_page_says_how_a_validator_judges_before_a_demand_is_signed(place: Place, serve: Any) -> None:
     async with juror_of(place) as juror, serve() as browser:
-        await until_online(browser, juror)
-        said = await browser.get(f"validators/{juror.signer.address}")
+        said = await once_online(browser, juror)
         assert (said["title"], said["online"]) == (juror.title, [juror.signer.address])
         assert said["policies"] == [{"name": COMPLETE.name, "description": COMPLETE.description}]
         assert (said["announcedFee"], said["fee"], said["doubts"]) == ("100", "100", {})
@@ -83,7 +81,7 @@ async def test_the_page_says_how_a_validator_judges_before_a_demand_is_signed(pl
 @pytest.mark.parametrize("doubt", ["silent", "low-fee"])
 async def test_the_local_account_orders_from_no_doubtful_validator(place: Place, serve: Any, doubt: str) -> None:
     async with juror_of(place) as juror, serve("person") as browser:
-        await until_online(browser, juror)
+        await once_online(browser, juror)
         validator = juror.signer.address if doubt == "low-fee" else place.market.accounts["robot"].signer.address
         wanted = {"model": MODEL, "objective": MODEL, "cost": "5", "validator": validator, "validatorFee": "1"}
         refused = await browser.post("local/orders", wanted, status=400)

@@ -135,13 +135,13 @@ async def announcements_of(agent: Agent, validator: str, *, jurors: int = 1) -> 
 
     They hear Results then: they subscribe before.
     """
-    selector, payloads = str(ValidatorKey(agent.channel.lighthouse, validator)), list[bytes]()
+    selector = str(ValidatorKey(agent.channel.lighthouse, validator))
 
-    async def have_all_answered() -> bool:
-        payloads[:] = await asked(agent, selector)
-        return len(payloads) >= jurors
+    async def announced() -> list[bytes]:
+        payloads = await asked(agent, selector)
+        return payloads if len(payloads) >= jurors else []
 
-    await until_found(have_all_answered, what=f"{jurors} announcements")
+    payloads = await until_found(announced, what=f"{jurors} announcements")
     return [ValidatorAnnouncement.decode(payload) for payload in payloads]
 
 
