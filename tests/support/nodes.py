@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import time
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
 from tests.support.processes import Server
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,19 +49,17 @@ class Anvil(Server):
         return self.folder / "anvil.json"
 
 
-def written_state(state: Path) -> bytes:
-    """The file of an anvil's state with all blocks of now: what it writes the second time from now."""
+def written_state(state: Path, block: int) -> bytes:
+    """The file with an anvil's state, once it has the block: a killed node loses later ones."""
+    content = b""
 
-    def written_at() -> int:
-        return state.stat().st_mtime_ns if state.exists() else 0
+    def has_block() -> bool:
+        nonlocal content
+        try:
+            content = state.read_bytes()
+            return int(json.loads(content)["best_block_number"]) >= block
+        except (OSError, ValueError):
+            return False  # it is being written
 
-    for _ in range(2):
-        before = written_at()
-        while written_at() == before:
-            time.sleep(0.02)
-    while True:
-        written = state.read_bytes()
-        with suppress(ValueError):  # while it is being written
-            json.loads(written)
-            return written
-        time.sleep(0.02)
+    wait_until(has_block, what=f"block {block} in {state}")
+    return content

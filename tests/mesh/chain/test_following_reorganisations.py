@@ -253,7 +253,7 @@ async def test_events_that_a_killed_node_lost_are_reverted(tmp_path: Path, caplo
             kept = await fork.approve(1)
             async with aclosing(chain.follow(kept, history=history)) as events:
                 await _until(events, _reaches(kept))
-                written = await asyncio.to_thread(written_state, state)
+                written = await asyncio.to_thread(written_state, state, kept)
                 lost = await fork.approve(2)
                 await _until(events, _reaches(lost))
                 await asyncio.to_thread(anvil.kill)

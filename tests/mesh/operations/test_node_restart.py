@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from tests.mesh.operations.site import FEE, Site, has_event, has_traceback
-from tests.support.nodes import Anvil
+from tests.support.nodes import Anvil, written_state
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -30,25 +29,6 @@ async def lasting_node(state: Path) -> AsyncIterator[Anvil]:
     arguments = ("--state", str(state), "--state-interval", "1", "--preserve-historical-states")
     async with Anvil(arguments=arguments) as node:
         yield node
-
-
-async def written(state: Path, block: int) -> bytes:
-    """Wait until a block is in the file, and return the file's content; a killed node loses later blocks."""
-    content = b""
-
-    def holds() -> bool:
-        nonlocal content
-        try:
-            content = state.read_bytes()
-            return int(json.loads(content)["best_block_number"]) >= block
-        except (OSError, ValueError):
-            return False  # it is being written
-
-    async def look() -> bool:
-        return await asyncio.to_thread(holds)
-
-    await until_found(look, what=f"block {block} in {state}", seconds=TIMEOUT)
-    return content
 
 
 def outages(caplog: pytest.LogCaptureFixture) -> int:
@@ -80,7 +60,8 @@ async def test_jobs_from_before_and_after_an_outage_of_the_node_are_done(
             before = await person.parts.chain.tokens.balance(site.address("robot"))
             early = await person.demand(site.job("early"), cost=COST)
             await until(lambda: done, what="the early job under way", seconds=TIMEOUT)
-            content = await written(state, await person.parts.chain.block_number())
+            head = await person.parts.chain.block_number()
+            content = await asyncio.to_thread(written_state, state, head)
 
             await asyncio.to_thread(getattr(node, end))
             if end == "kill":
