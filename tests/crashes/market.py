@@ -60,7 +60,6 @@ class CrashMarket:
 
     def __init__(self, generation: int = 3) -> None:
         self._options = dict(GENERATION_5) if generation == 5 else {}
-        self.folder = Path(tempfile.mkdtemp(prefix="aira-crashes-"))
         self._stack = ExitStack()
         self._running: dict[str, Serving] = {}
         self._played = 0
@@ -68,6 +67,7 @@ class CrashMarket:
         """Of processes that ended by themselves in this cell."""
 
     def __enter__(self) -> Self:
+        self.folder = Path(tempfile.mkdtemp(prefix="aira-crashes-"))
         self._stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
         self.node = self._stack.enter_context(Anvil(arguments=("--block-time", "0.5", "--mixed-mining")))
         self.router = self._stack.enter_context(Zenohd())
@@ -89,6 +89,14 @@ class CrashMarket:
 
     def play(self, cell: Cell) -> None:
         """One job with the fault, to its end: the contract is paid once or refunded, and the recording complete."""
+        try:
+            self._play(cell)
+        except AssertionError:
+            self.__exit__()  # what failed must not fail the next cells: they get a new market
+            self.__enter__()
+            raise
+
+    def _play(self, cell: Cell) -> None:
         self._played += 1
         control = self.folder / f"control-{self._played}"
         control.mkdir()

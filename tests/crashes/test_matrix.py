@@ -7,6 +7,8 @@ separated by commas.
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
+from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import pytest
@@ -15,7 +17,7 @@ from tests.crashes.market import CrashMarket
 from tests.crashes.matrix import CELLS, FAULTS, JURY_POINTS, POINTS, SHARED, Cell
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 SAMPLE: Final = (
     "provider-kill-",
@@ -42,27 +44,17 @@ def chosen() -> tuple[Cell, ...]:
 
 
 @pytest.fixture(scope="module")
-def markets() -> Iterator[dict[int, CrashMarket]]:
-    """The markets that run, by generation."""
-    running: dict[int, CrashMarket] = {}
-    try:
-        yield running
-    finally:
-        for market in running.values():
-            market.__exit__()
+def markets() -> Iterator[Callable[[int], CrashMarket]]:
+    """The market of a generation."""
+    with ExitStack() as stack:
+        yield cache(lambda generation: stack.enter_context(CrashMarket(generation)))
 
 
 if CHOSEN := chosen():
 
     @pytest.mark.parametrize("cell", CHOSEN, ids=lambda cell: cell.name)
-    def test_a_job_survives_the_fault(markets: dict[int, CrashMarket], cell: Cell) -> None:
-        if cell.generation not in markets:
-            markets[cell.generation] = CrashMarket(cell.generation).__enter__()
-        try:
-            markets[cell.generation].play(cell)
-        except AssertionError:
-            markets.pop(cell.generation).__exit__()  # what failed must not fail the next cells
-            raise
+    def test_a_job_survives_the_fault(markets: Callable[[int], CrashMarket], cell: Cell) -> None:
+        markets(cell.generation).play(cell)
 
 
 def test_each_point_is_a_method() -> None:
