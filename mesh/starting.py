@@ -102,7 +102,7 @@ async def open_when_ready(
         except RemoteError as error:
             if not waits_forever(settings):
                 raise
-            on_wait(str(error))  # before it is logged: who has read that asks for the health
+            on_wait(str(error))  # first: a reader of the log may ask for the health at once
             outages.failed(error, f"the {role} waits")
             if not await backoff.wait():
                 raise

@@ -129,7 +129,7 @@ async def serve(settings: Settings) -> None:
         while True:
             certificate = _own_certificate(endpoints)
             async with Network(endpoints) as network:
-                # Before it is announced: who has read that finds it healthy.
+                # Served first: a reader of the announcement may ask for the health at once.
                 with _serve_metrics(telemetry, network, drops):
                     announce(
                         log,

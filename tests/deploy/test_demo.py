@@ -37,7 +37,7 @@ async def test_a_new_market_starts_and_does_a_job_that_the_logs_show(
     assert demo.log("agent").count("the lamp is on") == 3
     liability = story.split("contract ")[1].split()[0]
     finalized = f"{liability}: finalized, success True"
-    await demo.until(lambda: finalized in demo.log("provider"), what="the provider's word", seconds=60)
+    await demo.until(lambda: finalized in demo.log("provider"), what="the end in the provider's log", seconds=60)
     assert liability in demo.log("agent")
 
 

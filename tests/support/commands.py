@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 AIRA = (sys.executable, "-m", "mesh")
 SECONDS = 200.0
 SOON = 40
-"""Seconds in which a signal ends a command, however busy the machine is: else a fraction of one."""
+"""Seconds in which a signal ends a command on a busy machine; on an idle one it takes less than one."""
 
 
 def aira(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 START_SECONDS = 180.0
 STOP_SECONDS = 30.0
 KILL_SECONDS = 60.0
-"""In which a killed process ends, however busy the machine is."""
+"""In which a killed process ends on a busy machine."""
 POLL_SECONDS = 0.02
 LOG_LINES = 40
 

@@ -22,9 +22,9 @@ async def test_an_agent_with_an_account_passes(machine: Machine) -> None:
     found = await machine.examined("agent", "robot")
 
     assert found.failed == []
-    told = {result.code: result.status for results in found.values() for result in results}
-    told.pop("disk-slow", None)  # others keep it busy
-    assert set(told.values()) == {CheckStatus.OK}
+    statuses = {result.code: result.status for results in found.values() for result in results}
+    statuses.pop("disk-slow", None)  # other programs may keep it busy
+    assert set(statuses.values()) == {CheckStatus.OK}
     assert machine.town.url in found.one("node").message
     assert found.one("contracts").code == "own"
     assert "1 provider" in found.one("lighthouse").message

@@ -32,7 +32,7 @@ ARM = "0x" + "0a" * 20
 PATIENT = ("--timeout", "90")
 """For checks that pass, also on a busy machine."""
 BUSY_DISK = "; with warnings: data folder"
-"""What is said of a disk that others keep busy."""
+"""The end of the last line if other programs keep the disk busy."""
 
 
 def objects(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
