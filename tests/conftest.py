@@ -24,6 +24,9 @@ gc.disable()  # until all tests are collected: they stay, and looking through th
 ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
 """Parameters that name a second implementation of what another parameter of the same test names already."""
 
+MEASURED: Final = ("tests/schemas/", "tests/mesh/")
+"""Whose tests measure coverage: those of the packages that have a bar for it."""
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Everything in CI; by default one EVM and one router, no `full` tests, and one value of `sample` parameters."""
@@ -31,7 +34,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
     groups: dict[tuple[object, ...], list[pytest.Item]] = {}
     for item in items:
-        if not _is_alternative(item) and item.get_closest_marker("full") is None:
+        if not _is_only_in_ci(item):
             groups.setdefault(_without_samples(item), []).append(item)
     sampled_before: Counter[object] = Counter()
     kept = set[pytest.Item]()
@@ -56,6 +59,20 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
     from tests.support.scheduling import LongestFirst
 
     return LongestFirst(config, log)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Measure no coverage in a test of another package or in one that only CI runs: measuring doubles its time."""
+    plugin = item.config.pluginmanager.getplugin("_cov")
+    measures = plugin.cov_controller if plugin else None
+    if measures is None or (item.nodeid.startswith(MEASURED) and not _is_only_in_ci(item)):
+        return (yield)
+    measures.pause()
+    try:
+        return (yield)
+    finally:
+        measures.resume()
 
 
 @pytest.fixture
@@ -89,6 +106,10 @@ def _without_samples(item: pytest.Item) -> tuple[object, ...]:
     return item.path, item.nodeid.partition("[")[0], *rest
 
 
-def _is_alternative(item: pytest.Item) -> bool:
+def _is_only_in_ci(item: pytest.Item) -> bool:
+    """Whether `item` is `full`, or one with an alternative among its parameters."""
     call = getattr(item, "callspec", None)
-    return call is not None and any(isinstance(value, str) and value in ALTERNATIVES for value in call.params.values())
+    values = call.params.values() if call is not None else ()
+    return item.get_closest_marker("full") is not None or any(
+        isinstance(value, str) and value in ALTERNATIVES for value in values
+    )
