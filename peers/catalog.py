@@ -28,12 +28,7 @@ SLITHER = PipRecipe(name="slither 0.11.6", manifest="slither")
 COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
 ROS2_SDK = PipRecipe(name="zenoh-ros2-sdk 0.1.8", manifest="zenoh-ros2-sdk")
 PAMOJA = PipRecipe(name="pamoja-ros2 0.2.0", manifest="pamoja-ros2")
-ROUTER = CargoRecipe(
-    crate="zenohd",
-    version="1.10.2",
-    # Tests wait for messages, not for the processor: this takes a third of the time of a release build.
-    environment={"CARGO_PROFILE_RELEASE_OPT_LEVEL": "1", "CARGO_PROFILE_RELEASE_CODEGEN_UNITS": "256"},
-)
+ROUTER = CargoRecipe(crate="zenohd", version="1.10.2")
 ROS2 = SourceRecipe(
     name="ros2-peer with hiroz 0.2.1",
     source=TESTS / "bridges" / "ros2" / "peer",
@@ -49,8 +44,8 @@ CONTAINERS = AptRecipe(
 )
 BASE = DebianRecipe(name="base image", release="bookworm", packages=("python3", "python3-venv", "ca-certificates"))
 
-# In this order they are installed: the quick ones first.
-RECIPES: tuple[Recipe, ...] = (
+# In this order they are installed.
+DOWNLOADED: tuple[Recipe, ...] = (
     CHAIN,
     AXE,
     CLIENT_3,
@@ -66,9 +61,8 @@ RECIPES: tuple[Recipe, ...] = (
     UNITS,
     CONTAINERS,
     BASE,
-    ROUTER,
-    ROS2,
 )
+COMPILED: tuple[Recipe, ...] = (ROUTER, ROS2)
 
 
 class PeerMissing(Exception):

@@ -1,7 +1,7 @@
 """`python -m peers.install`: install the missing peers, go on when one fails, and list at the end what is installed.
 
-It may be run any number of times, and by several people at once. It exits with 1 only where `AIRA_REQUIRE_PEERS=1`
-asks for all peers and one that a recipe should have given is missing.
+Some are compiled while the others are downloaded. It may be run any number of times, and by several people at once. It
+exits with 1 only where `AIRA_REQUIRE_PEERS=1` asks for all peers and one that a recipe should have given is missing.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ import fcntl
 import os
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from peers.catalog import PEERS, RECIPES, PeerMissing
+from peers.catalog import COMPILED, DOWNLOADED, PEERS, PeerMissing
 from peers.recipes import cache_folder
 from peers.running import InstallFailed, Runner
 
@@ -23,10 +24,15 @@ if TYPE_CHECKING:
     from peers.recipes import Recipe
 
 
-def main(recipes: Sequence[Recipe] = RECIPES) -> int:
-    """Install what is missing, print the table, and return the exit code."""
-    with _alone():
-        failures = {recipe.name: reason for recipe in recipes if (reason := _install(recipe))}
+def main(*queues: Sequence[Recipe]) -> int:
+    """Install what is missing, print the table, and return the exit code.
+
+    The recipes of one queue run one after the other, and the queues at the same time.
+    """
+    failures: dict[str, str] = {}
+    with _alone(), ThreadPoolExecutor(max_workers=max(1, len(queues))) as threads:
+        for failed in threads.map(_install_all, queues):
+            failures |= failed
     missing = _print_table(failures)
     if os.environ.get("AIRA_REQUIRE_PEERS") == "1" and missing:
         print(f"\nAIRA_REQUIRE_PEERS=1, but missing: {', '.join(missing)}", file=sys.stderr)
@@ -34,20 +40,25 @@ def main(recipes: Sequence[Recipe] = RECIPES) -> int:
     return 0
 
 
+def _install_all(recipes: Sequence[Recipe]) -> dict[str, str]:
+    """Run `recipes` in turn; return the names of those that failed, with the reasons."""
+    return {recipe.name: reason for recipe in recipes if (reason := _install(recipe))}
+
+
 def _install(recipe: Recipe) -> str:
     """Run `recipe` if a peer that it gives is missing; return why it failed, or nothing."""
     if recipe.is_complete() and not _missing_from(recipe):
         return ""
-    print(f"installing {recipe.name} ...", flush=True)
+    print(f"{recipe.name}: installing ...", flush=True)
     started = time.monotonic()
     log = cache_folder() / "logs" / f"{recipe.name.split()[0]}.log"
     log.unlink(missing_ok=True)
     try:
         recipe.install(Runner(log=log, environment=recipe.environment))
     except (InstallFailed, OSError) as error:
-        print(f"  failed: {error}", flush=True)
+        print(f"{recipe.name}: failed: {error}", flush=True)
         return str(error)
-    print(f"  done in {time.monotonic() - started:.0f} s", flush=True)
+    print(f"{recipe.name}: installed in {time.monotonic() - started:.0f} s", flush=True)
     return ""
 
 
@@ -81,4 +92,4 @@ def _alone() -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(COMPILED, DOWNLOADED))

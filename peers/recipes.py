@@ -104,13 +104,27 @@ class PipRecipe:
         return MANIFESTS / "pip" / f"{self.manifest}.txt"
 
 
+COMPILING = {
+    "CARGO_PROFILE_DEV_DEBUG": "false",
+    "CARGO_PROFILE_DEV_DEBUG_ASSERTIONS": "false",
+    "CARGO_PROFILE_DEV_INCREMENTAL": "false",
+    "CARGO_PROFILE_DEV_OVERFLOW_CHECKS": "false",
+}
+"""What compiles fastest and behaves like a release: tests wait for messages, not for the processor."""
+
+
+def build_folder() -> Path:
+    """Where programs in Rust are compiled: what two of them need is compiled once, and kept for the next version."""
+    return cache_folder() / "cargo"
+
+
 @dataclass(frozen=True, kw_only=True)
 class CargoRecipe:
     """One program built from crates: minutes on all cores, so it is rebuilt only for another version."""
 
     crate: str
     version: str
-    environment: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=lambda: COMPILING)
 
     @property
     def name(self) -> str:
@@ -126,24 +140,20 @@ class CargoRecipe:
         return record.exists() and f'"{self.crate} {self.version} ' in record.read_text()
 
     def install(self, run: Runner) -> None:
-        build = self.folder / "build"
-        into = ["--root", str(self.folder), "--target-dir", str(build)]
-        run(["cargo", "install", "--locked", "--force", *into, "--version", self.version, self.crate], timeout=2400)
-        shutil.rmtree(build, ignore_errors=True)
+        into = ["--root", str(self.folder), "--target-dir", str(build_folder())]
+        chosen = ["--version", self.version, self.crate]
+        run(["cargo", "install", "--debug", "--locked", "--force", *into, *chosen], timeout=2400)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceRecipe:
-    """A program of this repository in Rust, built by its lock file: once with each set of features.
-
-    What its dependencies compiled to is kept, since they take minutes and a change of the program seconds.
-    """
+    """A program of this repository in Rust, built by its lock file: once with each set of features."""
 
     name: str
     source: Path
     programs: Mapping[str, str]
     """The names of the programs, each with the features that it is built with."""
-    environment: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=lambda: COMPILING)
 
     @property
     def folder(self) -> Path:
@@ -154,12 +164,11 @@ class SourceRecipe:
 
     def install(self, run: Runner) -> None:
         files = self._files()
-        build = self.folder / "build"
         (self.folder / "bin").mkdir(parents=True, exist_ok=True)
         for program, features in self.programs.items():
-            chosen = ["--no-default-features", "--features", features, "--target-dir", str(build)]
+            chosen = ["--no-default-features", "--features", features, "--target-dir", str(build_folder())]
             run(["cargo", "build", "--locked", *chosen], timeout=2400, cwd=self.source)
-            shutil.copy(build / "debug" / self.name.split()[0], self.folder / "bin" / program)
+            shutil.copy(build_folder() / "debug" / self.name.split()[0], self.folder / "bin" / program)
         _mark(self.folder, _fingerprint(files))
 
     def _files(self) -> list[Path]:

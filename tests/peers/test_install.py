@@ -56,7 +56,7 @@ def test_missing_peers_are_an_error_only_if_all_are_required(
     cache: Path, monkeypatch: pytest.MonkeyPatch, required: str, code: int
 ) -> None:
     monkeypatch.setenv("AIRA_REQUIRE_PEERS", required)
-    assert install.main(recipes=()) == code
+    assert install.main() == code
 
 
 def test_a_partly_installed_folder_is_not_complete(cache: Path) -> None:
@@ -90,7 +90,7 @@ def test_a_program_is_built_again_when_its_source_changes(cache: Path, tmp_path:
     class CargoOnPaper(Runner):
         def __call__(self, command: Sequence[str | Path], *, timeout: float, cwd: Path | None = None) -> None:
             ran.append([str(word) for word in command])
-            program = recipe.folder / "build/debug/ros2-peer"
+            program = cache / "cargo/debug/ros2-peer"
             program.parent.mkdir(parents=True, exist_ok=True)
             program.write_text(str(len(ran)))
 
