@@ -145,6 +145,8 @@ class OriginalContracts(ContractVersion):
     def validation(self, result: Result, *, agree: bool) -> ContractCall:
         if self.generation == 5:
             raise NotOffered("finalization by a validator's own account", self.generation)
+        if result.success and not agree:
+            raise NotOffered("refusal by a validator: they would pay the promisor", self.generation)
         return super().validation(result, agree=agree)
 
     def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> ContractCall:

@@ -198,7 +198,8 @@ class Liabilities:
     async def validate(self, result: Result, *, agree: bool) -> Settled:
         """Finalize a generation-3 liability as the validator that it names.
 
-        Without `agree` the promisee is paid back, as for a result without success.
+        Without `agree` the promisee is paid back, as for a result without success. Raises `NotOffered` for that on the
+        original contracts, which would pay the promisor.
         """
         return await self._settle(self._contracts.version.validation(result, agree=agree))
 

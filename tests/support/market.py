@@ -9,7 +9,7 @@ import asyncio
 import dataclasses
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import pytest
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent import Contract, Phase
+    from mesh.chain import Account
     from schemas import Demand, Verified
     from tests.support.routers import EmbeddedRouter
 
@@ -44,6 +45,8 @@ class Founded:
 
     node: EmbeddedChain
     market: DevelopmentMarket
+    contracts: Literal["mesh", "original"] = "mesh"
+    generation: Literal[3, 5] = 3
 
 
 @pytest.fixture(scope="session")
@@ -62,6 +65,7 @@ class Place:
     """Where a test's agents meet. `async with Place(founded, endpoint, folder) as place`."""
 
     def __init__(self, founded: Founded, endpoint: str, folder: Path) -> None:
+        self.founded = founded
         self.node = founded.node
         self.market = founded.market
         self.endpoint = endpoint
@@ -79,8 +83,17 @@ class Place:
 
     def chain(self, role: str) -> Chain:
         """The chain for an account, not yet open."""
+        return self.chain_of(self.market.accounts[role], self.founded.generation)
+
+    def chain_of(self, account: Account, generation: Literal[3, 5]) -> Chain:
+        """The chain for any account in a generation, not yet open."""
         return Chain(
-            self.node.provider, account=self.market.accounts[role], ens=self.market.deployment.ens, timing=QUICK
+            self.node.provider,
+            account=account,
+            ens=self.market.deployment.ens,
+            generation=generation,
+            contracts=self.founded.contracts,
+            timing=QUICK,
         )
 
     def address(self, role: str) -> str:
@@ -98,6 +111,8 @@ class Place:
             data_dir=str(self.folder / role),
             lighthouse_contract=self.market.deployment.lighthouse_name,
             ens_contract=self.market.deployment.ens,
+            generation=self.founded.generation,
+            contracts=self.founded.contracts,
             poll_interval=QUICK.poll_interval,
             playback="at-once",
             fetch_timeout=5.0,

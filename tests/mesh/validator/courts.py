@@ -7,14 +7,14 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any, Literal
 
 from mesh.agent import Agent, Job
-from mesh.chain import Account, Chain
+from mesh.chain import Account
 from mesh.validator.validator import Validator
 from mesh.watching.queries import query_all
 from schemas import Result
 from schemas.keys import ValidatorKey
 from schemas.selectors import report_selector
 from schemas.verdicts import ValidatorAnnouncement, ValidatorReport
-from tests.support.market import MODEL, QUICK, QUICK_RESEND, Place, offering_unseen
+from tests.support.market import MODEL, QUICK_RESEND, Place, offering_unseen
 from tests.support.objectives import objective
 from tests.support.waiting import until_answered, until_found
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.agent import Contract
+    from mesh.chain import Chain
     from schemas import Liability
 
 PRICE = 7
@@ -47,14 +48,7 @@ class Court:
         return Account.from_key(self.place.node.funded_keys[4 + number])
 
     async def chain(self, account: Account) -> Chain:
-        chain = Chain(
-            self.place.node.provider,
-            account=account,
-            ens=self.place.market.deployment.ens,
-            generation=self.generation,
-            timing=QUICK,
-        )
-        return await self._stack.enter_async_context(chain)
+        return await self._stack.enter_async_context(self.place.chain_of(account, self.generation))
 
     async def jury(self, *numbers: int, quorum: int = 1) -> str:
         """The address of a validator contract with these jurors."""
