@@ -34,20 +34,31 @@ _ids: Final = itertools.count()
 """Numbers of nodes and endpoints, which are unique in a Zenoh session."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RosEndpoint:
-    """A publisher, subscription, server or client of ours, which the ROS 2 system sees while its token lives."""
+    """A publisher, subscription, server or client of ours, which the ROS 2 system sees from `show` until `withdraw`.
+
+    Show it last: what others send as soon as they see it must arrive.
+    """
 
     name: str
     type: str
     key: str
     gid: bytes
-    token: Any
+    _session: zenoh.Session
+    _token_key: str
+    """Empty where endpoints are not shown by tokens."""
+    _token: Any = None
+
+    def show(self) -> None:
+        """Let others see it."""
+        if self._token_key:
+            self._token = self._session.liveliness().declare_token(self._token_key)
 
     def withdraw(self) -> None:
-        """Take the token back."""
-        if self.token is not None:
-            self.token.undeclare()
+        """Take the token back, if there is one."""
+        if self._token is not None:
+            self._token.undeclare()
 
 
 class RosNode:
@@ -88,15 +99,15 @@ class RosNode:
         """The absolute name of a topic or service. Raises `InvalidRosName`."""
         return resolve(name, self._namespace, self._name)
 
-    def declare(
+    def endpoint(
         self, kind: RosEntityKind, name: str, type_name: str, *, type_hash: str = "", qos: RosQos | None = None
     ) -> RosEndpoint:
-        """Show an endpoint of this node. Raises `UnknownRosType` if neither type nor hash is known."""
+        """An endpoint of this node, not shown yet. Raises `UnknownRosType` if neither type nor hash is known."""
         type_hash = type_hash or self.types.type_hash(type_name)
         facts = {"name": name, "type": type_name, "type_hash": type_hash, "qos": qos or DEFAULT_QOS}
         text = self.flavour.token(self._entity(kind, next(_ids), **facts))
         key = self.flavour.key(name, type_name, type_hash)
-        return RosEndpoint(name, type_name, key, gid_of(text), self._show(text))
+        return RosEndpoint(name, type_name, key, gid_of(text), self.session, text)
 
     def others(self, name: str, *kinds: RosEntityKind) -> list[RosEntity]:
         """The endpoints of a name that other nodes have, or other nodes of this session."""

@@ -44,7 +44,8 @@ class RosClient:
         self.name: Final = name
         self.type: Final = type_name
         self._node = node
-        self._endpoint = node.declare("client", name, type_name, type_hash=type_hash)
+        self._endpoint = node.endpoint("client", name, type_name, type_hash=type_hash)
+        self._endpoint.show()
         self._sequence = 0
 
     async def call(self, request: object, *, timeout: float | None, job: RosRecorder | None = None) -> Any:
@@ -135,9 +136,10 @@ class RosServer:
         self._places = threading.Semaphore(limit)
         self._loop = asyncio.get_running_loop()
         self._requests: set[asyncio.Task[None]] = set()
-        self._endpoint = node.declare("server", name, type_name)
+        self._endpoint = node.endpoint("server", name, type_name)
         received = zenoh.handlers.Callback(self._receive, indirect=False)
         self._queryable: Any = node.session.declare_queryable(self._endpoint.key, received, complete=True)
+        self._endpoint.show()
 
     async def close(self) -> None:
         """Withdraw it, and cancel the requests that it handles."""

@@ -50,9 +50,10 @@ class RosPublisher:
         self.type: Final = full_type(type_name)
         self.qos: Final = qos
         self._node = node
-        self._endpoint = node.declare("publisher", name, self.type, qos=qos)
+        self._endpoint = node.endpoint("publisher", name, self.type, qos=qos)
         self._sequence = 0
         self._publisher = self._declare(node.session, self._endpoint.key)
+        self._endpoint.show()
 
     def put(self, message: object) -> Payload:
         """Publish a message: a dict of fields, an instance of the type's class, or a payload. Returns the payload.
@@ -110,7 +111,7 @@ class RosSubscription:
     async def __aenter__(self) -> Self:
         type_name, type_hash, qos = await self._discover()
         self._type = self._node.payload_type(type_name)
-        self._endpoint = self._node.declare("subscription", self.topic, type_name, type_hash=type_hash, qos=qos)
+        self._endpoint = self._node.endpoint("subscription", self.topic, type_name, type_hash=type_hash, qos=qos)
         self._pump = Pump(
             self._node.session,
             self._endpoint.key,
@@ -121,11 +122,8 @@ class RosSubscription:
             drops=self._node.drops,
             declare=partial(_declare_late, self._node.session, qos) if qos.is_transient_local else None,
         )
-        try:
-            await self._pump.__aenter__()
-        except BaseException:
-            self._endpoint.withdraw()
-            raise
+        await self._pump.__aenter__()
+        self._endpoint.show()
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
