@@ -25,7 +25,18 @@ from zenoh.handlers import FifoChannel
 from common import ADDRESS, LIGHTHOUSE, SPAWN, TOKEN, show
 from mesh.network import Channel, Endpoints, Network, free_endpoint
 from mesh.network.endpoints import allow_sessions
-from schemas import ZERO_ADDRESS, Demand, EventKey, Offer, RpcKey, Signer, cid_of_bytes, encode, market_selector
+from schemas import (
+    ZERO_ADDRESS,
+    Demand,
+    EventKey,
+    Offer,
+    PresenceKey,
+    RpcKey,
+    Signer,
+    cid_of_bytes,
+    encode,
+    market_selector,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -269,10 +280,12 @@ async def _channel(stack: AsyncExitStack, endpoint: str) -> Channel:
 async def _spread(channels: Sequence[Channel], count: int) -> None:
     """Wait until every router knows all agents."""
     deadline = time.monotonic() + START_TIMEOUT
-    for channel in channels:
-        while (present := len(await channel.present())) != count:
-            assert time.monotonic() < deadline, f"{present} of {count} agents are present"
-            await asyncio.sleep(0.05 + count / 10_000)
+    known: list[set[PresenceKey]] = [set() for _ in channels]
+    for channel, agents in zip(channels, known, strict=True):
+        channel.watch_presence(agents.add, gone=agents.discard, role="agent")
+    while any(len(agents) != count for agents in known):
+        assert time.monotonic() < deadline, f"{[len(agents) for agents in known]} of {count} agents are present"
+        await asyncio.sleep(0.05)
 
 
 async def unheard(at: Routers, count: int, messages: int) -> dict[str, float]:
