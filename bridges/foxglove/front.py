@@ -42,8 +42,6 @@ LONGEST_HEAD: Final = 16_384
 REQUEST_TIMEOUT: Final = 5.0
 SENT: Final = Rate(per_second=1 << 16, burst=4 * LONGEST_FRAME)
 """Bytes that one client sends; beyond, the front waits before it reads more."""
-STALLED: Final = 5.0
-"""Seconds in which a client must take `PART` bytes, or it is disconnected."""
 PART: Final = 1 << 16
 TOO_BIG: Final = b"\x88\x02\x03\xf1"
 """The frame that ends a WebSocket with the status 1009, a message too big."""
@@ -54,6 +52,8 @@ class FoxgloveFront(Lifecycle):
     listens, as host and port, or None while there is none."""
 
     title = "front of the Foxglove server"
+    stalled: float = 5.0
+    """Seconds in which a client must take `PART` bytes, or it is disconnected."""
 
     def __init__(self, options: FoxgloveOptions, drops: Drops) -> None:
         options.check()
@@ -136,7 +136,7 @@ class FoxgloveFront(Lifecycle):
             writer.write(greeting)
             async with Background() as tasks:
                 tasks.start(_send(reader, server_writer), "foxglove client sends")
-                await _receive(server_reader, writer)
+                await _receive(server_reader, writer, self.stalled)
         finally:
             self._admitted -= 1
             await _close(server_writer)
@@ -154,11 +154,11 @@ async def _send(reader: asyncio.StreamReader, server: asyncio.StreamWriter) -> N
     raise EOFError("the client closed the connection")
 
 
-async def _receive(server: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _receive(server: asyncio.StreamReader, writer: asyncio.StreamWriter, stalled: float) -> None:
     """Carry what the SDK's server sends, until it ends. Raises `TimeoutError` for a client that does not read."""
     while data := await server.read(PART):
         writer.write(data)
-        async with asyncio.timeout(STALLED):
+        async with asyncio.timeout(stalled):
             await writer.drain()
 
 

@@ -100,7 +100,9 @@ async def watching(settings: Settings, *, drops: Drops | None = None) -> AsyncIt
     """The components of an agent that only watches the market: it needs a router, but no account and no chain."""
     async with (
         Network(endpoints_of(settings)) as network,
-        Channel(network.session, settings.lighthouse_contract, drops=drops) as channel,
+        Channel(
+            network.session, settings.lighthouse_contract, drops=drops, answer_timeout=settings.answer_timeout
+        ) as channel,
     ):
         yield network, channel
 
@@ -175,6 +177,7 @@ async def connected(
             head=lambda: head.head,
             blocked=blocklist_at(settings.blocked_signers),
             drops=drops,
+            answer_timeout=settings.answer_timeout,
         ) as channel,
     ):
         yield network, channel

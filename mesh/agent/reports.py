@@ -45,10 +45,6 @@ PER_JUROR: Final = Rate(per_second=1.0, burst=16)
 """Reports of one juror that are looked at; each may be a question to the chain."""
 LOOKED_AT: Final = Rate(per_second=20.0, burst=200)
 """Reports in all that are looked at."""
-SILENCE: Final = 30.0
-"""Seconds without a verdict after which those who wait hear that the validator is silent."""
-ASK_TIMEOUT: Final = 3.0
-"""Seconds in which jurors answer with earlier reports."""
 
 
 class ContractReports(Lifecycle):
@@ -59,6 +55,8 @@ class ContractReports(Lifecycle):
     """
 
     title = "reports"
+    silence: float = 30.0
+    """Seconds without a verdict after which those who wait hear that the validator is silent."""
 
     def __init__(
         self, parts: AgentComponents, on_report: Callable[[ValidatorReport], Coroutine[Any, Any, None]] | None = None
@@ -93,8 +91,15 @@ class ContractReports(Lifecycle):
             return ()
         await self._read_jury(judged)
         if not judged.is_judged:
-            session, lighthouse = self._parts.network.session, self._parts.channel.lighthouse
-            for found in await asked_reports(session, lighthouse, self._parts.chain, liability):
+            channel = self._parts.channel
+            asked = asked_reports(
+                self._parts.network.session,
+                channel.lighthouse,
+                self._parts.chain,
+                liability,
+                timeout=channel.answer_timeout,
+            )
+            for found in await asked:
                 self._add(judged, found)
         return self.known(liability.address)
 
@@ -142,7 +147,7 @@ class ContractReports(Lifecycle):
             while changed.is_set():
                 changed.clear()
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(changed.wait(), 0 if judged.is_split else SILENCE)
+                    await asyncio.wait_for(changed.wait(), 0 if judged.is_split else self.silence)
             with suppress(AiraError):  # the node is away: the next state is said
                 await self.of(judged.liability)
                 if judged.is_judged:
@@ -225,13 +230,16 @@ async def refund_words(chain: Chain, liability: str) -> str:
 
 
 async def asked_reports(
-    session: zenoh.Session, lighthouse: str, chain: Chain, liability: Liability
+    session: zenoh.Session, lighthouse: str, chain: Chain, liability: Liability, *, timeout: float
 ) -> list[ValidatorReport]:
-    """The verified reports on a liability that its jurors answer with, one of each. Raises `ChainError`."""
+    """The verified reports on a liability that its jurors answer with in `timeout` seconds, one of each.
+
+    Raises `ChainError`.
+    """
     if liability.validator == ZERO_ADDRESS:
         return []
     selector = report_selector(lighthouse, liability.promisee, liability.address)
-    replies = await query_all(session, [selector], timeout=ASK_TIMEOUT)
+    replies = await query_all(session, [selector], timeout=timeout)
     found = await asyncio.to_thread(_signed, replies, liability)
     return [found[juror] for juror in await accepted_of(chain, liability.validator, found)]
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from mesh.network import Channel
 
-ANSWER_TIMEOUT: Final = 3.0
-"""Seconds that jurors have to answer."""
 KEPT: Final = 60.0
 """Seconds for which the announcements of a validator are not asked again, …"""
 KEPT_SILENCE: Final = 5.0
@@ -142,7 +140,7 @@ class ValidatorDirectory:
 
     async def _ask(self, validator: str) -> AnnouncedValidator:
         key = str(ValidatorKey(self._channel.lighthouse, validator))
-        replies = await query_all(self._session, [key], timeout=ANSWER_TIMEOUT)
+        replies = await query_all(self._session, [key], timeout=self._channel.answer_timeout)
         said = await asyncio.to_thread(_signed, replies, validator)
         jurors = await accepted_of(self._chain, validator, said)
         announcements = tuple(said[juror] for juror in jurors)

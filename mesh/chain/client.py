@@ -89,7 +89,7 @@ class Chain:
         self._kind = contracts
         self._stack = AsyncExitStack()
         self._contracts: Contracts | None = None
-        self._balances = CachedMetrics(self._ask_balances)
+        self._balances = CachedMetrics(self._ask_balances, max_age=self.node.timing.metrics_age)
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_AGE: Final = 10.0
-"""Seconds for which an answer of the node is reused."""
 ASK_TIMEOUT: Final = 1.0
 """Seconds that the node may take; metrics that it does not answer by then are left out."""
 
@@ -115,16 +113,17 @@ class NodeMetrics:
 
 
 class CachedMetrics:
-    """Metrics that the node is asked for at most every `MAX_AGE` seconds, left out if it does not answer in time."""
+    """Metrics that the node is asked for at most every `max_age` seconds, left out if it does not answer in time."""
 
-    def __init__(self, ask: Callable[[], Awaitable[Iterable[MetricFamily]]]) -> None:
+    def __init__(self, ask: Callable[[], Awaitable[Iterable[MetricFamily]]], *, max_age: float) -> None:
         self._ask = ask
+        self._max_age = max_age
         self._families: tuple[MetricFamily, ...] = ()
         self._asked_at = float("-inf")
 
     async def measure(self) -> tuple[MetricFamily, ...]:
-        """The metrics, not older than `MAX_AGE`."""
-        if time.monotonic() - self._asked_at >= MAX_AGE:
+        """The metrics, not older than `max_age`."""
+        if time.monotonic() - self._asked_at >= self._max_age:
             self._asked_at = time.monotonic()
             try:
                 async with asyncio.timeout(ASK_TIMEOUT):

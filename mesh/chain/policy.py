@@ -45,6 +45,12 @@ class Timing:
     repeat_within: float = 600.0
     """How long after a transaction with an unknown outcome the same transaction means that one, if it was mined."""
 
+    metrics_age: float = 10.0
+    """How old metrics may be that the node is asked for."""
+
+    validator_recheck: float = 60.0
+    """After how long it is asked again what the address of a validator is that may still change."""
+
     request_timeout: float = 15.0
     """For one answer of the node."""
 

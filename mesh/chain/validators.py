@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 REMEMBERED: Final = 4096
 """Validators whose verdict is remembered, the latest ones."""
-RECHECK: Final = 60.0
-"""Seconds after which a verdict is asked for again that a transaction can change."""
 
 
 class UnsafeValidator(InputError, code="validator-unsafe"):
@@ -189,7 +187,8 @@ class Validators:
         verdict = self._known(validator)
         if verdict is None:
             is_safe, has_code, is_final = await self._ask(validator)
-            verdict = _Verdict(is_safe, has_code, math.inf if is_final else self._clock() + RECHECK)
+            recheck = math.inf if is_final else self._contracts.node.timing.validator_recheck
+            verdict = _Verdict(is_safe, has_code, self._clock() + recheck)
             self._verdicts[validator] = verdict
         return verdict
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from schemas import Demand, Offer
     from schemas.signing import Rejection
 
-CONFIRMATION: Final = 5.0
-"""Seconds in which providers may confirm a withdrawal."""
 ANSWERS: Final = 256
 HEAD: Final = ("ORDER", "KIND", "STATE", "COST", "VALID UNTIL")
 
@@ -203,7 +201,7 @@ async def _confirmations(parts: AgentComponents, order: Order, providers: int, h
 
     Also waits until as many have `honoured` it; they say that once, so None for a withdrawal of an earlier run.
     """
-    confirmed, deadline = 0, asyncio.get_running_loop().time() + CONFIRMATION
+    confirmed, deadline = 0, asyncio.get_running_loop().time() + parts.channel.answer_timeout
 
     def is_complete() -> bool:
         return confirmed >= providers and (honoured is None or len(honoured) >= providers)
@@ -233,7 +231,7 @@ def _answers(parts: AgentComponents, order: Order) -> int:
         zenoh.handlers.FifoChannel(ANSWERS),
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=CONFIRMATION / 2,
+        timeout=parts.channel.answer_timeout / 2,
     )
     confirming = (reply for reply in replies if reply.ok is not None and _withdraws(reply.ok, parts, order))
     return len({str(reply.replier_id) for reply in confirming})

@@ -88,4 +88,5 @@ async def _network(settings: Settings) -> AsyncIterator[Network]:
 async def _ask(network: Network, settings: Settings, chain: Chain, liability: Liability) -> Sequence[ValidatorReport]:
     from mesh.agent.reports import asked_reports
 
-    return await asked_reports(network.session, settings.lighthouse_contract.lower(), chain, liability)
+    lighthouse, timeout = settings.lighthouse_contract.lower(), settings.answer_timeout
+    return await asked_reports(network.session, lighthouse, chain, liability, timeout=timeout)

@@ -155,7 +155,7 @@ class ProviderStatusService:
         self._settlement = settlement
         self._earnings = earnings
         self._drops = drops
-        self._stake = CachedMetrics(self._ask_stake)
+        self._stake = CachedMetrics(self._ask_stake, max_age=chain.node.timing.metrics_age)
         self._began = time.monotonic()
 
     async def status(self, _request: Nothing) -> Status:

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 PRESENT_LIMIT: Final = 1024
 """Agents that a question for presence returns, at most."""
-RECALL_TIMEOUT: Final = 5.0
-"""Seconds that providers have to answer with their open orders."""
+ANSWER_TIMEOUT: Final = 5.0
+"""Seconds that others have to answer a query."""
 RECALL_LIMIT: Final = 65_536
 """Open orders accepted from one recall, at most."""
 RECALL_BYTES: Final = 64 * 1024 * 1024
@@ -54,8 +54,8 @@ class Channel:
     `lighthouse` is the ENS name of the market. `address`, if given, is the lighthouse that orders must name;
     `resolver` resolves ENS names in messages; `validators` knows which validators orders may name (None: any); `head`
     returns the latest block number, for deadlines; messages of `blocked` signers are rejected; `drops` counts what is
-    dropped. Leaving `async with` withdraws the presence tokens and ends the watches, but does not close the session.
-    Raises `InvalidKey` for a name that no key may contain.
+    dropped; a query ends after `answer_timeout` seconds. Leaving `async with` withdraws the tokens and ends the
+    watches, but does not close the session. Raises `InvalidKey` for a name that no key may contain.
     """
 
     def __init__(
@@ -69,8 +69,10 @@ class Channel:
         head: Callable[[], int] = lambda: 0,
         blocked: BlockedSigners = frozenset(),
         drops: Drops | None = None,
+        answer_timeout: float = ANSWER_TIMEOUT,
     ) -> None:
         self._session = session
+        self.answer_timeout: Final = answer_timeout
         self.lighthouse = lighthouse.lower()
         lighthouse_selector(self.lighthouse)  # raises InvalidKey
         self.address = address
@@ -127,7 +129,7 @@ class Channel:
         """
         self._check_open()
         selector = market_selector(self.lighthouse, kind.kind, model)
-        return Subscription(self._session, selector, self._validator_of(kind), self._drops)
+        return Subscription(self._session, selector, self._validator_of(kind), self._drops, self.answer_timeout)
 
     def announce(self, role: str, address: str) -> None:
         """Announce the agent at `address` as present in `role`, for as long as the channel is open."""
@@ -175,7 +177,7 @@ class Channel:
                 self._drops.count("presence", number=more)
             return list(_presence_keys(sorted(found)))
 
-        replies = iter(ask(selector, handler, timeout=RECALL_TIMEOUT))
+        replies = iter(ask(selector, handler, timeout=self.answer_timeout))
         return await asyncio.to_thread(collect)
 
     def _check_open(self) -> None:
@@ -199,11 +201,12 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
     """
 
     def __init__(
-        self, session: zenoh.Session, selector: str, validator: MessageValidator[M], drops: Drops | None = None
+        self, session: zenoh.Session, selector: str, validator: MessageValidator[M], drops: Drops, answer_timeout: float
     ) -> None:
         copy, check, limit = self._copy, validator.check_all, MAX_MESSAGE_SIZE
         super().__init__(session, selector, copy=copy, convert_all=check, payload_limit=limit, drops=drops)
         self._validator: MessageValidator[M] = validator
+        self._answer_timeout = answer_timeout
         self.kind: Final = validator.kind.kind
         """The kind of message: `demand`, `offer`, `withdrawal` or `result`."""
         self._unresolved: FairQueue[Unresolved[M]] = FairQueue(per_sender=LOOKUP_LIMIT // 2, total=LOOKUP_LIMIT)
@@ -242,7 +245,7 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
     async def recall(self) -> None:
         """Ask the providers for the open orders; the iterator yields each new one once.
 
-        Returns when all providers have answered, or after `RECALL_TIMEOUT`, also without a provider. Cancelling this
+        Returns when all providers have answered, or after `answer_timeout`, also without a provider. Cancelling this
         call or leaving `async with` ends the query.
         """
         self.check_entered()
@@ -262,7 +265,7 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
             zenoh.handlers.FifoChannel(RECALL_LIMIT),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=RECALL_TIMEOUT,
+            timeout=self._answer_timeout,
             cancellation_token=query,
         )
         copies, size = list[Any](), 0

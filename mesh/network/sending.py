@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 import zenoh
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from zenoh import Session
 
 QUIET: Final = 0.00025
@@ -38,9 +40,17 @@ _paces: dict[int, _Pace] = {}
 """The pace of each session, by the session's `id`: Zenoh's sessions hold no attributes."""
 
 
-def put(session: Session, key: str, payload: bytes, *, encoding: str = JSON, attachment: bytes | None = None) -> None:
+def put(
+    session: Session,
+    key: str,
+    payload: bytes,
+    *,
+    encoding: str = JSON,
+    attachment: bytes | None = None,
+    clock: Callable[[], float] = monotonic,
+) -> None:
     """Put bytes on a key. A congested link drops them rather than block."""
-    pace, now = _pace_of(session), monotonic()
+    pace, now = _pace_of(session), clock()
     quiet = now - pace.last
     pace.last = now
     pace.credit = min(CREDIT, pace.credit + quiet * REFILL)

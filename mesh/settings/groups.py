@@ -6,35 +6,18 @@ Options keep the names and the defaults of the legacy stack where it had them.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
-
-from msgspec import Meta
+from typing import TYPE_CHECKING, Final, Literal
 
 from mesh.errors import ConfigurationError
+from mesh.settings.options import Gwei, Interval, PositiveInt, Seconds, SecondsOrEver, option
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-LONGEST: Final = 1e9
-"""The most seconds that an option can hold, about thirty years: not every file format can express infinity."""
-
 DEADLINE_LIMIT: Final = 7200
 """Blocks, about a day where one takes 12 seconds."""
-
-PositiveInt = Annotated[int, Meta(ge=1)]
-Seconds = Annotated[float, Meta(ge=0, le=LONGEST)]
-Interval = Annotated[float, Meta(gt=0, le=LONGEST)]
-SecondsOrEver = Annotated[float, Meta(ge=-1, le=LONGEST)]
-Gwei = Annotated[float, Meta(ge=1e-9, le=1e9)]
-
-T = TypeVar("T")
-
-
-def option(default: T, meaning: str) -> T:
-    """A field of a group: its default, and one line that explains it."""
-    return field(default=default, metadata={"meaning": meaning})
 
 
 class NodeNotSet(ConfigurationError, code="node-not-set"):
@@ -54,6 +37,9 @@ class NetworkSettings:
     )
     connect_timeout: SecondsOrEver = option(
         10.0, "seconds to wait for a router at startup; -1 waits forever, also for the node, the contracts and files"
+    )
+    answer_timeout: Interval = option(
+        5.0, "seconds to wait for the answers of others, such as a validator's jurors and the providers"
     )
     tls_ca: str = option(
         "", "the site's CA certificate (PEM); routers and clients on tls/ endpoints are checked with it"

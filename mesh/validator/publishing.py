@@ -34,8 +34,11 @@ PENDING: Final = 64
 class Announcements:
     """Answers queries of `ValidatorKey` with a signed announcement for each of the addresses that it judges for.
 
-    An announcement is signed again when it is older than `REFRESH`. `clock` is the time of day in seconds.
+    An announcement is signed again when it is older than `refresh` seconds. `clock` is the time of day in seconds.
     """
+
+    refresh: float = REFRESH
+    """Seconds."""
 
     def __init__(self, parts: ValidatorComponents, *, clock: Callable[[], float] = time.time) -> None:
         self._parts = parts
@@ -61,7 +64,7 @@ class Announcements:
     def announcement(self, validator: str) -> ValidatorAnnouncement:
         """The signed announcement for one of the addresses."""
         now, found = int(self._clock()), self._signed.get(validator)
-        if found is None or not 0 <= now - found.made_at < REFRESH:
+        if found is None or not 0 <= now - found.made_at < self.refresh:
             found = self._signed[validator] = self._sign(validator, now)
         return found
 

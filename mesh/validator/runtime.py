@@ -61,7 +61,7 @@ class ValidatorRuntime(Role):
     async def _open(self, stack: AsyncExitStack) -> None:
         parts = self.parts
         self.results = await stack.enter_async_context(parts.channel.subscribe(Result))
-        await stack.enter_async_context(Announcements(parts))
+        self.announcements = await stack.enter_async_context(Announcements(parts))
         await stack.enter_async_context(ReportService(parts))
         self.status = ValidatorStatus(parts, self.judge, self.results)
         parts.services.offer("status", self.status.status)

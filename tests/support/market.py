@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 MODEL = cid_of_bytes(b"what the robots of the tests can do")
 QUICK_RESEND = RetryPolicy(initial=0.1, ceiling=0.5)
-QUICK = Timing(poll_interval=0.03, receipt_interval=0.01)
+QUICK = Timing(poll_interval=0.03, receipt_interval=0.01, metrics_age=0.0)
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,7 @@ class Place:
             poll_interval=QUICK.poll_interval,
             playback="at-once",
             fetch_timeout=5.0,
+            answer_timeout=60.0,
         )
         return dataclasses.replace(settings, **options)
 

@@ -12,7 +12,6 @@ import websockets
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridges.foxglove import front as front_module
 from bridges.foxglove.errors import ClientRefused
 from bridges.foxglove.front import CLIENTS
 from bridges.foxglove.handshake import LONGEST_FRAME, FrameGuard, Upgrade
@@ -131,9 +130,9 @@ async def test_a_client_that_sends_nonsense_hurts_no_other(serve: Any) -> None:
         assert set(viewer.topics) == {"/x"}
 
 
-async def test_a_client_that_does_not_read_is_disconnected(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(front_module, "STALLED", 2.0)
+async def test_a_client_that_does_not_read_is_disconnected(serve: Any) -> None:
     async with serve() as server, viewing(server.front.url, "/x") as viewer, viewing(server.front.url, "/x") as slow:
+        server.front.stalled = 2.0
         server.publish("/x", bytes(10), RAW)
         await viewer.until_seen("/x")
         await slow.until_seen("/x")

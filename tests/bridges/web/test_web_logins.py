@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ssl
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any
@@ -13,8 +14,8 @@ from bridges.web.components import opened
 from bridges.web.errors import NotOpenToOthers
 from bridges.web.options import WebOptions
 from bridges.web.server import PageServer
-from mesh import fresh_file
 from mesh.background import Background
+from mesh.fresh_file import CHECK_INTERVAL
 from mesh.identity import Member
 from mesh.market.provider import Provider
 from mesh.network import Network
@@ -89,10 +90,7 @@ async def test_other_machines_log_in_by_tls(serve: Any, site: Site) -> None:
                 await plain.get(page.server.url.replace("https", "http"))
 
 
-async def test_members_log_in_by_their_certificates(
-    serve: Any, site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fresh_file, "CHECK_INTERVAL", -1.0)
+async def test_members_log_in_by_their_certificates(serve: Any, site: Site, tmp_path: Path) -> None:
     boss = site.enlist(Member(name="boss", address=BOSS, roles=("operator",)))
     ann = site.enlist(Member(name="ann", address=ANN, roles=("person",)))
     gone = site.enlist(Member(name="gone", address=GONE, roles=("operator",), revoked=True))
@@ -111,9 +109,11 @@ async def test_members_log_in_by_their_certificates(
                     await browser.get("market")
         for change in (lambda: site.roster.write_text("garbage"), site.roster.unlink):
             change()  # the last roster that could be read stays in force
+            await asyncio.sleep(1.1 * CHECK_INTERVAL)
             async with visitor(site, page.server, boss) as browser:
                 assert (await browser.get("market"))["role"] == "operator"
         site.roster.write_text(f'lighthouses = ["{MARKET}"]\n')
+        await asyncio.sleep(1.1 * CHECK_INTERVAL)
         async with visitor(site, page.server, boss) as browser:
             await browser.get("market", status=401)
     async with (

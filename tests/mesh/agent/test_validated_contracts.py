@@ -21,7 +21,7 @@ from mesh import (
     ValidatorSilent,
     Verified,
 )
-from mesh.agent import Phase, reports, validators
+from mesh.agent import Phase
 from mesh.agent.validators import OLDEST
 from mesh.chain import UnsafeValidator, ValidatorWithoutCode
 from schemas import Demand, ReportKey, Result, Signer, decode
@@ -37,13 +37,6 @@ if TYPE_CHECKING:
     from mesh import Agent, Contract
 
 STRANGER = Signer(b"\x07" * 32)
-
-
-@pytest.fixture(autouse=True)
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Jurors have long to answer: a busy machine must not make them silent."""
-    monkeypatch.setattr(reports, "ASK_TIMEOUT", 60.0)
-    monkeypatch.setattr(validators, "ANSWER_TIMEOUT", 60.0)
 
 
 def juror_of(place: Place, **fields: Any) -> Juror:
@@ -155,13 +148,11 @@ async def test_what_was_missed_is_asked_for(place: Place, caplog: pytest.LogCapt
             assert await again.reports() == tuple(juror.served)
 
 
-async def test_those_who_wait_are_told_that_the_validator_is_silent(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(reports, "SILENCE", 0.2)
+async def test_those_who_wait_are_told_that_the_validator_is_silent(place: Place) -> None:
     heard: list[Progress] = []
     robot = place.agent("robot")
-    async with validated(place, robot, juror := juror_of(place)) as (_, contract):
+    async with validated(place, robot, juror := juror_of(place)) as (person, contract):
+        person.runtime.reports.silence = 0.2
         ending = asyncio.create_task(contract.outcome(on_progress=heard.append))
         await until(lambda: any(one.kind == "unjudged" for one in heard))
         unjudged = next(one for one in heard if one.kind == "unjudged")
@@ -285,10 +276,10 @@ async def under_a_jury(place: Place) -> AsyncIterator[tuple[Juror, Juror, Agent,
         yield first, second, robot, person, contract
 
 
-async def test_jurors_that_disagree_are_shown_to_both(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reports, "SILENCE", 0.3)
+async def test_jurors_that_disagree_are_shown_to_both(place: Place) -> None:
     heard: list[Progress] = []
     async with under_a_jury(place) as (first, second, robot, person, contract):
+        person.runtime.reports.silence = 0.3
         announced = await person.validator(first.validator)
         assert (announced.jurors, announced.quorum, announced.fee, announced.has_quorum) == (2, 2, 100, True)
         assert contract.liability.validator_fee == 100

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec.structs import asdict
 
-from mesh.chain import XRT, Account, UnsafeValidator, new_private_key, validators
+from mesh.chain import XRT, Account, Timing, UnsafeValidator, new_private_key, validators
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash, recover
 from tests.mesh.chain.conftest import next_nonce, reverted
 
@@ -101,16 +101,16 @@ async def test_contracts_and_accounts_with_transactions_are_validators(
 
 @CONTRACTS
 async def test_an_address_that_may_become_a_lighthouse_is_refused_where_the_contracts_would_accept_that(
-    market: DeployedMarket, contracts: Any, generation: int, monkeypatch: pytest.MonkeyPatch
+    market: DeployedMarket, contracts: Any, generation: int
 ) -> None:
     unused = Account.from_key(new_private_key()).address
     async with market.chain(contracts=contracts, generation=generation) as chain:
         assert await chain.validators.is_safe(unused) is (contracts == "mesh")
         assert chain.validators.known(unused) is not None
-        monkeypatch.setattr(validators, "RECHECK", 0.0)
-        other = Account.from_key(new_private_key()).address
-        await chain.validators.is_safe(other)
-        assert chain.validators.known(other) is None, "a transaction can change it"
+    timing = Timing(validator_recheck=0.0)
+    async with market.chain(contracts=contracts, generation=generation, timing=timing) as chain:
+        await chain.validators.is_safe(unused)
+        assert chain.validators.known(unused) is None, "a transaction can change it"
 
 
 async def test_a_limited_number_of_verdicts_is_remembered(

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import reports, validators
 from mesh.chain import UnsafeValidator
 from mesh.cli.demand import demand
 from mesh.cli.errors import DoubtfulValidator, JobNotDone
@@ -32,13 +31,6 @@ TERMS: dict[str, Any] = {"model": MODEL, "cost": "7wn", "lifetime": 500, "out": 
 @pytest.fixture
 async def site(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path) -> Site:
     return await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
-
-
-@pytest.fixture(autouse=True)
-def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A juror on a busy machine answers late."""
-    monkeypatch.setattr(validators, "ANSWER_TIMEOUT", 60.0)
-    monkeypatch.setattr(reports, "ASK_TIMEOUT", 60.0)
 
 
 @pytest.fixture

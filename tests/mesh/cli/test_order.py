@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent import OrderState
-from mesh.cli import order as order_command
 from mesh.cli.demand import demand
 from mesh.cli.errors import InvalidOptions, UnknownOrder
 from mesh.cli.order import _list, _withdraw
@@ -78,9 +77,8 @@ async def test_orders_are_listed_and_withdrawn_by_their_hash(site: Site, capsys:
 
 
 async def test_the_provider_confirms_a_withdrawal_and_does_not_match_the_order(
-    site: Site, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    site: Site, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(order_command, "CONFIRMATION", 60.0)
     done: list[str] = []
     async with site.provider():
         async with site.agent("person") as person:

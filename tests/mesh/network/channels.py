@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @asynccontextmanager
 async def opened(session: zenoh.Session, **options: Any) -> AsyncIterator[Channel]:
-    async with Channel(session, MARKET, **({"address": LIGHTHOUSE} | options)) as channel:
+    async with Channel(session, MARKET, **({"address": LIGHTHOUSE, "answer_timeout": 60.0} | options)) as channel:
         yield channel
 
 

@@ -19,33 +19,39 @@ if TYPE_CHECKING:
 KEY = "aira/test"
 
 
+class Clock:
+    """A clock that tests set, in seconds."""
+
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The time in seconds; tests change it."""
-    now = [1000.0]
-    monkeypatch.setattr(sending, "monotonic", lambda: now[0])
-    return now
+def clock() -> Clock:
+    return Clock()
 
 
 async def test_a_message_on_a_quiet_session_is_sent_at_once_and_those_right_after_it_in_batches(
-    here: zenoh.Session, clock: list[float]
+    here: zenoh.Session, clock: Clock
 ) -> None:
     heard: list[bool] = []
     subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
     for pause in (0.0, 0.0, sending.QUIET / 2, sending.QUIET / 2, sending.QUIET * 1.01, 0.0):
-        clock[0] += pause
-        sending.put(here, KEY, b"")
+        clock.now += pause
+        sending.put(here, KEY, b"", clock=clock)
     await until(lambda: len(heard) == 6)
     assert heard == [True, False, False, False, True, False]
     subscriber.undeclare()
 
 
-async def test_of_a_stream_only_the_beginning_is_sent_at_once(here: zenoh.Session, clock: list[float]) -> None:
+async def test_of_a_stream_only_the_beginning_is_sent_at_once(here: zenoh.Session, clock: Clock) -> None:
     heard: list[bool] = []
     subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
     for _ in range(100):
-        clock[0] += sending.QUIET * 1.01
-        sending.put(here, KEY, b"")
+        clock.now += sending.QUIET * 1.01
+        sending.put(here, KEY, b"", clock=clock)
     await until(lambda: len(heard) == 100)
     assert heard[:8] == [True] * 8
     assert sum(heard[8:]) == 4, "as much as the credit of 23 ms"
@@ -53,7 +59,7 @@ async def test_of_a_stream_only_the_beginning_is_sent_at_once(here: zenoh.Sessio
 
 
 async def test_a_conversation_is_sent_at_once_throughout(
-    here: zenoh.Session, there: zenoh.Session, clock: list[float]
+    here: zenoh.Session, there: zenoh.Session, clock: Clock
 ) -> None:
     """Each order is answered before the next one is sent."""
     async with listening(here, there) as (demands, theirs):
@@ -61,25 +67,25 @@ async def test_a_conversation_is_sent_at_once_throughout(
         subscriber: Any = there.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
         await until_heard(here, KEY)
         for _ in range(30):
-            clock[0] += sending.QUIET * 1.01
+            clock.now += sending.QUIET * 1.01
             theirs.publish(demand())
             await take(demands, 1)
-            sending.put(here, KEY, b"")
+            sending.put(here, KEY, b"", clock=clock)
         await until(lambda: len(heard) == 30)
         assert heard == [True] * 30
         subscriber.undeclare()
 
 
-async def test_each_session_has_its_own_quiet(here: zenoh.Session, there: zenoh.Session, clock: list[float]) -> None:
+async def test_each_session_has_its_own_quiet(here: zenoh.Session, there: zenoh.Session, clock: Clock) -> None:
     heard: list[bool] = []
     subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
-    sending.put(here, KEY, b"")
-    sending.put(here, KEY, b"")
+    sending.put(here, KEY, b"", clock=clock)
+    sending.put(here, KEY, b"", clock=clock)
     await until(lambda: len(heard) == 2)
     there_heard: list[bool] = []
     # On a key of its own: what was put here may still be under way.
     other: Any = there.declare_subscriber(f"{KEY}/there", lambda sample: there_heard.append(sample.express))
-    sending.put(there, f"{KEY}/there", b"")
+    sending.put(there, f"{KEY}/there", b"", clock=clock)
     await until(lambda: there_heard)
     assert (heard[:2], there_heard[0]) == ([True, False], True)
     other.undeclare()

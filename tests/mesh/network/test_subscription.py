@@ -11,7 +11,7 @@ import pytest
 
 from mesh.errors import RemoteError
 from mesh.flood import Drops
-from mesh.network import ValidationStatistics, channel, message_key
+from mesh.network import ValidationStatistics, message_key
 from mesh.network.channel import LOOKUP_LIMIT, RECALL_LIMIT
 from schemas import Demand, SignedMessage, encode, message_hash
 from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
@@ -25,12 +25,6 @@ if TYPE_CHECKING:
 
 
 NAME = "token.robonomics.eth"
-
-
-@pytest.fixture(autouse=True)
-def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy machine may take long for the thousands of replies of a test."""
-    monkeypatch.setattr(channel, "RECALL_TIMEOUT", 60.0)
 
 
 def with_name(message: Demand, name: str = NAME) -> bytes:

@@ -73,6 +73,7 @@ class Site:
             "web3_http_provider": self.url,
             "lighthouse_contract": self.lighthouse,
             "poll_interval": 0.05,
+            "answer_timeout": 60.0,
             "playback": "at-once",
         }
         return Settings(**(fields | options))
@@ -98,6 +99,7 @@ class Site:
             "web3_http_provider": self.url,
             "lighthouse_contract": self.lighthouse,
             "poll_interval": "0.05",
+            "answer_timeout": "60",
             "keyfile": str(keyfile),
             "keyfile_password_file": str(password),
         }

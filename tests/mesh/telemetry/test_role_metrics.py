@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from mesh.agent import Agent, JobFailed
 from mesh.background import Background
 from mesh.chain import NodeUnreachable
-from mesh.chain import metrics as chain_metrics
 from mesh.market.provider import Provider, ProviderProcess
 from mesh.network import Endpoints, Network
 from mesh.telemetry.serving import Telemetry
@@ -85,10 +84,7 @@ async def settled(url: str, **expected: float) -> Scrape:
     return await scraped(url)
 
 
-async def test_a_job_changes_exactly_these_metrics_of_its_provider(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(chain_metrics, "MAX_AGE", 0.0)
+async def test_a_job_changes_exactly_these_metrics_of_its_provider(place: Place) -> None:
     lighthouse = place.market.deployment.lighthouse_name
     async with provider_at(place) as url, blinking(place), place.agent("person") as person:
         before, eth = await scraped(url), await place.chains["provider"].tokens.eth_balance()
@@ -259,7 +255,6 @@ async def test_rejected_orders_are_counted_by_reason(place: Place) -> None:
 async def test_a_balance_that_the_node_does_not_return_is_left_out(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chain_metrics, "MAX_AGE", 0.0)
     chain = place.chains["robot"]
 
     async def unreachable(address: str | None = None) -> int:

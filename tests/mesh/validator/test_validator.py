@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT
-from mesh.validator import publishing
 from mesh.validator.publishing import REFRESH, Announcements
 from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
 from tests.support.log_events import logged_facts
@@ -44,13 +43,11 @@ async def test_a_validated_job_is_paid_in_generation_3(place: Place) -> None:
             assert [policy.name for policy in announcement.policies] == ["complete", "acknowledged"]
 
 
-async def test_an_announcement_is_signed_again_so_that_parties_believe_it(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(publishing, "REFRESH", 0)
+async def test_an_announcement_is_signed_again_so_that_parties_believe_it(place: Place) -> None:
     async with Court(place) as court:
         validator = await court.validator()
         async with court.at_work(validator) as person:
+            validator.runtime.announcements.refresh = 0
             (first,) = await announcements_of(person, validator.address)
 
             async def is_renewed() -> bool:
