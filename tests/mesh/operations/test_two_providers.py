@@ -62,6 +62,8 @@ async def test_providers_share_jobs_and_take_over_and_each_job_is_done_once(serv
             await until(lambda: len(done) >= JOBS // 2, what="half of the jobs", seconds=TIMEOUT)
             shared = await sent(site, chain, start)
             await asyncio.to_thread(rival.kill)
+            for _ in range(3):  # after what the chain's server had received from it, but not handled yet
+                await served.node.mine()
             killed = await chain.block_number()
             tasks.start(mine_empty_blocks(served), "blocks without transactions")
             outcomes = await asyncio.gather(*jobs)
