@@ -2,7 +2,6 @@
 
 from mesh.settings.groups import (
     DEFAULTS,
-    LONGEST,
     MEANING,
     OPTIONS,
     AccountNotSet,
@@ -29,3 +28,4 @@ from mesh.settings.loading import (
     UnknownOption,
     load,
 )
+from mesh.settings.options import LONGEST

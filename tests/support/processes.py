@@ -105,7 +105,9 @@ class Server(ABC):
 
     def pause(self) -> None:
         """Freeze the process: it keeps its connections but does not answer until `resume`."""
-        self._running().send_signal(signal.SIGSTOP)
+        process = self._running()
+        process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)  # the signal takes a moment
 
     def resume(self) -> None:
         """Let a paused process go on."""

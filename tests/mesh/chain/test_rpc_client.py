@@ -234,7 +234,6 @@ async def test_a_frozen_node_is_skipped_and_asked_last_afterwards() -> None:
         timing = replace(QUICK, request_timeout=4)
         async with Node(f"{frozen.url}, {other.url}", timing=timing) as node:
             await asyncio.to_thread(frozen.pause)
-            # The signal may take a moment, and the first request still be answered.
             started = time.monotonic()
             for _ in range(5):
                 await node.block_number()

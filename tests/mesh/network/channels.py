@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.network import Channel, message_key
 from schemas import Demand, SignedMessage, Verified
@@ -18,10 +18,12 @@ if TYPE_CHECKING:
 
     from mesh.network import Subscription
 
+OPTIONS: Final[dict[str, Any]] = {"address": LIGHTHOUSE, "answer_timeout": 60.0}
+
 
 @asynccontextmanager
 async def opened(session: zenoh.Session, **options: Any) -> AsyncIterator[Channel]:
-    async with Channel(session, MARKET, **({"address": LIGHTHOUSE, "answer_timeout": 60.0} | options)) as channel:
+    async with Channel(session, MARKET, **(OPTIONS | options)) as channel:
         yield channel
 
 
