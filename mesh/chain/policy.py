@@ -46,10 +46,10 @@ class Timing:
     """How long after a transaction with an unknown outcome the same transaction means that one, if it was mined."""
 
     metrics_age: float = 10.0
-    """How old metrics may be that the node is asked for."""
+    """How old a metric that comes from the node may be."""
 
     validator_recheck: float = 60.0
-    """After how long it is asked again what the address of a validator is that may still change."""
+    """How long an answer about a validator is trusted while a transaction can still change it."""
 
     request_timeout: float = 15.0
     """For one answer of the node."""
