@@ -114,25 +114,27 @@ class Database:
             raise
 
     async def close(self) -> None:
-        """Close the file if it is open. An open connection keeps its thread, and so the interpreter, alive."""
+        """Close the file if it is open, after the call that is using it.
+
+        An open connection keeps its thread, and so the interpreter, alive.
+        """
         connection, self._connection = self._connection, None
         if connection is not None:
-            await connection.close()
+            async with self._using:
+                await connection.close()
 
     async def run(self, statement: str, values: tuple[Any, ...] = (), *, sync: bool = True) -> bool:
         """Run one statement, and sync it to the disk. Returns whether it changed any rows."""
         async with self._using:
             with self._usable():
                 await self._set_sync(sync)
-                cursor = await self._opened().execute(statement, values)
-        changed = cursor.rowcount > 0
-        await cursor.close()
-        return changed
+                async with self._opened().execute(statement, values) as cursor:
+                    return cursor.rowcount > 0
 
     async def run_together(self, *statements: tuple[str, tuple[Any, ...]], sync: bool = True) -> None:
         """Run all statements in one transaction. All of them have an effect or, if it fails, none."""
-        connection = self._opened()
         async with self._using:
+            connection = self._opened()
             try:
                 with self._usable():
                     await self._set_sync(sync)

@@ -7,14 +7,14 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import aiosqlite
 import pytest
 
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.work import Ledger, Phase
-from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
+from mesh.work.database import VERSION, Database, LedgerTooNew, LedgerUnusable
 from mesh.work.outbox import outgoing
 from tests.mesh.work.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.work.samples import liability, message
@@ -23,6 +23,7 @@ from tests.support.orders import demand, withdrawal
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
     from pathlib import Path
 
 __all__ = ["ledger", "path"]
@@ -224,3 +225,23 @@ async def completed(ledger: Ledger) -> LedgerUnusable | None:
     except LedgerUnusable as error:
         return error
     return None
+
+
+async def test_what_comes_while_the_ledger_is_closed_finds_it_closed(tmp_path: Path) -> None:
+    """Calls that have begun are done first."""
+    for turns in range(20):
+        database = Database(tmp_path / "ledger.db")
+        await database.open()
+        row = ("INSERT OR REPLACE INTO cursors (name, block) VALUES ('x', 1)", ())
+        calls: list[Coroutine[Any, Any, object]] = [
+            database.run(*row),
+            database.run_together(row),
+            database.rows("SELECT 1"),
+        ]
+        tasks = [asyncio.create_task(call) for call in calls]
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await database.close()
+        done = await asyncio.gather(*tasks, return_exceptions=True)
+        failures = [error for error in done if isinstance(error, Exception)]
+        assert [type(error) for error in failures] == [ClosedError] * len(failures)
