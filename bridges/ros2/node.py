@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from bridges.ros2.errors import RosTypeMismatch, RosUnavailable
@@ -17,6 +18,8 @@ from schemas.errors import InvalidPayload
 from schemas.payloads import Payload, PayloadType
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import zenoh
 
     from bridges.ros2.dds import Ros2Dds
@@ -45,15 +48,13 @@ class RosEndpoint:
     type: str
     key: str
     gid: bytes
-    _session: zenoh.Session
-    _token_key: str
-    """Empty where endpoints are not shown by tokens."""
+    _declare: Callable[[], Any]
+    """Declares its token; gives None where endpoints are not shown by tokens."""
     _token: Any = None
 
     def show(self) -> None:
         """Let others see it."""
-        if self._token_key:
-            self._token = self._session.liveliness().declare_token(self._token_key)
+        self._token = self._declare()
 
     def withdraw(self) -> None:
         """Take the token back, if there is one."""
@@ -107,7 +108,7 @@ class RosNode:
         facts = {"name": name, "type": type_name, "type_hash": type_hash, "qos": qos or DEFAULT_QOS}
         text = self.flavour.token(self._entity(kind, next(_ids), **facts))
         key = self.flavour.key(name, type_name, type_hash)
-        return RosEndpoint(name, type_name, key, gid_of(text), self.session, text)
+        return RosEndpoint(name, type_name, key, gid_of(text), partial(self._show, text))
 
     def others(self, name: str, *kinds: RosEntityKind) -> list[RosEntity]:
         """The endpoints of a name that other nodes have, or other nodes of this session."""

@@ -164,7 +164,8 @@ async def _peers(settings: Settings, network: Network) -> str:
     from mesh.network import Channel
     from mesh.watching import present
 
-    async with Channel(network.session, settings.lighthouse_contract) as channel:
+    name, timeout = settings.lighthouse_contract, settings.answer_timeout
+    async with Channel(network.session, name, answer_timeout=timeout) as channel:
         peers = await present(channel, "agent", "bridge")
     named = ", ".join(f"{peer.role} {short_address(peer.address)}" for peer in peers[:PEERS_NAMED])
     more = f" and {len(peers) - PEERS_NAMED} more" if len(peers) > PEERS_NAMED else ""

@@ -9,15 +9,16 @@ each that it receives. A conversation is express throughout; of a stream, only t
 
 from __future__ import annotations
 
-from time import monotonic
 from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from mesh.clock import SYSTEM_CLOCK
 
+if TYPE_CHECKING:
     from zenoh import Session
+
+    from mesh.clock import Clock
 
 QUIET: Final = 0.00025
 """Seconds without a message after which the next one may be sent at once."""
@@ -47,10 +48,10 @@ def put(
     *,
     encoding: str = JSON,
     attachment: bytes | None = None,
-    clock: Callable[[], float] = monotonic,
+    clock: Clock = SYSTEM_CLOCK,
 ) -> None:
     """Put bytes on a key. A congested link drops them rather than block."""
-    pace, now = _pace_of(session), clock()
+    pace, now = _pace_of(session), clock.monotonic()
     quiet = now - pace.last
     pace.last = now
     pace.credit = min(CREDIT, pace.credit + quiet * REFILL)

@@ -8,6 +8,7 @@ import pytest
 
 from mesh.network import Endpoints, Network, sending
 from tests.mesh.network.channels import listening, take
+from tests.support.clocks import SECOND, SetClock
 from tests.support.orders import demand
 from tests.support.waiting import until, until_heard
 
@@ -19,38 +20,29 @@ if TYPE_CHECKING:
 KEY = "aira/test"
 
 
-class Clock:
-    """A clock that tests set, in seconds."""
-
-    now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
+def clock() -> SetClock:
+    return SetClock()
 
 
 async def test_a_message_on_a_quiet_session_is_sent_at_once_and_those_right_after_it_in_batches(
-    here: zenoh.Session, clock: Clock
+    here: zenoh.Session, clock: SetClock
 ) -> None:
     heard: list[bool] = []
     subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
     for pause in (0.0, 0.0, sending.QUIET / 2, sending.QUIET / 2, sending.QUIET * 1.01, 0.0):
-        clock.now += pause
+        clock.pass_by(round(pause * SECOND))
         sending.put(here, KEY, b"", clock=clock)
     await until(lambda: len(heard) == 6)
     assert heard == [True, False, False, False, True, False]
     subscriber.undeclare()
 
 
-async def test_of_a_stream_only_the_beginning_is_sent_at_once(here: zenoh.Session, clock: Clock) -> None:
+async def test_of_a_stream_only_the_beginning_is_sent_at_once(here: zenoh.Session, clock: SetClock) -> None:
     heard: list[bool] = []
     subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
     for _ in range(100):
-        clock.now += sending.QUIET * 1.01
+        clock.pass_by(round(sending.QUIET * 1.01 * SECOND))
         sending.put(here, KEY, b"", clock=clock)
     await until(lambda: len(heard) == 100)
     assert heard[:8] == [True] * 8
@@ -59,7 +51,7 @@ async def test_of_a_stream_only_the_beginning_is_sent_at_once(here: zenoh.Sessio
 
 
 async def test_a_conversation_is_sent_at_once_throughout(
-    here: zenoh.Session, there: zenoh.Session, clock: Clock
+    here: zenoh.Session, there: zenoh.Session, clock: SetClock
 ) -> None:
     """Each order is answered before the next one is sent."""
     async with listening(here, there) as (demands, theirs):
@@ -67,7 +59,7 @@ async def test_a_conversation_is_sent_at_once_throughout(
         subscriber: Any = there.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
         await until_heard(here, KEY)
         for _ in range(30):
-            clock.now += sending.QUIET * 1.01
+            clock.pass_by(round(sending.QUIET * 1.01 * SECOND))
             theirs.publish(demand())
             await take(demands, 1)
             sending.put(here, KEY, b"", clock=clock)
@@ -76,7 +68,7 @@ async def test_a_conversation_is_sent_at_once_throughout(
         subscriber.undeclare()
 
 
-async def test_each_session_has_its_own_quiet(here: zenoh.Session, there: zenoh.Session, clock: Clock) -> None:
+async def test_each_session_has_its_own_quiet(here: zenoh.Session, there: zenoh.Session, clock: SetClock) -> None:
     heard: list[bool] = []
     subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
     sending.put(here, KEY, b"", clock=clock)

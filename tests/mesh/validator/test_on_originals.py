@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from mesh.agent import Agent, Contract
     from mesh.validator.validator import Validator
     from tests.support.routers import EmbeddedRouter
 
@@ -73,6 +74,13 @@ async def judge(court: Court) -> tuple[Validator, str]:
     return validator, court.account().address
 
 
+async def hand_in_undone_work(court: Court, person: Agent, robot: Agent, validator: str) -> Contract:
+    """A contract for which the robot hands in a recording that does not show the work."""
+    contract = await court.demand(person, validator)
+    await claim(robot, contract, await robot.add(court.place.save(objective(("/go", "nowhere")), "lie.mcap")))
+    return contract
+
+
 async def test_a_validated_job_is_paid(court: Court) -> None:
     place = court.place
     (validator, named), robot = await judge(court), await court.robot()
@@ -91,8 +99,7 @@ async def test_undone_work_is_refunded(court: Court) -> None:
     (validator, named), robot = await judge(court), await liar(court)
     async with court.at_work(validator, robot) as person:
         before = await court.place.balance("person")
-        contract = await court.demand(person, named)
-        await claim(robot, contract, await robot.add(court.place.save(objective(("/go", "nowhere")), "lie.mcap")))
+        contract = await hand_in_undone_work(court, person, robot, named)
         assert not (await contract.outcome()).success
         assert await court.place.balance("person") == before - FEE
 
@@ -105,8 +112,7 @@ async def test_undone_work_is_not_paid_where_a_refusal_would_pay_it(
     (validator, named), robot = await judge(court), await liar(court)
     async with court.at_work(validator, robot) as person:
         before = await court.place.balance("robot")
-        contract = await court.demand(person, named)
-        await claim(robot, contract, await robot.add(court.place.save(objective(("/go", "nowhere")), "lie.mcap")))
+        contract = await hand_in_undone_work(court, person, robot, named)
         (report,) = await until_found(lambda: reports_on(person, contract), what="the report")
         assert not report.success
 
