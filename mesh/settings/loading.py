@@ -26,7 +26,13 @@ RETIRED: Final = {
 }
 """Options of the legacy stack that have no meaning here, and why. They are logged and ignored."""
 
-NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO", "AIRA_MCAP", "AIRA_PEERS_CACHE"})
+NOT_OPTIONS: Final = frozenset(
+    {
+        "AIRA_CONFIG",
+        *("AIRA_REQUIRE_PEERS", "AIRA_PEERS_CACHE", "AIRA_KUBO", "AIRA_MCAP", "AIRA_ORIGINAL_CONTRACTS"),
+        *("AIRA_MODEL_HISTORIES", "AIRA_MONEY_HISTORIES", "AIRA_TURN_HISTORIES", "AIRA_SIMULATION_TRACEBACKS"),
+    }
+)
 """`AIRA_*` variables that belong to the command line or to the tests, not to the settings."""
 
 
