@@ -136,10 +136,9 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
         print(f"seed {options.seed}", file=sys.stderr)
     if min(options.jobs, options.history_jobs, options.workers) < 1:
         parser.error("--jobs, --history-jobs and --workers are at least 1")
-    names = set(KINDS)
     only, without = (frozenset(filter(None, text.split(","))) for text in (options.only, options.without))
-    if (only | without) - names - {"none"}:
-        parser.error(f"faults are {', '.join(sorted(names))}")
+    if (only | without) - {*KINDS, "none"}:
+        parser.error(f"faults are {', '.join(sorted(KINDS))}")
     options.only, options.without = only or None, without
     if options.log:
         _print_logs()

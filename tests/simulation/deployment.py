@@ -41,10 +41,10 @@ STAKE: Final = 100 * XRT
 """Of the second provider, in wn: as much as the first one has."""
 PLAIN: Final = 0.5
 """How many markets are as small as possible."""
-LIFETIMES: Final = (4, 8, 60, 90, 90)
-"""Blocks for which an order is valid: sometimes so few that it expires while it is matched."""
-
-
+LIFETIMES: Final = (60, 90, 90)
+"""Blocks for which an order is valid."""
+SHORT_LIFETIMES: Final = (4, 8)
+"""So few that it may expire while it is matched."""
 JURORS: Final = 3
 VALIDATED: Final = 0.4
 """How many markets of generation 5 have a validator."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from tests.simulation.scheduler import SECOND
@@ -59,6 +59,12 @@ class FaultPlan:
     """That a block with events is replaced soon after it was mined."""
     repeat_every: float = 0.0
     """A stranger publishes all orders again that it has heard."""
+    withdraw: float = 0.0
+    """That a person withdraws an order."""
+    revoke: float = 0.0
+    """That a person takes the allowance for an order away for a while."""
+    short_lived: float = 0.0
+    """That an order is valid for a few blocks only."""
     lasts: float = 0.0
     """Seconds after which all faults stop, though people go on; zero: not before people are done, or time is up."""
 
@@ -91,7 +97,13 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
 }
 
 
-KINDS: Final = tuple(field.name for field in fields(FaultPlan) if field.name in RANGES)
+WHIMS: Final[dict[str, tuple[float, ...]]] = {
+    "withdraw": (0.1, 0.2, 0.7),
+    "revoke": (0.0, 0.0, 0.5),
+    "short_lived": (0.4,),
+}
+"""What people do that leaves an order without a job, and how often: in all histories that do not exclude it."""
+KINDS: Final = (*RANGES, *WHIMS)
 LASTS: Final = (10, 150)
 
 
@@ -100,11 +112,15 @@ def choose(
 ) -> FaultPlan:
     """The faults of a history: all of the kinds in `only`, or of all kinds but `without` some."""
     plan, level = FaultPlan(), chance.choice(SHARES) if only is None else 1.0
-    for name in KINDS:
+    for name in RANGES:
         is_chosen, value = chance.random() < level, chance.uniform(*RANGES[name])
         if is_chosen and (only is None or name in only) and name not in without:
             setattr(plan, name, value)
     plan.lasts = chance.choice([0.0, *(2 * [chance.uniform(*LASTS)])])
+    for name, shares in WHIMS.items():
+        share = chance.choice(shares)
+        if (only is None or name in only) and name not in without:
+            setattr(plan, name, share)
     return plan
 
 
@@ -130,6 +146,7 @@ class Faults:
         for faults in (faults for role in market.roles for faults in role.all_node_faults):
             faults.unreachable, faults.silent, faults.late = plan.unreachable, plan.silent, plan.late
             faults.spoilt, faults.lost_after_sending = plan.spoilt, plan.lost_after_sending
+        market.withdrawn, market.revoked, market.short_lived = plan.withdraw, plan.revoke, plan.short_lived
         if self._draw("robot-left", plan.leave):
             self._scheduler.call_later(self._draw.random.uniform(5, 300), self._leave)
         self._every = {

@@ -27,10 +27,8 @@ if TYPE_CHECKING:
     from mesh.market.book import Match
     from tests.simulation.audit import Audit
 
-WITHDRAWN: Final = (0.1, 0.2, 0.7)
 GONE: Final = (NoContracts, NotALiability)
 """Errors about contracts that a reorganisation may take: no process may end by them."""
-REVOKED: Final = (0.0, 0.0, 0.5)
 
 
 @dataclass
@@ -50,6 +48,12 @@ class Market:
     plan_crash: Callable[[Role, Process], None] = lambda role, process: None
     lines: list[str] = field(default_factory=list)
     audit: Audit | None = None
+    withdrawn: float = 0.0
+    """How many orders people withdraw."""
+    revoked: float = 0.0
+    """For how many orders people take the allowance away for a while."""
+    short_lived: float = 0.0
+    """How many orders are valid for a few blocks only."""
     settled_head: int = 0
     settled_blocks: int = 0
     plan: MarketPlan = field(default_factory=MarketPlan)
@@ -62,10 +66,6 @@ class Market:
         self.violations: list[str] = []
         self.objectives: dict[int, Path] = {}
         self.cids: dict[Path, str] = {}
-        self.withdrawn = self.scheduler.random.choice(WITHDRAWN)
-        """How many orders people withdraw."""
-        self.revoked = self.scheduler.random.choice(REVOKED)
-        """For how many orders people take the allowance away for a while."""
         names = ("provider", "provider-1")[: self.plan.providers]
         self.providers = [ProviderRole(self, name) for name in names]
         self.robots = [RobotRole(self, f"robot-{number}") for number in range(ROBOTS)]

@@ -111,7 +111,7 @@ MUTATIONS: Final = (
         "mesh.agent.trade:Trader.new_head",
         "order.deadline <= block",
         "order.deadline <= block + 3",
-        "delay,leave_out,partition_every",
+        "delay,leave_out,partition_every,short_lived",
     ),
     Mutation(
         "open orders of an earlier run are sent again without being taken up",
@@ -140,8 +140,9 @@ MUTATIONS: Final = (
         "mesh.chain.liabilities:RefundState.is_refundable",
         "return not self.is_finalized",
         "return self.is_finalized",
-        "leave",
+        "leave,crash_every",
         seeds=40,
+        jobs=6,
     ),
     Mutation(
         "people are told the opposite of how a contract ended",
@@ -183,14 +184,14 @@ MUTATIONS: Final = (
         "mesh.agent.trade:Trader._rejected",
         "elif order.reject(rejection):",
         "elif fail_future(order.created, OrderExpired(identity, 0)) or order.reject(rejection):",
-        "late",
+        "late,revoke",
     ),
     Mutation(
         "a withdrawal is not sent to the chain",
         "mesh.agent.trade:Trader.withdraw_on_chain",
         "tx = (await self._chain.liabilities.withdraw(order.signed)).tx",
         'tx = ""',
-        "drop,delay,leave_out,partition_every",
+        "drop,delay,leave_out,partition_every,withdraw",
         seeds=40,
     ),
     Mutation(
@@ -220,7 +221,7 @@ MUTATIONS: Final = (
         "mesh.market.settlement:Settlement._refusal",
         "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
         "return None",
-        "repeat_every,delay",
+        "repeat_every,delay,withdraw",
         seeds=120,
     ),
     Mutation(
@@ -229,6 +230,7 @@ MUTATIONS: Final = (
         "synced.position, recorded=synced.messages",
         "run.position + 1, recorded=0",
         CRASHES,
+        jobs=6,
     ),
     Mutation(
         "the provider does not see a reorganisation",
@@ -281,7 +283,7 @@ CANDIDATES: Final = (
         "mesh.market.withdrawals:Withdrawals._load",
         "if self._database is None:",
         "if True:",
-        "crash_every,repeat_every,partition_every",
+        "crash_every,repeat_every,partition_every,withdraw",
     ),
     Mutation(
         "a success is signed although the recording lacks messages",
@@ -344,7 +346,7 @@ CANDIDATES: Final = (
         "mesh.market.settlement:Settlement._set_aside_unfunded",
         "self._unfunded.add(order)",
         "continue",
-        "late",
+        "late,revoke",
     ),
     Mutation(
         "an order that was used by a reverted contract is taken for withdrawn",

@@ -20,7 +20,7 @@ from mesh.validator.validator import Validator
 from schemas import String, decode, message_hash
 from tests.simulation import loop
 from tests.simulation.chain import NodeFaults, SimulatedNode
-from tests.simulation.deployment import ENDPOINT, LIFETIMES, MODEL, STAKE, TIMING
+from tests.simulation.deployment import ENDPOINT, LIFETIMES, MODEL, SHORT_LIFETIMES, STAKE, TIMING
 from tests.simulation.scheduler import Process
 
 if TYPE_CHECKING:
@@ -285,8 +285,9 @@ class PersonRole(Role):
 
     async def _order(self, agent: Agent, wanted: Ordered) -> Contract:
         """Post an order, and wait for its contract; some are withdrawn."""
-        chance = self.market.scheduler.random
-        objective, lifetime = self.market.objective(chance.randint(2, 12)), chance.choice(LIFETIMES)
+        chance, draw = self.market.scheduler.random, self.market.draw
+        objective = self.market.objective(chance.randint(2, 12))
+        lifetime = chance.choice(SHORT_LIFETIMES if draw("order-short-lived", self.market.short_lived) else LIFETIMES)
         self.market.trace(self.name, "demands", number=wanted.number, cost=wanted.cost)
         order = await agent.order(
             objective,
@@ -297,9 +298,9 @@ class PersonRole(Role):
         )
         wanted.order, wanted.told = order.hash, "ordered"
         wanted.posted, wanted.deadline = self.market.deployed.chain.evm.head, order.message.deadline
-        if chance.random() < self.market.revoked:
+        if draw("allowance-revoked", self.market.revoked):
             self._revoking = asyncio.ensure_future(self._revoke(agent))
-        if chance.random() < self.market.withdrawn:
+        if draw("order-withdrawn", self.market.withdrawn):
             await asyncio.sleep(chance.uniform(0.1, 20))
             on_chain = chance.random() < 0.5
             await (order.withdraw_on_chain() if on_chain else order.withdraw())

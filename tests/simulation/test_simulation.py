@@ -15,13 +15,17 @@ from tests.simulation.faults import KINDS
 from tests.simulation.mutations import CANDIDATES, MUTATIONS
 from tests.simulation.runs import numbers_in, ranges
 
-FAULTS = "crash,crash_every,delay,drop,duplicate,late,leave_out,lost_after_sending,partition_every,preempt"
+FAULTS = (
+    "crash,crash_every,delay,drop,duplicate,late,leave_out,lost_after_sending,partition_every,preempt,"
+    "withdraw,revoke,short_lived"
+)
 
 
 HAPPEN = {
     *("message-cut-off", "message-delayed", "message-dropped", "message-duplicated", "message-replayed"),
     *("answer-spoilt", "node-late", "node-unreachable", "reorganisation", "transaction-left-out"),
     *("clock-jump", "crash-planned", "disk-full", "kill", "partition", "power-failure", "write-refused"),
+    *("allowance-revoked", "order-short-lived", "order-withdrawn"),
 }
 """Kinds of faults as they are counted."""
 
