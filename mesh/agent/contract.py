@@ -167,6 +167,9 @@ class WatchedContracts:
     def __len__(self) -> int:
         return len(self._watched)
 
+    def __contains__(self, address: str) -> bool:
+        return address in self._watched
+
     async def read(self, address: str) -> Contract:
         """The contract at `address` (or name), read from the chain. Raises `NotALiability`."""
         address = await self._parts.chain.names.address(address)

@@ -2,7 +2,7 @@
 
 `ChainListener` reads the chain block by block and saves its position in the ledger, so it misses nothing while the
 agent is down. Handling is idempotent: a block that was handled in part is handled again. The methods named `…_reverted`
-undo what a reorganisation reverts. `LateResults` finalizes a job if no provider does so in time.
+undo what a reorganisation reverts.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from contextlib import aclosing
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
@@ -22,20 +22,14 @@ from mesh.chain import (
     History,
     NewLiability,
     NoContracts,
-    NodeUnreachable,
     NotALiability,
-    NotOffered,
     Reorganisation,
-    RequestRefused,
-    Reverted,
     Transfer,
 )
-from mesh.errors import ChainError
 from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.retry import Backoff
 from mesh.work.ledger import TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
-from schemas import Result, decode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,16 +42,6 @@ if TYPE_CHECKING:
     from schemas import Liability
 
 log = logging.getLogger(__name__)
-
-SHARE: Final = 4
-"""A Result is late when a quarter of the blocks before the refund are left …"""
-LEAST_BLOCKS: Final = 20
-"""… or fewer than this."""
-SOON: Final = 3
-"""Blocks that leave a Result unsettled before the chain is asked when it would be late."""
-JUDGED: Final = frozenset({"NotTheValidator", "RefusedByValidator"})
-"""How the contracts refuse a Result that only a validator can finalize."""
-NEVER: Final = 2**63
 
 
 class ChainListener:
@@ -91,7 +75,12 @@ class ChainListener:
         """Read on from the position in the ledger."""
         cursor, history = await self._position()
         following = self._chain.follow(
-            cursor, history=history, token=token, parties=[self._account], outages=self._parts.outages
+            cursor,
+            history=history,
+            token=token,
+            parties=[self._account],
+            choose=self._choose,
+            outages=self._parts.outages,
         )
         async with aclosing(following) as blocks:
             async for block in blocks:
@@ -104,7 +93,8 @@ class ChainListener:
                 if block.events:
                     # If it is handled only in part, and replaced before the agent is back, it is reverted like others.
                     await self._ledger.set_cursor(block.block_number - 1, history=history.encode())
-                await self.handle_all(block.events)
+                for event in block.events:
+                    await self.handle(event)
                 await self._ledger.set_cursor(block.block_number, history=history.encode())
                 await self.new_head(block.block_number)
                 backoff.reset()
@@ -130,17 +120,17 @@ class ChainListener:
         self._parts.chain_head.begin_after(last)
         return last + 1, history
 
-    async def handle_all(self, events: Sequence[ChainEvent]) -> None:
-        """Act on the events of a block, except on new liabilities between others."""
-        created = [event for event in events if isinstance(event, NewLiability)]
-        foreign: set[NewLiability] = set()
-        if len(created) > 1:  # one call for all
-            read = partial(self._chain.liabilities.parties, [event.liability for event in created])
-            parties = await self._chain.retrying(read, outages=self._parts.outages)
-            foreign = {event for event, named in zip(created, parties, strict=True) if self._account not in named}
-        for event in events:
-            if event not in foreign:
-                await self.handle(event)
+    async def _choose(self, created: Sequence[str], ended: Sequence[str]) -> set[str]:
+        """Of the liabilities that were created or ended in some blocks, those that may concern this agent."""
+        chosen = set(created)
+        if len(created) > 1:  # one call for all, because most are between others
+            parties = await self._chain.liabilities.parties(created)
+            chosen = {one for one, named in zip(created, parties, strict=True) if self._account in named}
+        if ended:
+            held = await self._ledger.holds([*ended, *map(result_identity, ended)])
+            watched = self._trader.contracts
+            chosen |= {one for one in ended if one in held or result_identity(one) in held or one in watched}
+        return chosen
 
     async def handle(self, event: ChainEvent) -> None:
         """Act on an event of the chain."""
@@ -209,7 +199,7 @@ class ChainListener:
 
     @with_liability_context
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
-        """A contract, perhaps not ours, has paid (`success`) or refunded. `result` is the CID of its recording."""
+        """A contract has paid (`success`) or refunded. `result` is the CID of its recording."""
         async with self._executor.halted(address) as job:
             # In this order: after a crash in between, the block is handled again and finds the job unfinished.
             await self._parts.outbox.settle(result_identity(address))  # also one that was signed by request
@@ -233,8 +223,8 @@ class ChainListener:
     async def new_head(self, block: int) -> None:
         """All of `block` has been handled. After a reorganisation it may be lower than before."""
         self._parts.chain_head.advance_to(block)
-        await self._trader.new_head(block)
         await self._parts.outbox.expire(block)
+        await self._trader.new_head(block)
 
     async def _owe_result(self, job: JobRecord) -> None:
         """Send the Result of a complete job again."""
@@ -242,58 +232,3 @@ class ChainListener:
         address, success = job.liability.address, bool(job.success)
         await self._executor.owe_result(address, success=success, result=job.result, note=job.note)
         await self._parts.outbox.send_new()
-
-
-class LateResults:
-    """Finalizes liabilities by the account's own Results before they can be refunded, if no provider does.
-
-    The original contracts offer no finalization without a turn; there it does nothing.
-    """
-
-    def __init__(self, parts: AgentComponents) -> None:
-        self._parts = parts
-        self._liabilities = parts.chain.liabilities
-        self._late_from: dict[str, int] = {}  # block, by liability
-        self._since: dict[str, int] = {}  # the block at which its Result was seen first, by liability
-
-    async def run(self) -> None:
-        """Look at the unsettled Results after each block, until cancelled."""
-        head = self._parts.chain_head
-        while True:
-            unsettled = await self._parts.ledger.outbox(head=head.head)
-            results = [decode(one.payload) for one in unsettled if one.kind == Result.kind]
-            waiting = {result.liability: result for result in results if isinstance(result, Result)}
-            self._late_from = {address: block for address, block in self._late_from.items() if address in waiting}
-            self._since = {address: self._since.get(address, head.head) for address in waiting}
-            for address, result in waiting.items():
-                with liability_context(address):
-                    await self._finalize_if_late(result)
-            await head.reached(head.head + 1)
-
-    async def _finalize_if_late(self, result: Result) -> None:
-        address, head = result.liability, self._parts.chain_head.head
-        try:
-            if address not in self._late_from:
-                if head - self._since[address] < SOON:
-                    return
-                refundable = await self._liabilities.refundable_from(address)
-                self._late_from[address] = refundable - max(LEAST_BLOCKS, (refundable - self._since[address]) // SHARE)
-            if head < self._late_from[address]:
-                return
-            settled = await self._liabilities.finalize_without_turn(result)
-        except (NodeUnreachable, RequestRefused, NotALiability) as error:
-            log.debug("looking at the result again after the next block: %s", error)
-        except (NotOffered, Reverted) as error:
-            # The originals, a liability that has ended, or one whose validator must confirm the result.
-            self._late_from[address] = NEVER
-            log.debug("only a provider can finalize this: %s", error)
-            if isinstance(error, Reverted) and error.reason in JUDGED:
-                facts = log_event("verdict-late", code=error.reason)
-                log.warning("the validator has not judged the result, and the cost can be refunded soon", extra=facts)
-        except ChainError as error:
-            facts = log_event("late-result-waits", code=error.code)
-            log.warning("no provider finalized the contract, and finalizing it failed: %s", error, extra=facts)
-        else:
-            self._late_from[address] = NEVER
-            facts = log_event("late-result-finalized", success=result.success, gas=settled.gas_used)
-            log.warning("finalized without a provider, because none did in time", extra=facts)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.agent.declines import DeclinePublisher
 from mesh.agent.demands import DemandDispatcher
 from mesh.agent.handlers import call
-from mesh.agent.listener import ChainListener, LateResults
+from mesh.agent.late_results import LateResults
+from mesh.agent.listener import ChainListener
 from mesh.agent.reports import ContractReports
 from mesh.agent.services import offer_services
 from mesh.agent.status import AgentStatus

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from mesh.chain.contracts import ContractKind
     from mesh.chain.following import BlockEvents, History
     from mesh.chain.policy import FeePolicy, Timing
+    from mesh.chain.reader import Choose
     from mesh.chain.rpc_client import Endpoint
     from mesh.errors import AiraError
     from mesh.outage_log import OutageLog
@@ -181,13 +182,15 @@ class Chain:
         token: str = "",
         parties: Iterable[str] | None = None,
         lighthouses: Iterable[str] = (),
+        choose: Choose | None = None,
         outages: OutageLog | None = None,
     ) -> AsyncGenerator[BlockEvents, None]:
         """Blocks with their events from the block `cursor` on, and reorganisations, without end: see `following`.
 
         Transfers and approvals are those of `token` (an address; XRT by default), all or those that concern one of
-        `parties` (addresses); a lighthouse's turns are read for the addresses in `lighthouses`. Outages of the node are
-        logged to `outages` and survived. Raises `ChainWentBack` and `ReorganisedTooDeep`.
+        `parties` (addresses); a lighthouse's turns are read for the addresses in `lighthouses`. `choose` says which
+        liabilities' events are read; all by default. Outages of the node are logged to `outages` and survived. Raises
+        `ChainWentBack` and `ReorganisedTooDeep`.
         """
         contracts = self._opened()
         sources = EventSources(
@@ -195,6 +198,7 @@ class Chain:
             token=token or contracts.xrt,
             parties=None if parties is None else frozenset(parties),
             lighthouses=tuple(lighthouses),
+            choose=choose,
             is_liability=contracts.version.is_liability,
             recognise=contracts.version.recognise,
         )

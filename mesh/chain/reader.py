@@ -15,6 +15,7 @@ from mesh.chain.errors import NodeUnreachable, RequestRefused
 from mesh.chain.events import (
     Approval,
     ChainEvent,
+    Finalized,
     NewLiability,
     NewLighthouse,
     Transfer,
@@ -24,7 +25,7 @@ from mesh.chain.events import (
 from schemas.address import address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Collection, Iterable, Sequence
 
     from mesh.chain.answers import BlockHeader, Log
     from mesh.chain.node import Node
@@ -46,6 +47,12 @@ class ReplacedWhileReading(Exception):
     """The chain was reorganised between two requests: the answers don't belong together."""
 
 
+Choose: TypeAlias = "Callable[[Sequence[str], Sequence[str]], Awaitable[Collection[str]]]"
+"""Returns, of the liabilities (addresses) that were created and of those that ended, the ones whose events are read."""
+
+DecodedLog: TypeAlias = "tuple[Log, ChainEvent | None]"
+"""A log and its event, if it is one of the contracts'."""
+
 ReadRange: TypeAlias = "Callable[[int, int, BlockHeader | None], Awaitable[list[SeenBlock]]]"
 """Reads the blocks from one to another, both included, as `read_events` does; of a single block it gets the header."""
 
@@ -61,6 +68,8 @@ class EventSources:
     token: str
     parties: frozenset[str] | None = None
     lighthouses: tuple[str, ...] = ()
+    choose: Choose | None = None
+    """Which liabilities' events are read; those of all by default."""
     is_liability: Callable[[str], Awaitable[bool]]
     recognise: Callable[[str], None]
     """Called with each liability that the factory's events name, before `is_liability` is asked about its events."""
@@ -78,13 +87,21 @@ class EventSources:
         parties = [bytes(12) + address_bytes(party) for party in self.parties]
         return header is None or header.may_log(*wanted, *((*one, party) for one in of_token for party in parties))
 
-    def concern(self, event: ChainEvent | None) -> bool:
-        """Whether an event is one of those that are read."""
+    async def chosen(self, decoded: Sequence[DecodedLog]) -> list[DecodedLog]:
+        """The same logs, with None for each event that is not one of those that are read."""
+        liabilities: Collection[str] | None = None
+        if self.choose is not None:
+            created = [event.liability for _, event in decoded if isinstance(event, NewLiability)]
+            ended = [event.liability for _, event in decoded if isinstance(event, Finalized)]
+            liabilities = await self.choose(created, ended) if created or ended else ()
+        return [(log, event if self._is_read(event, liabilities) else None) for log, event in decoded]
+
+    def _is_read(self, event: ChainEvent | None, liabilities: Collection[str] | None) -> bool:
         match event:
-            case None:
-                return False
             case Transfer(one, other) | Approval(one, other):
                 return self.parties is None or one in self.parties or other in self.parties
+            case NewLiability(liability) | Finalized(liability):
+                return liabilities is None or liability in liabilities
         return True
 
 
@@ -135,22 +152,25 @@ async def read_events(
     if sources.logs_in(header):
         contracts = [sources.factory, sources.token, *sources.lighthouses]
         logs = await node.logs(first, last, addresses=contracts, topics=topics_of("Factory", "XRT", "Lighthouse"))
-    for log in logs:
-        if isinstance(event := decode_log(log), NewLiability) and log.address == sources.factory:
+    decoded = [(log, decode_log(log)) for log in logs]
+    for log, event in decoded:
+        if isinstance(event, NewLiability) and log.address == sources.factory:
             sources.recognise(event.liability)
     endings: list[Log] = []
     if header is None or header.may_log(_topics("Liability")):
         endings = await node.logs(first, last, addresses=(), topics=topics_of("Liability"))
     # Any contract can log the same event, and as often as it likes.
     ours = {address for address in {log.address for log in endings} if await sources.is_liability(address)}
-    return _by_block((*logs, *(log for log in endings if log.address in ours)), last, sources.concern)
+    decoded += [(log, decode_log(log)) for log in endings if log.address in ours]
+    return _by_block(await sources.chosen(decoded), last)
 
 
 async def read_created(node: Node, factory: str, first: int, last: int, header: BlockHeader | None) -> list[SeenBlock]:
     """The same with the events of the factory only."""
     if header is not None and not header.may_log(*((address_bytes(factory), topic) for topic in _topics("Factory"))):
         return _by_block((), last)
-    return _by_block(await node.logs(first, last, addresses=[factory], topics=topics_of("Factory")), last)
+    logs = await node.logs(first, last, addresses=[factory], topics=topics_of("Factory"))
+    return _by_block(((log, decode_log(log)) for log in logs), last)
 
 
 async def list_created(node: Node, factory: str, from_block: int) -> list[NewLiability | NewLighthouse]:
@@ -165,18 +185,18 @@ def _topics(*contracts: str) -> list[bytes]:
     return [bytes.fromhex(topic[2:]) for topic in topics_of(*contracts)]
 
 
-def _by_block(
-    logs: Iterable[Log], last: int, concern: Callable[[ChainEvent | None], bool] = lambda event: event is not None
-) -> list[SeenBlock]:
-    ordered = sorted(logs, key=lambda log: (log.block_number, log.log_index))
+def _by_block(decoded: Iterable[DecodedLog], last: int) -> list[SeenBlock]:
+    """The blocks of some logs that have events, and the last one."""
+    ordered = sorted(decoded, key=lambda one: (one[0].block_number, one[0].log_index))
     blocks = []
-    for number, group in groupby(ordered, key=lambda log: log.block_number):
+    for number, group in groupby(ordered, key=lambda one: one[0].block_number):
         of_block = list(group)
-        hashes = {log.block_hash for log in of_block}
+        hashes = {log.block_hash for log, _ in of_block}
         if len(hashes) > 1:
             raise ReplacedWhileReading
-        events = tuple(event for log in of_block if concern(event := decode_log(log)) and event is not None)
-        blocks.append(SeenBlock(number, hashes.pop(), events))
+        events = tuple(event for _, event in of_block if event is not None)
+        if events or number == last:
+            blocks.append(SeenBlock(number, hashes.pop(), events))
     if not blocks or blocks[-1].block_number != last:
         blocks.append(SeenBlock(last, b"", ()))
     return blocks

@@ -128,8 +128,10 @@ class Database:
         async with self._using:
             with self._usable():
                 await self._set_sync(sync)
-                async with self._opened().execute(statement, values) as cursor:
-                    return cursor.rowcount > 0
+                connection = self._opened()
+                before = connection.total_changes
+                await connection.execute_fetchall(statement, values)  # one call of the thread, not two
+                return connection.total_changes > before
 
     async def run_together(self, *statements: tuple[str, tuple[Any, ...]], sync: bool = True) -> None:
         """Run all statements in one transaction. All of them have an effect or, if it fails, none."""

@@ -18,7 +18,7 @@ from mesh.work.database import Database
 from schemas import Liability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
 LISTENER: Final = "listener"
@@ -185,6 +185,13 @@ class Ledger:
         statement = f"SELECT * FROM jobs WHERE phase IN ({marks}) AND NOT aside ORDER BY rowid"
         return [_job(row) for row in await self._database.rows(statement, wanted)]
 
+    async def holds(self, names: Sequence[str]) -> set[str]:
+        """Those of some names that are a job's liability (address), or the identity of a message in the outbox."""
+        marks = ",".join("?" * len(names))
+        statement = f"SELECT liability FROM jobs WHERE liability IN ({marks})"
+        statement += f" UNION SELECT identity FROM outbox WHERE identity IN ({marks})"
+        return {row[0] for row in await self._database.rows(statement, (*names, *names))}
+
     async def jobs_by_phase(self) -> dict[str, int]:
         """The number of jobs in each phase that has any."""
         return {phase: count for phase, count, _ in await self.phases()}
@@ -262,10 +269,17 @@ class Ledger:
 
     async def outbox(self, *, head: int) -> list[Outgoing]:
         """The messages to send, oldest first. Deletes those whose deadline block `head` has reached."""
-        await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (head,), sync=False)
-        await self._database.run("DELETE FROM withdrawn WHERE deadline <= ?", (head,), sync=False)
-        statement = "SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid"
-        return [Outgoing(*row) for row in await self._database.rows(statement)]
+        rows = await self._database.rows(
+            "SELECT identity, kind, payload, deadline, rowid FROM outbox"
+            " UNION ALL SELECT identity, kind, payload, deadline, 0 FROM withdrawn WHERE deadline <= ? ORDER BY rowid",
+            (head,),
+        )
+        if any(row[3] is not None and row[3] <= head for row in rows):
+            await self._database.run_together(
+                *((f"DELETE FROM {table} WHERE deadline <= ?", (head,)) for table in ("outbox", "withdrawn")),
+                sync=False,
+            )
+        return [Outgoing(*row[:4]) for row in rows if row[3] is None or row[3] > head]
 
     async def waiting_by_kind(self) -> dict[str, int]:
         """The messages in the outbox of each kind (`demand`, `offer`, `withdrawal`, `result`) that has any."""

@@ -357,7 +357,7 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "robots leave late results to providers",
-        "mesh.agent.listener:LateResults._finalize_if_late",
+        "mesh.agent.late_results:LateResults._finalize_if_late",
         "if head < self._late_from[address]:",
         "if True:",
         "leave",

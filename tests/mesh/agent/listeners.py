@@ -53,7 +53,7 @@ class RecordedTokenEvents(TokenEvents):
 
 
 class RecordingListener(ChainListener):
-    """A listener that writes down what happens on the chain, and does nothing about it."""
+    """A listener that writes down what happens on the chain, and does no more about it than to add jobs."""
 
     def __init__(self, parts: AgentComponents) -> None:
         runtime = AgentRuntime(parts, Handlers(), Models(parts.store, parts.exchange))
@@ -67,6 +67,7 @@ class RecordingListener(ChainListener):
 
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         self.liabilities.append((liability, demand_hash, offer_hash))
+        await self._ledger.add_job(liability)
 
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         self.ends.append((address, success, result))
