@@ -34,6 +34,7 @@ from mesh.devchain import EmbeddedChain  # noqa: E402
 from mesh.devchain.anvil import find_anvil, serve_anvil  # noqa: E402
 from mesh.devchain.development import deploy_market  # noqa: E402
 from mesh.market.provider import Provider  # noqa: E402
+from mesh.market.transaction_queue import UNDER_WAY  # noqa: E402
 from mesh.network import Channel, Endpoints, Network  # noqa: E402
 from mesh.settings import Settings  # noqa: E402
 from peers.catalog import locate  # noqa: E402
@@ -122,14 +123,16 @@ async def embedded() -> AsyncIterator[tuple[Any, DevelopmentMarket]]:
         yield node.provider, await deploy_market(node.provider, node.funded_keys)
 
 
-def jobs_per_minute(jobs: int, *, robots: int, at_once: int, block_time: int = 0) -> dict[str, Any]:
+def jobs_per_minute(
+    jobs: int, *, robots: int, at_once: int, block_time: int = 0, unmined: int = UNDER_WAY
+) -> dict[str, Any]:
     """Jobs from demand to payment: one provider, that many robots, and a person with `at_once` open demands.
 
     Router, anvil, provider, all robots together and the person are a process each. A block is mined with each
-    transaction, or every `block_time` seconds.
+    transaction, or every `block_time` seconds. The provider has at most `unmined` transactions that are not mined.
     """
     with router() as (endpoint, pid), tempfile.TemporaryDirectory() as folder:
-        settings = Settings(connect=(endpoint,), data_dir=folder, playback="at-once")
+        settings = Settings(connect=(endpoint,), data_dir=folder, playback="at-once", unmined_limit=unmined)
         return asyncio.run(_jobs(settings, pid, jobs=jobs, robots=robots, at_once=at_once, block_time=block_time))
 
 
@@ -179,6 +182,7 @@ async def _jobs(
         "robots": robots,
         "at_once": at_once,
         "block_time": block_time,
+        "unmined": settings.unmined_limit,
         "jobs_per_minute": round(jobs / seconds * 60),
         "provider_cpu_ms_a_job": round(used["provider"] / jobs * 1000, 1),
         "provider_capacity": round(60 * jobs / used["provider"]),
@@ -206,7 +210,9 @@ async def _provide(settings: Settings, keys: Sequence[bytes], number: int, pipe:
     async with (
         chain_of(settings, Account.from_key(keys[0])) as chain,
         Network(Endpoints(connect=settings.connect)) as network,
-        Provider(network.session, chain, settings.lighthouse_contract) as provider,
+        Provider(
+            network.session, chain, settings.lighthouse_contract, unmined_limit=settings.unmined_limit
+        ) as provider,
         Background() as tasks,
     ):
         tasks.start(provider.run(), "provider")
@@ -262,9 +268,15 @@ def _model(which: int) -> str:
 
 def main() -> None:
     """Run the benchmark of jobs."""
-    options = arguments("jobs a minute of one provider", jobs=200, robots=20, at_once=40, block_time=0)
+    options = arguments(
+        "jobs a minute of one provider", jobs=200, robots=20, at_once=40, block_time=0, unmined=UNDER_WAY
+    )
     results = jobs_per_minute(
-        options.jobs, robots=options.robots, at_once=options.at_once, block_time=options.block_time
+        options.jobs,
+        robots=options.robots,
+        at_once=options.at_once,
+        block_time=options.block_time,
+        unmined=options.unmined,
     )
     show(results, as_json=options.json)
 

@@ -55,6 +55,8 @@ MODEL: Final = cid_of_bytes(b"what the robot of the benchmark can do")
 TIMEOUT: Final = 180.0
 SETTLE_SECONDS: Final = 3.0
 """After the last block of a job, until all have read it."""
+PACE_BLOCKS: Final = 8
+"""Blocks at the pace of a case that its chain has when the processes start."""
 CALLS_PER_JOB: Final = 30
 """With a block every 12 s."""
 IDLE_MINUTE: Final = 6
@@ -246,6 +248,8 @@ async def market_of(case: Case) -> AsyncIterator[tuple[Market, Chain]]:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         chain = await stack.enter_async_context(market.chain(node.url, "person"))
         await chain.node.request("evm_setAutomine", False)
+        # As on a chain that is older than the market: its deployment came at another pace.
+        await chain.node.request("anvil_mine", PACE_BLOCKS, case.block_time)
         await chain.node.request("evm_setIntervalMining", case.block_time)
         proxy = CountingProxy(node.url)
         port = await stack.enter_async_context(proxy.serve())

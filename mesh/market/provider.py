@@ -20,7 +20,7 @@ from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.liability_events import OPEN_LIABILITIES
 from mesh.market.services import OrderBookService, ProviderStatusService
 from mesh.market.settlement import Settlement
-from mesh.market.transaction_queue import LEAST_GAS, RETRY, TransactionQueue
+from mesh.market.transaction_queue import LEAST_GAS, RETRY, UNDER_WAY, TransactionQueue
 from mesh.market.turns import NoStake
 from mesh.market.withdrawals import Withdrawals
 from mesh.network.channel import Channel
@@ -59,11 +59,12 @@ class Provider(Role):
     """A provider of one lighthouse: `async with Provider(session, chain, lighthouse) as provider`, then `run`.
 
     `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
-    is called with each match before its liability is created, `retry` is the policy for transactions that fail, and
-    `open_liabilities` the most records of open liabilities in memory. Withdrawals are kept in the file `withdrawals`,
-    if given. Orders leave the book after `deadline_limit` blocks. Messages of `blocked` signers are rejected, and their
-    orders leave the book; what is dropped is counted in `drops`. The caller closes session and chain. When `run` is
-    cancelled, a transaction that was sent may still be mined.
+    is called with each match before its liability is created, `retry` is the policy for transactions that fail,
+    `unmined_limit` the most of them that wait to be mined, and `open_liabilities` the most records of open liabilities
+    in memory. Withdrawals are kept in the file `withdrawals`, if given. Orders leave the book after `deadline_limit`
+    blocks. Messages of `blocked` signers are rejected, and their orders leave the book; what is dropped is counted in
+    `drops`. The caller closes session and chain. When `run` is cancelled, a transaction that was sent may still be
+    mined.
     """
 
     title = "provider"
@@ -77,6 +78,7 @@ class Provider(Role):
         limit: int = LIMIT,
         matched: Callable[[Match], None] = lambda match: None,
         retry: RetryPolicy = RETRY,
+        unmined_limit: int = UNDER_WAY,
         open_liabilities: int = OPEN_LIABILITIES,
         withdrawals: Path | None = None,
         deadline_limit: int = DEADLINE_LIMIT,
@@ -92,6 +94,7 @@ class Provider(Role):
         self._limit = limit
         self._matched = matched
         self._retry = retry
+        self._unmined_limit = unmined_limit
         self._open_liabilities = open_liabilities
         self._deadline_limit = deadline_limit
         self._blocked = blocked
@@ -109,7 +112,12 @@ class Provider(Role):
         stack.enter_context(self.withdrawals)
         self.withdrawals.expire(head)
         self.queue = TransactionQueue(
-            self._chain, address, head=lambda: self.settlement.events.head, earnings=self.ledger, retry=self._retry
+            self._chain,
+            address,
+            head=lambda: self.settlement.events.head,
+            earnings=self.ledger,
+            retry=self._retry,
+            under_way=self._unmined_limit,
         )
         self.channel = await stack.enter_async_context(
             Channel(

@@ -43,7 +43,7 @@ RETRY: Final = RetryPolicy(attempts=8)
 BUSY_SECONDS: Final = 100.0
 """How long the failing attempts at one transaction may take in all: the others wait meanwhile."""
 UNDER_WAY: Final = 16
-"""Transactions that wait to be mined at the same time: nodes keep as many of one account, and may drop more."""
+"""Transactions that wait to be mined at the same time, by default: some nodes keep no more of one account."""
 QUEUED: Final = 1024
 """Transactions in the queue above which `has_room` waits."""
 SET_ASIDE: Final = 4096

@@ -153,6 +153,9 @@ class MarketSettings:
     lighthouse_contract: str = option("", "ENS name of the lighthouse, the market to trade on")
     erc20_token: str = option("", "ENS name or address of the token that pays for work")
     open_orders_limit: PositiveInt = option(24_576, "most open orders that a provider keeps, 2 KB each")
+    unmined_limit: PositiveInt = option(
+        16, "most transactions of a provider that wait to be mined; some nodes keep no more of one account"
+    )
     deadline_limit: PositiveInt = option(
         DEADLINE_LIMIT,
         "blocks after which a provider drops an order, and an agent's offer for a demand ends, before its deadline",
