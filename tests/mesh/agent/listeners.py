@@ -58,6 +58,7 @@ class RecordingListener(ChainListener):
     def __init__(self, parts: AgentComponents) -> None:
         runtime = AgentRuntime(parts, Handlers(), Models(parts.store, parts.exchange))
         super().__init__(parts, runtime.trader, runtime.executor, on_phase=ignore)
+        self.watched = runtime.trader.contracts
         self.liabilities: list[tuple[Liability, bytes, bytes]] = []
         self.ends: list[tuple[str, bool, str]] = []
         self.reverted_ends: list[str] = []
@@ -131,6 +132,6 @@ async def contract(place: Place, *, promisor: str = "robot") -> tuple[str, Deman
     return created.liability, demand, offer
 
 
-async def finalize(place: Place, address: str) -> None:
-    result = place.market.accounts["robot"].signer.sign(Result(liability=address, result=RECORDING, success=True))
+async def finalize(place: Place, address: str, *, promisor: str = "robot") -> None:
+    result = place.market.accounts[promisor].signer.sign(Result(liability=address, result=RECORDING, success=True))
     await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, result)

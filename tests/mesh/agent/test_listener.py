@@ -76,6 +76,19 @@ async def test_a_finalization_is_reported_with_its_result(place: Place, ledger: 
     assert listener.ends == [(address, True, RECORDING)]
 
 
+async def test_of_contracts_of_others_only_the_end_of_a_watched_one_is_reported(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as listener:
+        await started(ledger)
+        others = [(await contract(place, promisor="provider"))[0] for _ in range(3)]
+        await listener.watched.read(others[1])
+        for address in others:
+            await finalize(place, address, promisor="provider")
+        mine, *_ = await contract(place)
+        await finalize(place, mine)
+        await until(lambda: len(listener.ends) == 2)
+    assert [address for address, *_ in listener.ends] == [others[1], mine]
+
+
 async def test_a_new_agent_begins_at_the_head(place: Place, ledger: Ledger) -> None:
     await contract(place)
     head = await place.chains["robot"].block_number()

@@ -269,3 +269,17 @@ async def test_several_transactions_wait_to_be_mined_at_the_same_time(local: Loc
             assert not provider.queue.is_down, "none had to fail before the next was sent"
         await until(lambda: provider.earnings().created == 3)
         assert local.rejections == []
+
+
+async def test_no_more_transactions_than_the_limit_wait_to_be_mined(local: LocalMarket) -> None:
+    before = len(await local.chain.liabilities.list())
+    async with HeldNode(local.node) as node, local.provider(endpoint=node, unmined_limit=2) as provider:
+        with node.back("eth_getTransactionReceipt"):
+            for _ in range(5):
+                demand = local.demand()
+                local.publish(demand, local.offer())
+            await until(lambda: provider.queue.waiting == 3)
+            await asyncio.sleep(1)
+            assert provider.queue.waiting == 3
+            assert len(await local.chain.liabilities.list()) == before + 2
+        await until(lambda: provider.earnings().created == 5)
