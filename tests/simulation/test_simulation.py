@@ -77,7 +77,7 @@ def test_a_planted_bug_is_found() -> None:
 def test_faults_of_each_kind_happen() -> None:
     """Which of them a seed draws changes with the code, so it takes a few."""
     happened = set[str]()
-    for seed in map(str, range(1, 9)):
+    for seed in map(str, range(1, 33)):
         arguments = ("--seed", seed, "--jobs", "4", "--chain", "model", "--only", ",".join(KINDS), "--lasts", "400")
         found, said = simulate(*arguments)
         assert found["violations"] == [], said
