@@ -247,15 +247,13 @@ MUTATIONS: Final = (
         "if False:",
         "spoilt",
     ),
-)
-
-CANDIDATES: Final = (
     Mutation(
         "messages are recorded with the time of day",
         "mesh.recording.recorder:Recorder.record",
         "self._epoch + self._clock.monotonic_ns()",
         "self._clock.time_ns()",
         "clock_every",
+        seeds=40,
     ),
     Mutation(
         "the listener's cursor runs ahead of what it has handled",
@@ -263,7 +261,25 @@ CANDIDATES: Final = (
         "block.block_number - 1, history",
         "block.block_number, history",
         CRASHES,
+        seeds=40,
     ),
+    Mutation(
+        "orders of a reverted contract are forgotten",
+        "mesh.agent.trade:Trader.liability_reverted",
+        "await self._parts.outbox.unspend(address)",
+        "None",
+        REORGANISATIONS + ",crash_every",
+    ),
+    Mutation(
+        "an order that its maker can't pay is forgotten",
+        "mesh.market.settlement:Settlement._set_aside_unfunded",
+        "self._unfunded.add(order)",
+        "continue",
+        "late,revoke",
+    ),
+)
+
+CANDIDATES: Final = (
     Mutation(
         "a job that was set aside is never taken up again",
         "mesh.work.ledger:Ledger.add_job",
@@ -291,13 +307,6 @@ CANDIDATES: Final = (
         "if success and (missing :=",
         "if False and (missing :=",
         "full_every",
-    ),
-    Mutation(
-        "orders of a reverted contract are forgotten",
-        "mesh.agent.trade:Trader.liability_reverted",
-        "await self._parts.outbox.unspend(address)",
-        "None",
-        REORGANISATIONS + ",crash_every",
     ),
     Mutation(
         "a reverted payment is not asked for again",
@@ -340,13 +349,6 @@ CANDIDATES: Final = (
         "if result in self._events.unconfirmed:",
         "if False:",
         "duplicate,replay",
-    ),
-    Mutation(
-        "an order that its maker can't pay is forgotten",
-        "mesh.market.settlement:Settlement._set_aside_unfunded",
-        "self._unfunded.add(order)",
-        "continue",
-        "late,revoke",
     ),
     Mutation(
         "an order that was used by a reverted contract is taken for withdrawn",
