@@ -214,7 +214,8 @@ class Outbox:
         """Wait until the next attempt is due."""
         while True:
             self._changed.clear()
-            next_at = min((one.next_at for one in self._attempts.values()), default=None)
+            free = (one.next_at for identity, one in self._attempts.items() if identity not in self._held)
+            next_at = min(free, default=None)
             remaining = None if next_at is None else next_at - self._clock()
             if remaining is not None and remaining <= 0:
                 return

@@ -38,9 +38,15 @@ class Post:
         self.ledger = ledger
         self.network = network
         clock = time.monotonic if policy is QUICKLY else lambda: self.time
+        self.rounds = 0
         self.outbox = Outbox(
-            ledger, channel, network, head=lambda: self.head, policy=policy, clock=clock, chance=lambda: 0.0
+            ledger, channel, network, head=self._read_head, policy=policy, clock=clock, chance=lambda: 0.0
         )
+
+    def _read_head(self) -> int:
+        """The head, which the outbox reads once each time it looks for messages to send."""
+        self.rounds += 1
+        return self.head
 
 
 @asynccontextmanager
@@ -193,6 +199,24 @@ async def test_each_message_backs_off_on_its_own(
         await until(lambda: received[-1][1] == second)
         await sent_at(155.9)
         await sent_at(156, first, second)
+
+
+async def test_a_message_that_is_held_keeps_nothing_busy(post: Post, received: list[tuple[str, Any]]) -> None:
+    """As after a reorganisation: sent before, and held until its allowance is ensured."""
+    ours = demand()
+    await listened_to(post)
+    async with Background() as tasks:
+        tasks.start(post.outbox.run(), "outbox")
+        await post.outbox.post(ours)
+        await until(lambda: len(received) >= 2)
+        post.outbox.hold([outgoing_identity(ours)])
+        await asyncio.sleep(0.3)
+        post.rounds = 0
+        await asyncio.sleep(0.5)
+        assert post.rounds == 0
+        received.clear()
+        await post.outbox.release([outgoing_identity(ours)])
+        await until(lambda: [message for _, message in received[:1]] == [ours])
 
 
 @pytest.mark.parametrize("role", ["provider", "validator"])
