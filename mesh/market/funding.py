@@ -13,7 +13,7 @@ import asyncio
 import heapq
 from collections import Counter
 from contextlib import asynccontextmanager, nullcontext
-from itertools import count
+from itertools import count, islice
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from mesh.chain import Holding
@@ -86,7 +86,7 @@ class UnfundedOrders:
         """Look at the orders when they are due, until cancelled."""
         while True:
             await asyncio.sleep(self._interval)
-            due = [order for order in (self._next_due() for _ in range(CHECKS)) if order is not None]
+            due = list(islice(iter(self._next_due, None), CHECKS))
             for order, shortage in zip(due, await self._shortages(due), strict=True):
                 waiting = self._waiting.pop(order_id(order), None)
                 if waiting is None or order_id(order) not in self._book:
