@@ -221,8 +221,8 @@ MUTATIONS: Final = (
         "mesh.market.settlement:Settlement._refusal",
         "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
         "return None",
-        "repeat_every,delay,withdraw",
-        seeds=120,
+        "repeat_every,replay,drop,duplicate,delay,withdraw",
+        seeds=240,
     ),
     Mutation(
         "the ledger's position runs ahead of the recording",
@@ -230,6 +230,7 @@ MUTATIONS: Final = (
         "synced.position, recorded=synced.messages",
         "run.position + 1, recorded=0",
         CRASHES,
+        seeds=120,
         jobs=6,
     ),
     Mutation(
