@@ -217,6 +217,14 @@ MUTATIONS: Final = (
         "late",
     ),
     Mutation(
+        "an order that waits for its allowance keeps its agent busy",
+        "mesh.work.outbox:Outbox._wait",
+        " if identity not in self._held",
+        "",
+        f"{REORGANISATIONS},revoke,late,unreachable",
+        seeds=40,
+    ),
+    Mutation(
         "the provider ignores withdrawals",
         "mesh.market.settlement:Settlement._refusal",
         "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",

@@ -101,6 +101,7 @@ class Role:
         process = self.process = Process(market.scheduler, f"{self.name}#{self.starts}")
         process.wall_offset_ns = self.wall_offset_ns
         process.on_crash = lambda: self._crashed(process)
+        process.on_busy = lambda: market.violated("busy", f"{process.name} polls without a pause")
         self.folder.mkdir(parents=True, exist_ok=True)
         if not self.market.is_calm:
             market.plan_crash(self, process)

@@ -25,6 +25,8 @@ REAL_TIME: Final = time.perf_counter
 """The real clock."""
 STEP_NS: Final = 20_000
 """What one callback of an event loop costs. Code that polls a clock would never end if it cost nothing."""
+BUSY_STEPS: Final = 20_000
+"""Steps of a process in a second that mean that it is busy with nothing. Honest work takes up to 5,200; 50,000 fit."""
 START_WALL_NS: Final = 1_800_000_000 * SECOND
 
 
@@ -74,6 +76,9 @@ class Process:
         self.crash_at_commit: int | None = None
         self.wall_offset_ns = 0
         self.on_crash: Callable[[], None] = lambda: None
+        self.on_busy: Callable[[], None] = lambda: None
+        self._second = 0
+        self._busy_at = 0
         self.kept: list[object] = []
         """What must not be collected after a crash, which would run its cleanup."""
 
@@ -81,6 +86,11 @@ class Process:
         """Count a step of this process. It may be its last."""
         self.steps += 1
         self.scheduler.now_ns += STEP_NS
+        second = self.scheduler.now_ns // SECOND
+        if second != self._second:
+            self._second, self._busy_at = second, self.steps + BUSY_STEPS
+        if self.steps == self._busy_at:
+            self.on_busy()
         if self.steps == self.crash_at_step:
             self.scheduler.crash(self)
 
