@@ -17,7 +17,7 @@ WORKDIR /source
 COPY requirements/lock.txt requirements/
 RUN python3 -m venv /tools && python3 -m venv --without-pip /opt/aira \
  && sed -n '/^setuptools==/,/[^\\]$/p' requirements/lock.txt > /tmp/setuptools.txt \
- && /tools/bin/pip install --quiet --no-cache-dir --require-hashes -r /tmp/setuptools.txt
+ && /tools/bin/pip install --quiet --no-cache-dir --no-deps --require-hashes -r /tmp/setuptools.txt
 
 FROM tools AS project
 COPY LICENSE README.md pyproject.toml ./
@@ -28,13 +28,13 @@ RUN /tools/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /whe
 
 FROM tools AS edge-environment
 COPY requirements/edge.txt requirements/
-RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --require-hashes -r requirements/edge.txt
+RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --no-deps --require-hashes -r requirements/edge.txt
 COPY --from=project /wheels /wheels
 RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --no-index --no-deps /wheels/*.whl
 
 FROM tools AS server-environment
 COPY requirements/server.txt requirements/
-RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --require-hashes -r requirements/server.txt
+RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --no-deps --require-hashes -r requirements/server.txt
 COPY --from=project /wheels /wheels
 RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --no-index --no-deps /wheels/*.whl
 

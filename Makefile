@@ -33,6 +33,7 @@ define NEEDS_PYTHON
 [ -n "$(PYTHON)" ] || { echo "Python 3.11 or later is needed, and python3 is: $$(python3 --version 2>&1)" >&2; exit 1; }
 endef
 
+# The lock lists every package, so nothing is resolved: older pips would take a newer version of a package with extras.
 # Made again when the exact versions or the project's own metadata change; otherwise there is nothing to do.
 $(INSTALLED): $(LOCK) pyproject.toml
 	@$(NEEDS_PYTHON)
@@ -41,8 +42,9 @@ $(INSTALLED): $(LOCK) pyproject.toml
 	@rm -f $@
 	@$(PYTHON) -m venv .venv
 	@echo "installing into .venv ..."
-	@$(BIN)/pip install --quiet --disable-pip-version-check -r $(LOCK)
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $(LOCK)
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@$(BIN)/pip check --quiet --disable-pip-version-check
 	@touch $@
 
 demo: $(INSTALLED) ## a whole market on this machine, in one process; ARGS="..." are passed on
