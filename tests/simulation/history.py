@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from tests.simulation import loop, threads
 from tests.simulation.audit import Audit
 from tests.simulation.chance import FaultDraw
-from tests.simulation.deployment import PAUSES, market_plan
+from tests.simulation.deployment import JOBS, PAUSES, market_plan
 from tests.simulation.faults import Faults, choose
 from tests.simulation.market import Market
 from tests.simulation.scheduler import REAL_TIME, SECOND, HistoryFailed, Process
@@ -57,9 +57,13 @@ class Report:
     """The hash of the trace."""
 
 
-def plan_of(seed: int, *, only: frozenset[str] | None = None, without: frozenset[str] = frozenset()) -> FaultPlan:
-    """The faults of a seed, of some kinds `only`, or `without` some."""
-    return choose(random.Random(f"faults {seed}"), only=only, without=without)
+def plan_of(
+    seed: int, jobs: int, *, only: frozenset[str] | None = None, without: frozenset[str] = frozenset()
+) -> FaultPlan:
+    """The faults of a seed, of some kinds `only`, or `without` some. In long histories they last longer."""
+    plan = choose(random.Random(f"faults {seed}"), only=only, without=without)
+    plan.lasts *= max(1.0, jobs / JOBS)
+    return plan
 
 
 def run_history(

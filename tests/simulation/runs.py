@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -11,10 +12,10 @@ import traceback
 from collections import deque
 from dataclasses import asdict, dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn
 
 from tests.simulation import history
-from tests.simulation.deployment import market_plan
+from tests.simulation.deployment import JOBS, market_plan
 from tests.simulation.history import Report
 from tests.simulation.mutations import planted
 
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
 
     from tests.simulation.deployment import Deployed, Deployments
+
+MOST_CPU_SECONDS: Final = 900
+"""Of a history; the longest of those with 60 jobs take a minute."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class Run:
     def arguments(self) -> str:
         """The command line's arguments that run it again."""
         words = [f"--seed {self.seed} --jobs {self.jobs}"]
+        if self.jobs > JOBS:
+            words.append(f"--history-jobs {self.jobs}")
         if self.only is not None:
             words.append(f"--only {','.join(sorted(self.only)) or 'none'}")
         if self.without:
@@ -126,7 +132,8 @@ class Child:
             said = pipe.read()
         os.waitpid(self._process, 0)
         if not said:
-            return Report(self.run.seed, violations=["history-failed: the process of the history ended"])
+            ended = f"history-failed: its process ended, or computed for {MOST_CPU_SECONDS} s"
+            return Report(self.run.seed, violations=[ended])
         report = Report(**json.loads(said))
         report.chains = {self._kind: 1}
         return report
@@ -141,10 +148,11 @@ class Child:
 def _play(market: Deployed, run: Run, writing: int, *, trace: bool, switches: str | None) -> NoReturn:
     """Run a history in this process, which ends; the report goes into the pipe."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_SECONDS, MOST_CPU_SECONDS))
     try:
         if run.plant:
             planted(run.plant).apply()
-        plan = history.plan_of(run.seed, only=run.only, without=run.without)
+        plan = history.plan_of(run.seed, run.jobs, only=run.only, without=run.without)
         plan.lasts = plan.lasts if run.lasts is None else run.lasts
         report, lines = history.run_history(market, run.seed, run.jobs, plan, left_out=run.left_out, switches=switches)
         if trace:

@@ -5,6 +5,7 @@ What is above them in the standard library (events, semaphores, executors) is Py
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import random
@@ -51,7 +52,8 @@ class Lock:
             return True
         if not blocking:
             return False
-        ends = None if timeout < 0 else current.now_ns + round(timeout * SECOND)
+        # At least a nanosecond: who waits in a loop until a time has come must get there.
+        ends = None if timeout < 0 else current.now_ns + max(1, math.ceil(timeout * SECOND))
         fiber = current.current
         assert fiber is not None, "a lock is taken outside of any thread"
         while self.locked():
