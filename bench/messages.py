@@ -14,7 +14,8 @@ import os
 import sys
 import threading
 import time
-from typing import Any, Final
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
 
 from coincurve import PublicKey
 from zenoh import CongestionControl
@@ -22,6 +23,9 @@ from zenoh import CongestionControl
 from common import ADDRESS, LIGHTHOUSE, SPAWN, arguments, router, show, signed_demands
 from mesh.network import Channel, Endpoints, Network, message_key
 from schemas import Demand, encode, keccak256, message_hash
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 WINDOW: Final = 4096
 """Most messages in flight; the ring holds twice as many."""
@@ -68,8 +72,7 @@ async def _publish(endpoint: str, count: int, ready: Any) -> None:
 
 async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, float]:
     """Verified messages, and bare recoveries, per second of this process's time."""
-    received: list[Demand] = []
-    bare = 0.0
+    received, latest, bare = 0, deque[Demand](maxlen=EVERY), 0.0
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
         Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
@@ -80,25 +83,26 @@ async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, float]:
         await anext(demands)
         started, apart = time.process_time(), 0.0
         async for demand in demands:
-            received.append(demand.message)
-            if len(received) % EVERY == 0:
-                network.session.put(PROGRESS_KEY, str(len(received) + 1))
-            if len(received) % INTERLUDE == 0:
+            received += 1
+            latest.append(demand.message)
+            if received % EVERY == 0:
+                network.session.put(PROGRESS_KEY, str(received + 1))
+            if received % INTERLUDE == 0:
                 time.sleep(REST)  # noqa: ASYNC251  # the pump verifies what it may, and then waits for this thread
                 before = time.process_time()
-                bare += recover_bare(received[-EVERY:])
+                bare += recover_bare(latest)
                 apart += time.process_time() - before
-            if len(received) == count - 1:
+            if received == count - 1:
                 network.session.put(PROGRESS_KEY, str(count))
                 break
         seconds = time.process_time() - started - apart
         statistics = demands.statistics()
     assert not statistics.invalid, statistics
     assert not statistics.dropped, statistics
-    return len(received) / seconds, len(received) // INTERLUDE * EVERY / bare
+    return received / seconds, received // INTERLUDE * EVERY / bare
 
 
-def recover_bare(demands: list[Demand]) -> float:
+def recover_bare(demands: Iterable[Demand]) -> float:
     """Seconds of this thread for recoveries of the same signatures; preparations are not counted."""
     signatures = [compact(demand) for demand in demands]
     started = time.thread_time()

@@ -47,8 +47,8 @@ AMBIGUOUS_NONCE: Final = "00" * 12
 """No nonce of generation 3 may start like this: the contracts would read it as a generation-5 order."""
 DEDUPLICATION_LIMIT: Final = 65_536
 """Accepted messages that a validator remembers, to drop duplicates."""
-SLICE: Final = 64
-"""Signatures verified at a time: a few milliseconds."""
+SLICE: Final = 128
+"""Signatures verified at a time: some seven milliseconds."""
 _DOT, _BACKSLASH = b".\\"
 
 
@@ -171,8 +171,10 @@ class MessageValidator(Generic[M]):
 
     def _verify_all(self, prepared: list[_Prepared[M] | Unresolved[M]]) -> list[Verified[M] | Unresolved[M]]:
         """Verify signatures: that of each message once, even if copies of it come together."""
-        new = [each for each in prepared if isinstance(each, _Prepared) and each.identity not in self._seen]
-        signed = {each.identity: each.signed for each in new}
+        seen = self._seen
+        signed = {
+            each.identity: each.signed for each in prepared if type(each) is _Prepared and each.identity not in seen
+        }
         keys = dict(zip(signed, recover_keys(signed.values()), strict=True))
         with self._lock:
             return [found for each in prepared if (found := self._verify(each, keys)) is not None]
