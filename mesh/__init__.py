@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.shadowing import require_own
@@ -117,6 +118,7 @@ if not TYPE_CHECKING:  # a type checker knows the names from above, and reports 
         return _version() if name == "__version__" else _load(name)
 
 
+@cache
 def _version() -> str:
     from importlib.metadata import PackageNotFoundError, version
 

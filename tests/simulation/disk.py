@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import builtins
 import errno
+import fcntl
 import io
 import os
 import shutil
@@ -118,55 +119,58 @@ class SimulatedDisk:
     def crash(self, folder: Path, *, power: bool) -> None:
         """Bring a folder to what a crash leaves: all that was written, unless the machine lost its `power`.
 
-        The files are copies: the locks of the dead process are on the old ones.
+        Databases and locked files become copies: the locks of the dead process are on the old ones.
         """
-        gone = folder.with_name(f"{folder.name}.gone")
-        folder.rename(gone)
-        self._restore(gone, folder, power=power)
-        shutil.rmtree(gone)
+        self._restore(str(folder), power=power)
 
-    def _restore(self, gone: Path, folder: Path, *, power: bool) -> None:
-        folder.mkdir()
-        entries = self._entries.get(gone.stat().st_ino)
-        for path in sorted(gone.iterdir()):
-            target = folder / path.name
-            if path.is_dir():
-                self._restore(path, target, power=power)
-                continue
-            if path.name.endswith(INDEX):
-                continue
-            kept, inode = path.read_bytes(), path.stat().st_ino
-            if power:
-                left = self._after_power_failure(path, kept, entries or {})
-                if left is None:
-                    self._draw.counts["file-lost"] += 1
-                    continue
-                kept = left
-            target.write_bytes(kept)
-            shutil.copystat(path, target)
-            copy = target.stat().st_ino
-            if inode in self.databases:
-                self.databases.add(copy)
-            elif inode in self.logs:
-                self.logs[copy] = self.logs[inode].ending_at(len(kept)) if power else self.logs[inode]
-            elif power:
-                self.synced[copy] = kept
-            elif inode in self.synced:
-                self.synced[copy] = self.synced[inode]
-        if entries is not None:
-            self._entries[folder.stat().st_ino] = entries
+    def _restore(self, folder: str, *, power: bool) -> None:
+        entries = self._entries.get(os.stat(folder).st_ino, {})
+        # An index comes last: it says how far its log goes.
+        for entry in sorted(os.scandir(folder), key=lambda one: (one.name.endswith(INDEX), one.name)):
+            path, inode = entry.path, entry.inode()
+            if entry.is_dir():
+                self._restore(path, power=power)
+            elif path.endswith(INDEX):
+                os.unlink(path)
+            elif not power:
+                if inode in self.databases or inode in self.logs or _is_locked(path):
+                    self._copy(path, inode, Path(path).read_bytes())
+            elif (left := self._after_power_failure(path, inode, now := Path(path).read_bytes(), entries)) is None:
+                self._draw.counts["file-lost"] += 1
+                os.unlink(path)
+            else:
+                if left != now or inode in self.databases or inode in self.logs or _is_locked(path):
+                    inode = self._copy(path, inode, left)
+                if inode in self.logs:
+                    self.logs[inode] = self.logs[inode].ending_at(len(left))
+                elif inode not in self.databases:
+                    self.synced[inode] = left
 
-    def _after_power_failure(self, path: Path, now: bytes, entries: dict[str, int]) -> bytes | None:
+    def _copy(self, path: str, inode: int, data: bytes) -> int:
+        """Put a new file with this content in the place of one, of which it inherits the rest; its inode."""
+        new = path + ".new"
+        Path(new).write_bytes(data)
+        shutil.copystat(path, new)
+        os.replace(new, path)
+        copy = os.stat(path).st_ino
+        if inode in self.databases:
+            self.databases.add(copy)
+        elif inode in self.logs:
+            self.logs[copy] = self.logs[inode]
+        elif inode in self.synced:
+            self.synced[copy] = self.synced[inode]
+        return copy
+
+    def _after_power_failure(self, path: str, inode: int, now: bytes, entries: dict[str, int]) -> bytes | None:
         """What is left of a file; None if its name was not synced, and is lost with it."""
-        inode = path.stat().st_ino
         if inode in self.databases:
             return now
         if inode in self.logs:
-            latest = LogState.of(str(path).removesuffix(LOG))
+            latest = LogState.of(path.removesuffix(LOG))
             now, synced = now if latest is None else latest.cut(now), self.logs[inode].cut(now)
         elif inode in self.synced:
             synced = self.synced[inode]
-        elif path.name not in entries and self._draw.random.random() < 0.5:
+        elif os.path.basename(path) not in entries and self._draw.random.random() < 0.5:
             return None
         else:
             synced = b""
@@ -200,6 +204,17 @@ class SimulatedDisk:
             return connection
 
         sqlite3.connect = connect_here  # type: ignore[assignment]
+
+
+def _is_locked(path: str) -> bool:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
 
 
 def _checked(disk: SimulatedDisk, write: Any) -> Any:
@@ -239,6 +254,8 @@ class DatabaseConnection(sqlite3.Connection):
     disk: SimulatedDisk
     path: str
     _log = 0
+    _level: int | None = None
+    """What `synchronous` is; None if that may have changed."""
     _moved: tuple[bytes, int] | None = None
 
     def execute(self, statement: str, *arguments: Any) -> sqlite3.Cursor:
@@ -254,6 +271,7 @@ class DatabaseConnection(sqlite3.Connection):
     def executescript(self, statements: str) -> sqlite3.Cursor:
         """Execute several statements."""
         done: sqlite3.Cursor = self._guarded("CREATE", super().executescript, statements)
+        self._level = None
         return done
 
     def commit(self) -> None:
@@ -273,6 +291,8 @@ class DatabaseConnection(sqlite3.Connection):
         found = function(*arguments)
         if is_commit:
             self._committed()
+        elif word.startswith("PRAGMA"):
+            self._level = None
         return found
 
     def _committed(self) -> None:
@@ -281,9 +301,10 @@ class DatabaseConnection(sqlite3.Connection):
             self._find_files()
         latest = LogState.of(self.path)
         if latest is not None:
-            (level,) = super().execute("PRAGMA synchronous").fetchone()
+            if self._level is None:
+                (self._level,) = super().execute("PRAGMA synchronous").fetchone()
             moved = (latest.salts, latest.moved)
-            if level >= FULL or (latest.moved and moved != self._moved):
+            if self._level >= FULL or (latest.moved and moved != self._moved):
                 self.disk.logs[self._log] = latest
             else:
                 self.disk.logs.setdefault(self._log, latest._replace(frames=0))

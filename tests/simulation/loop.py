@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import heapq
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from tests.simulation.scheduler import SECOND, Fiber, Process, Scheduler
+from tests.simulation.threads import SimpleQueue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
+
+
+MOST_WORKERS: Final = 6
+"""Threads for blocking functions, as asyncio has on two cores."""
 
 
 class Future(asyncio.Future[Any]):
@@ -41,6 +46,8 @@ class SimulatedLoop(asyncio.BaseEventLoop):
         self._sleeping = False
         self._tasks: list[Task] = []
         self._prune_at = 100
+        self._work = SimpleQueue()
+        self._workers = self._idle = 0
         self.set_task_factory(self._make_task)
 
     def time(self) -> float:
@@ -61,6 +68,29 @@ class SimulatedLoop(asyncio.BaseEventLoop):
             self._tasks = [one for one in self._tasks if not one.done()]
             self._prune_at = 2 * len(self._tasks) + 100
         return task
+
+    def run_in_executor(self, executor: Any, func: Any, *args: Any) -> asyncio.Future[Any]:  # type: ignore[override]
+        """Run a function in a thread of this process: one that is idle, or a new one while there are few."""
+        if executor is not None:
+            return super().run_in_executor(executor, func, *args)
+        future = self.create_future()
+        self._work.put((future, func, args))
+        if self._idle < self._work.qsize() and self._workers < MOST_WORKERS:
+            self._workers += 1
+            self._scheduler.spawn(self._do_work, f"worker {self._workers}", self._process)
+        return future
+
+    def _do_work(self) -> None:
+        while True:
+            self._idle += 1
+            future, function, arguments = self._work.get()
+            self._idle -= 1
+            if not future.cancelled():
+                try:
+                    found, error = function(*arguments), None
+                except BaseException as failure:
+                    found, error = None, failure
+                self.call_soon_threadsafe(_settle, future, found, error)
 
     def _run_once(self) -> None:
         scheduler, ready, scheduled = self._scheduler, self._ready, self._scheduled  # type: ignore[attr-defined]
@@ -92,6 +122,15 @@ class SimulatedLoop(asyncio.BaseEventLoop):
 
     def _process_events(self, event_list: object) -> None:
         """There are no sockets."""
+
+
+def _settle(future: asyncio.Future[Any], found: Any, error: BaseException | None) -> None:
+    if future.cancelled():
+        return
+    if error is None:
+        future.set_result(found)
+    else:
+        future.set_exception(error)
 
 
 def start(

@@ -48,19 +48,9 @@ class Fiber:
         """Counts the waits of this fiber: a timer of an earlier wait has no effect."""
         self.is_waiting = False
         self.timed_out = False
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._hooks: Any = None
-
-    def leave(self) -> None:
-        """Put aside what CPython keeps for each thread."""
-        self._loop, self._hooks = events._get_running_loop(), sys.get_asyncgen_hooks()
-        events._set_running_loop(None)
-
-    def enter(self) -> None:
-        """Take it back."""
-        events._set_running_loop(self._loop)
-        if self._hooks is not None:
-            sys.set_asyncgen_hooks(*self._hooks)
+        self.loop: asyncio.AbstractEventLoop | None = None
+        self.hooks: Any = None
+        """With the running event loop, what CPython keeps for each thread."""
 
 
 class Process:
@@ -203,18 +193,22 @@ class Scheduler:
         self.call_at(self.now_ns + round(seconds * SECOND), function, *arguments)
 
     def run(self, is_done: Callable[[], bool], *, until_ns: int) -> bool:
-        """Run until `is_done`, which is asked whenever time passes; False if that time comes first."""
+        """Run until `is_done`, which is asked each second and at the end; False if that time comes first."""
+        asked = -1
         while True:
             while self._runnable:
                 chosen = self._runnable.pop(self.random.randrange(len(self._runnable)))
                 self._switch_in(chosen)
                 if self._timers and self._timers[0][0] <= self.now_ns:
                     self._fire()
-            if is_done():
-                return True
-            if not self._timers:
+            following = self._timers[0][0] if self._timers else None
+            if self.now_ns // SECOND != asked or following is None or following > until_ns:
+                asked = self.now_ns // SECOND
+                if is_done():
+                    return True
+            if following is None:
                 raise HistoryFailed("nothing can ever happen again")
-            if self._timers[0][0] > until_ns:
+            if following > until_ns:
                 return False
             self.now_ns = max(self.now_ns, self._timers[0][0])
             self._fire()
@@ -236,7 +230,9 @@ class Scheduler:
         if self._watch is not None:
             self._watch(fiber)
         self.current = fiber
-        fiber.enter()
+        if fiber.loop is not None:
+            events._set_running_loop(fiber.loop)
+            sys.set_asyncgen_hooks(*fiber.hooks)
         fiber.greenlet.switch()
         if fiber.greenlet.dead:
             self._fibers.discard(fiber)
@@ -244,5 +240,8 @@ class Scheduler:
         self.current = None
 
     def _switch_out(self, fiber: Fiber) -> None:
-        fiber.leave()
+        loop = fiber.loop = events._get_running_loop()
+        if loop is not None:
+            fiber.hooks = sys.get_asyncgen_hooks()
+            events._set_running_loop(None)
         self._hub.switch()

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections import deque
+from types import GenericAlias
 from typing import TYPE_CHECKING, Any, Final
 
 from tests.simulation.scheduler import SECOND, START_WALL_NS, Fiber, Scheduler
@@ -86,6 +87,45 @@ class Lock:
 
     def _at_fork_reinit(self) -> None:
         self._locked = False
+
+
+class SimpleQueue:
+    """`queue.SimpleQueue`, as far as it is used."""
+
+    __class_getitem__: Any = classmethod(GenericAlias)
+
+    def __init__(self) -> None:
+        self._items: deque[Any] = deque()
+        self._waiting: deque[Fiber] = deque()
+
+    def qsize(self) -> int:
+        """How many items wait."""
+        return len(self._items)
+
+    def put(self, item: Any) -> None:
+        """Add an item."""
+        World.scheduler.maybe_pause()
+        self._items.append(item)
+        if self._waiting:
+            World.scheduler.wake(self._waiting.popleft())
+
+    put_nowait = put
+
+    def get(self, block: bool = True) -> Any:
+        """Remove the oldest item; `block` waits for one, else `queue.Empty` is raised."""
+        current = World.scheduler
+        current.maybe_pause()
+        while not self._items:
+            if not block:
+                raise queue.Empty
+            assert current.current is not None, "a queue is waited for outside of any thread"
+            self._waiting.append(current.current)
+            current.wait()
+        return self._items.popleft()
+
+    def get_nowait(self) -> Any:
+        """The oldest item; raises `queue.Empty` if there is none."""
+        return self.get(block=False)
 
 
 class Thread:
@@ -201,7 +241,7 @@ def install() -> None:
     module.Thread = Thread
     queues: Any = queue
     queues.time = time.monotonic
-    queues.SimpleQueue = queues._PySimpleQueue
+    queues.SimpleQueue = SimpleQueue
     number_in_sets(Thread, threading.Event, queue.Queue)
     os.urandom = lambda size: World.scheduler.random.randbytes(size)
     secrets.token_bytes = lambda size=None: World.scheduler.random.randbytes(32 if size is None else size)  # type: ignore[assignment]
