@@ -63,8 +63,15 @@ class _Verdict(NamedTuple):
     until: float
 
 
+class _KnownJury(NamedTuple):
+    state: JuryState | None
+    until: float
+
+
 class Validators:
-    """What is known of validators, each asked from the chain once. A contract or a lighthouse stays what it is.
+    """What is known of validators, each asked from the chain once. A jury or a lighthouse stays what it is.
+
+    That a contract is no jury is asked again after a while: the node may have been behind, or answered wrongly.
 
     With the originals, an address without code must have sent a transaction: else it may be that of a lighthouse which
     somebody is about to create.
@@ -74,7 +81,7 @@ class Validators:
         self._contracts = contracts
         self._clock = clock
         self._verdicts: BoundedDict[str, _Verdict] = BoundedDict(REMEMBERED)
-        self._juries: BoundedDict[str, JuryState | None] = BoundedDict(REMEMBERED)
+        self._juries: BoundedDict[str, _KnownJury] = BoundedDict(REMEMBERED)
         """Contracts that were asked whether they are juries; the fees are 0."""
 
     def known(self, validator: str) -> bool | None:
@@ -206,9 +213,12 @@ class Validators:
 
     async def _jury(self, contract: str) -> JuryState | None:
         """The jury at an address with code, without its fees; None if it is another contract."""
-        if contract not in self._juries:
-            self._juries[contract] = await read_jury(self._contracts, contract)
-        return self._juries[contract]
+        known = self._juries.get(contract)
+        if known is None or self._clock() >= known.until:
+            state = await read_jury(self._contracts, contract)
+            recheck = self._contracts.node.timing.validator_recheck if state is None else math.inf
+            known = self._juries[contract] = _KnownJury(state, self._clock() + recheck)
+        return known.state
 
 
 def _check(validator: str, generation: int, verdict: _Verdict | None) -> None:

@@ -188,7 +188,9 @@ class Faults:
         for role in market.roles:
             for node_faults in role.all_node_faults:
                 node_faults.stop()
+            role.wall_offset_ns = 0
             if role.process is not None:
+                role.process.wall_offset_ns = 0
                 role.process.crash_at_step = role.process.crash_at_commit = None
 
     def _again(self, kind: str, mean: float) -> None:

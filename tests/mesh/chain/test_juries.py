@@ -16,8 +16,10 @@ from mesh.chain import (
     NoFees,
     NotAJury,
     NotOffered,
+    Timing,
     TransactionSender,
     ValidatorWithoutCode,
+    juries,
     new_private_key,
 )
 from mesh.errors import InvalidMessage
@@ -120,6 +122,17 @@ async def test_other_contracts_are_no_juries(market: DeployedMarket) -> None:
             accounts(1)[0].address,
         ]:
             assert await chain.validators.jury(address) is None
+
+
+async def test_a_jury_that_a_node_did_not_know_is_asked_again(
+    market: DeployedMarket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed, jurors = await some_jury(market)
+    async with market.chain(timing=Timing(validator_recheck=0.0)) as chain:
+        with monkeypatch.context() as behind:
+            behind.setattr(juries, "is_code_of", lambda name, code: False)
+            assert await chain.validators.jurors(deployed.address) is None
+        assert await chain.validators.jurors(deployed.address) == tuple(juror.address for juror in jurors)
 
 
 async def test_another_contract_is_asked_about_each_signer(market: DeployedMarket) -> None:
