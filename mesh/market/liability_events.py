@@ -142,7 +142,7 @@ class LiabilityEvents:
                 self.unconfirmed.finalized(event.liability, block.block_number)
         self.head, self.read_at = block.block_number, time.monotonic()
         self.unconfirmed.confirm(self.head)
-        self._withdrawals.expire(self.head)
+        self._withdrawals.expire(self.head - self._chain.node.timing.reorg_depth)
         for order in self._book.expire(self.head):
             self._forget(order)  # its deadline may be later than the book's limit
             facts = {"order": order.hash.hex(), "signer": order.signer}

@@ -1,4 +1,4 @@
-"""The withdrawals that a provider or a bridge knows: kept until their deadline, also across a restart."""
+"""The withdrawals that a provider or a bridge knows: kept until their deadline has passed, also across a restart."""
 
 from __future__ import annotations
 

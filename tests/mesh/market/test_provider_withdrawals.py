@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from mesh.chain.policy import REORG_DEPTH
 from mesh.market import order_id
 from mesh.market.withdrawals import withdrawn_id
 from schemas import Withdrawal, verify_message
@@ -118,13 +119,21 @@ async def test_a_provider_that_starts_later_learns_withdrawals_from_others(local
             assert (await anext(withdrawals)).message == withdrawal
 
 
-async def test_withdrawals_are_forgotten_at_their_deadline(local: LocalMarket) -> None:
-    async with local.provider() as provider:
-        demand = local.demand(deadline=await local.chain.block_number() + 3)
+async def test_withdrawals_are_known_until_no_reorganisation_reaches_their_deadline(
+    local: LocalMarket, tmp_path: Path
+) -> None:
+    path, demand = tmp_path / "withdrawals.sqlite", local.demand(deadline=await local.chain.block_number() + 3)
+    async with local.provider(withdrawals=path) as provider:
         local.publish(withdrawal_of(local, demand))
         await local.rejection_of(demand)
-        assert len(provider.withdrawals) == 1
         await local.mine(3)
+        await until_read(local, provider)
+        assert len(provider.withdrawals) == 1
+
+    async with local.provider(withdrawals=path) as provider:  # it reads the blocks again that may be replaced
+        local.publish(demand, local.offer(deadline=demand.deadline))
+        await until(lambda: provider.earnings().rejected == {"withdrawn": 1})
+        await local.mine(REORG_DEPTH)
         await until_read(local, provider)
         assert len(provider.withdrawals) == 0
         assert await works_on(local, provider)
