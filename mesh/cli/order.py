@@ -209,7 +209,7 @@ async def _confirmations(parts: AgentComponents, order: Order, providers: int, h
     while not is_complete() and asyncio.get_running_loop().time() < deadline:
         confirmed = await asyncio.to_thread(_answers, parts, order)
         await asyncio.sleep(0 if is_complete() else 0.2)
-        await parts.outbox.send_due()
+        parts.outbox.send_due()
     return confirmed
 
 

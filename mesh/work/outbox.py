@@ -8,7 +8,7 @@ import random
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
@@ -17,12 +17,14 @@ from mesh.work.ledger import Outgoing
 from schemas import Demand, Offer, Result, SignedMessage, Withdrawal, decode, encode, message_hash
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Awaitable, Callable, Iterable
 
     from mesh.network import Channel, Network
     from mesh.work.ledger import Ledger
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 RESEND: Final = RetryPolicy(initial=0.5, ceiling=300.0)
 """How long to wait for the effect of a message before it is sent again."""
@@ -64,11 +66,15 @@ def outgoing(message: SignedMessage) -> Outgoing:
 
 @dataclass
 class _Attempts:
-    """When a message is sent next (in seconds of the clock), and the deadline (block) of its order."""
+    """A message, and when it is sent next (in seconds of the clock; 0: at once)."""
 
+    message: SignedMessage
     backoff: Backoff
-    next_at: float
-    deadline: int | None
+    next_at: float = 0.0
+
+    def is_open(self, head: int) -> bool:
+        """Whether block `head` has not reached the deadline of its order."""
+        return isinstance(self.message, Result) or self.message.deadline > head
 
 
 class Outbox:
@@ -101,6 +107,9 @@ class Outbox:
         self._clock = clock
         self._chance = chance
         self._attempts: dict[str, _Attempts] = {}
+        """What the ledger held when it was read, without what was settled since; the oldest first."""
+        self._lock = asyncio.Lock()
+        """Held while the ledger is read, or loses a message: what is settled must not come back."""
         self._held: set[str] = set()
         self._fresh: set[str] = set()
         """Messages that were never sent, in this run or an earlier one."""
@@ -115,13 +124,11 @@ class Outbox:
 
     async def settle(self, identity: str) -> bool:
         """Stop sending a message: its effect was seen. False if it was not in the outbox."""
-        self._attempts.pop(identity, None)
-        return await self._ledger.settle(identity)
+        return await self._without(identity, self._ledger.settle(identity))
 
     async def spend(self, identity: str, liability: str) -> None:
         """Stop sending an order: it became the contract at the address `liability`, unless that is reverted."""
-        self._attempts.pop(identity, None)
-        await self._ledger.spend(identity, liability)
+        await self._without(identity, self._ledger.spend(identity, liability))
 
     async def unspend(self, liability: str) -> list[Outgoing]:
         """Take back the orders of a reverted contract; they are sent again after `release`. Returns them."""
@@ -132,14 +139,12 @@ class Outbox:
 
     async def withdraw(self, withdrawal: Withdrawal) -> None:
         """Stop sending an order, and send its signed withdrawal until the order's deadline."""
-        self._attempts.pop(withdrawal.order, None)
-        await self._ledger.withdraw(withdrawal.order, outgoing(withdrawal))
+        await self._without(withdrawal.order, self._ledger.withdraw(withdrawal.order, outgoing(withdrawal)))
         await self.send_new()
 
     async def replace(self, identity: str, message: SignedMessage) -> None:
         """Send a signed message instead of the one called `identity`."""
-        self._attempts.pop(identity, None)
-        await self._ledger.replace(identity, outgoing(message))
+        await self._without(identity, self._ledger.replace(identity, outgoing(message)))
         await self.send_new()
 
     def hold(self, identities: Iterable[str]) -> None:
@@ -152,26 +157,42 @@ class Outbox:
         await self.send_new()
 
     async def send_new(self) -> None:
-        """Send the messages of the ledger that were not sent yet."""
-        await self._send(lambda identity: identity not in self._attempts)
+        """Send the messages of the ledger that were not sent yet, and those whose time has come."""
+        async with self._lock:
+            known, unsent = self._attempts, await self._ledger.outbox(head=self._head())
+            self._attempts = {one.identity: known.get(one.identity) or self._first_attempt(one) for one in unsent}
+        self.send_due()
 
     async def send_all(self) -> None:
         """Send all messages, and start their delays over."""
         self._attempts.clear()
         await self.send_new()
 
-    async def send_due(self) -> None:
+    def send_due(self) -> None:
         """Send the messages whose time has come."""
-        now = self._clock()
-        await self._send(lambda identity: identity not in self._attempts or self._attempts[identity].next_at <= now)
+        now, head = self._clock(), self._head()
+        due = [
+            (identity, one)
+            for identity, one in self._attempts.items()
+            if one.next_at <= now and identity not in self._held and one.is_open(head)
+        ]
+        offers = [(identity, one) for identity, one in due if isinstance(one.message, Offer)]
+        others = [(identity, one) for identity, one in due if not isinstance(one.message, Offer)]
+        for identity, one in (*others, *reversed(offers)):
+            wait = LATER
+            if identity in self._fresh or self._limiter.allow(""):
+                self._fresh.discard(identity)
+                self._channel.publish(one.message)
+                wait = one.backoff.next_delay() or 0.0
+            one.next_at = self._clock() + wait
+        self._changed.set()
 
     async def expire(self, head: int) -> None:
         """Drop the orders whose deadline block `head` has reached."""
-        if any(one.deadline is not None and one.deadline <= head for one in self._attempts.values()):
-            await self._ledger.outbox(head=head)
-            self._attempts = {
-                identity: one for identity, one in self._attempts.items() if one.deadline is None or one.deadline > head
-            }
+        if not all(one.is_open(head) for one in self._attempts.values()):
+            async with self._lock:
+                await self._ledger.outbox(head=head)
+                self._attempts = {identity: one for identity, one in self._attempts.items() if one.is_open(head)}
 
     async def run(self) -> None:
         """Send messages when they are due, until cancelled."""
@@ -184,31 +205,18 @@ class Outbox:
             await self.send_all()
             while True:
                 await self._wait()
-                await self.send_due()
+                self.send_due()
 
-    async def _send(self, is_due: Callable[[str], bool]) -> None:
-        unsent = await self._ledger.outbox(head=self._head())
-        offers = [one for one in unsent if one.kind == "offer"]
-        for one in (*(one for one in unsent if one.kind != "offer"), *reversed(offers)):
-            if one.identity in self._held or not is_due(one.identity):
-                continue
-            wait, attempts = LATER, self._attempts_at(one)
-            if one.identity in self._fresh or self._limiter.allow(""):
-                self._fresh.discard(one.identity)
-                message = decode(one.payload)
-                assert isinstance(message, Demand | Offer | Withdrawal | Result)
-                self._channel.publish(message)
-                wait = attempts.backoff.next_delay() or 0.0
-            attempts.next_at = self._clock() + wait
-        self._attempts = {
-            one.identity: self._attempts[one.identity] for one in unsent if one.identity in self._attempts
-        }
-        self._changed.set()
+    async def _without(self, identity: str, removal: Awaitable[T]) -> T:
+        """Await what removes a message from the ledger."""
+        async with self._lock:
+            self._attempts.pop(identity, None)
+            return await removal
 
-    def _attempts_at(self, one: Outgoing) -> _Attempts:
-        if one.identity not in self._attempts:
-            self._attempts[one.identity] = _Attempts(Backoff(self._policy, chance=self._chance), 0.0, one.deadline)
-        return self._attempts[one.identity]
+    def _first_attempt(self, one: Outgoing) -> _Attempts:
+        message = decode(one.payload)
+        assert isinstance(message, Demand | Offer | Withdrawal | Result)
+        return _Attempts(message, Backoff(self._policy, chance=self._chance))
 
     async def _wait(self) -> None:
         """Wait until the next attempt is due."""

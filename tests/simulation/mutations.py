@@ -367,6 +367,22 @@ CANDIDATES: Final = (
         REORGANISATIONS,
     ),
     Mutation(
+        "that a contract is no jury is remembered for ever",
+        "mesh.chain.validators:Validators._jury",
+        "self._contracts.node.timing.validator_recheck if state is None else math.inf",
+        "math.inf",
+        "spoilt",
+        seeds=100,
+    ),
+    Mutation(
+        "a withdrawal is forgotten at the deadline of its order",
+        "mesh.market.liability_events:LiabilityEvents._take_block",
+        "self.head - self._chain.node.timing.reorg_depth",
+        "self.head",
+        "withdraw,short_lived,replay,repeat_every,crash_every",
+        seeds=100,
+    ),
+    Mutation(
         "robots leave late results to providers",
         "mesh.agent.late_results:LateResults._finalize_if_late",
         "if head < self._late_from[address]:",

@@ -170,7 +170,7 @@ async def test_each_message_backs_off_on_its_own(
         async def sent_at(at: float, *expected: object) -> None:
             """Move the time on; exactly these messages are sent."""
             post.time, before = at, len(received)
-            await post.outbox.send_due()
+            post.outbox.send_due()
             await until(lambda: len(received) == before + len(expected))
             assert [message for _, message in received[before:]] == list(expected)
 
@@ -199,6 +199,22 @@ async def test_each_message_backs_off_on_its_own(
         await until(lambda: received[-1][1] == second)
         await sent_at(155.9)
         await sent_at(156, first, second)
+
+
+async def test_what_is_settled_while_the_ledger_is_read_is_sent_no_more(
+    router: EmbeddedRouter, tmp_path: Path, received: list[tuple[str, Any]]
+) -> None:
+    async with opened(router, tmp_path, RetryPolicy(initial=3.0)) as post:
+        await listened_to(post)
+        first, second = demand(), demand()
+        await post.outbox.post(first)
+        outbox = post.outbox
+        await asyncio.gather(outbox.send_new(), outbox.settle(outgoing_identity(first)), outbox.send_new())
+        post.time = 100.0
+        outbox.send_due()
+        await outbox.post(second)
+        await until(lambda: received and received[-1][1] == second)
+        assert [message for _, message in received] == [first, second]
 
 
 async def test_a_message_that_is_held_keeps_nothing_busy(post: Post, received: list[tuple[str, Any]]) -> None:
