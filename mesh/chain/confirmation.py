@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.chain.errors import NodeUnreachable, RequestRefused, TransactionTimeout
 from mesh.chain.metrics import TransactionOutcome
+from mesh.chain.pending import PendingTransaction
 from mesh.chain.policy import Fees
 from mesh.log_context import log_event
 from mesh.retry import Backoff
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from mesh.chain.accounts import Account, SignedTransaction
     from mesh.chain.answers import MinedTransaction
     from mesh.chain.node import Node
-    from mesh.chain.pending import PendingTransaction, PendingTransactions
+    from mesh.chain.pending import PendingTransactions
 
 log = logging.getLogger(__name__)
 
@@ -123,6 +124,8 @@ class Confirmation:
         self._was_mined = False
         self._was_missed = False
         """Whether a new block was looked at that may have had it, and had it not: rarely is its nonce lost by then."""
+        self._missing: int | None = None
+        """The nonce before this one's that nothing was known to have when that was looked for last."""
         self._nonce_used = 0
         """Checks in a row that found the nonce used by another transaction."""
 
@@ -232,13 +235,35 @@ class Confirmation:
                 finally:
                     self._pending.abandon(blocking)
             elif nonce not in self._pending.taken:
-                tx = self._entry.newest.hash
-                log.warning(
-                    "%s waits for nonce %d of its account, which was sent by another program",
-                    tx,
-                    nonce,
-                    extra=log_event("transaction-blocked", tx=tx, nonce=nonce),
-                )
+                await self._fill(nonce)
+
+    async def _fill(self, nonce: int) -> None:
+        """Use a nonce that the node knows no transaction of, so that later ones can be mined.
+
+        A reorganisation took the one that had it, and a restart made us forget it. Others of the account may still send
+        it: only a nonce that was missing twice is filled.
+        """
+        was_missing, self._missing, address = self._missing == nonce, nonce, self._account.address
+        if not was_missing or await self._node.transaction_count(address, pending=True) != nonce:
+            facts = {"tx": self._entry.newest.hash, "nonce": nonce}
+            waits = "%(tx)s waits for nonce %(nonce)d of its account, which no transaction of this program has"
+            log.warning(waits, facts, extra=log_event("transaction-blocked", **facts))
+            return
+        gas = await self._node.estimate_gas({"from": address, "to": address, "data": "0x", "value": 0})
+        fields = self._entry.fields | {"to": address, "data": "0x", "value": 0, "gas": gas}
+        signed = self._account.sign_transaction({**fields, "nonce": nonce})
+        filler = PendingTransaction(nonce=nonce, fields=fields, versions=[signed])
+        async with self._pending.lock:
+            await self._pending.refresh()
+            if nonce in self._pending.taken or not await self._pending.add(filler):
+                return
+            try:
+                await self._send_again(filler)
+            finally:
+                self._pending.abandon(filler)
+        facts = {"tx": signed.hash, "nonce": nonce}
+        filled = "nonce %(nonce)d of the account was lost; %(tx)s takes its place, and does nothing"
+        log.warning(filled, facts, extra=log_event("transaction-filled", **facts))
 
     async def _replace(self, entry: PendingTransaction) -> None:
         """Send another version with higher fees, or the old one again if the ceiling leaves no room."""

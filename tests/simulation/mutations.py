@@ -383,6 +383,14 @@ CANDIDATES: Final = (
         seeds=100,
     ),
     Mutation(
+        "a nonce that a reorganisation freed is left to others",
+        "mesh.chain.confirmation:Confirmation._unblock",
+        "await self._fill(nonce)",
+        "pass",
+        REORGANISATIONS + ",crash_every,leave_out",
+        seeds=100,
+    ),
+    Mutation(
         "robots leave late results to providers",
         "mesh.agent.late_results:LateResults._finalize_if_late",
         "if head < self._late_from[address]:",

@@ -154,6 +154,28 @@ async def test_a_confirmed_transaction_that_a_reorganisation_left_in_the_pool_is
     await wire.close()
 
 
+async def test_a_nonce_that_a_reorganisation_freed_and_nobody_remembers_is_filled(anvil: Anvil) -> None:
+    """As when a process ends once its transaction is mined, and a reorganisation takes that one."""
+    friends, timing = (unused_address(), unused_address()), replace(QUICK, replace_after=0.1)
+    account = Account.from_key(anvil.private_keys[0])
+    async with Node(anvil.url, timing=timing) as node, Node(anvil.url, timing=timing) as restarted:
+        before = await node.request("evm_snapshot")
+        first = asyncio.create_task(TransactionSender(node, account).send(to=friends[0], data=b"", value=5))
+        await until_pending(node, 1)
+        await node.request("evm_mine")
+        await first
+        second = asyncio.create_task(TransactionSender(restarted, account).send(to=friends[1], data=b"", value=7))
+        await until_pending(node, 1)
+        await node.request("evm_revert", before)
+        async with asyncio.timeout(60):
+            while not second.done():
+                await node.request("evm_mine")
+                await asyncio.sleep(0.05)
+        await second
+        assert [await node.eth_balance(friend) for friend in friends] == [0, 7]
+        assert await node.transaction_count(account.address) == 2
+
+
 class _Indexing(HttpTransport):
     """A node that is still busy with its index, and says so when it is asked for a receipt."""
 
