@@ -14,6 +14,7 @@ from mesh.agent.offers import OpenOffers
 from mesh.agent.orders import Order, OrderState, TermsWriter, TradedOrder
 from mesh.agent.progress import Progress, report, seen_offers
 from mesh.agent.statements import received_declines, received_rejections
+from mesh.agent.withdrawing import withdraw_again
 from mesh.background import Background
 from mesh.chain import Allowances, OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
@@ -185,8 +186,9 @@ class Trader(Lifecycle):
         await self._parts.outbox.release({order.identity for order in orders} - {order.identity for order in again})
 
     def reorganised(self) -> None:
-        """A reorganisation may have reverted the allowance of open orders: they wait until it is ensured."""
+        """A reorganisation may have reverted the allowance of open orders, which wait for it, and withdrawals."""
         self._send_when_covered([order for order in self._orders.values() if order.is_open])
+        self._tasks.start(withdraw_again(self._parts), "withdraw again on the chain")
 
     async def new_head(self, block: int) -> None:
         """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""

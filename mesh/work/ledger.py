@@ -113,6 +113,14 @@ class StoredOrder(msgspec.Struct, frozen=True, kw_only=True):
     is_withdrawn: bool
 
 
+class WithdrawnOrder(msgspec.Struct, frozen=True, kw_only=True):
+    """An order of ours that the transaction `tx` withdrew on the chain."""
+
+    identity: str
+    payload: bytes
+    tx: str
+
+
 class Ledger:
     """The ledger in the file at `path`, created if missing: `async with Ledger(path) as ledger`.
 
@@ -253,6 +261,15 @@ class Ledger:
     async def use_up(self, identity: str, tx: str) -> None:
         """The transaction `tx` has made sure that a withdrawn order can't become a contract any more."""
         await self._database.run("UPDATE withdrawn SET used_by = ? WHERE identity = ?", (tx, identity))
+
+    async def withdrawn_on_chain(self, *, head: int) -> list[WithdrawnOrder]:
+        """The orders that transactions of ours withdrew, with a deadline after block `head`, the oldest first."""
+        rows = await self._database.rows(
+            "SELECT identity, payload, used_by FROM withdrawn"
+            " WHERE LENGTH(used_by) = 66 AND deadline > ? ORDER BY posted",  # an address is shorter
+            (head,),
+        )
+        return [WithdrawnOrder(identity=row[0], payload=row[1], tx=row[2]) for row in rows]
 
     async def replace(self, identity: str, outgoing: Outgoing) -> None:
         """Keep a message for sending instead of the one called `identity`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -205,6 +206,23 @@ async def test_an_order_withdrawn_on_the_chain_is_of_no_use_to_any_provider(plac
             assert await liabilities.is_order_used(message_hash(order.message), place.address("person"))
         else:
             assert await liabilities.next_nonce() == int(order.message.nonce) + 1
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_a_withdrawal_on_the_chain_that_a_reorganisation_reverts_is_made_again(
+    place: Place, generation: int
+) -> None:
+    async with place.agent("person", generation=generation) as person:
+        order = await person.order(OBJECTIVE)
+        head = await place.chains["person"].block_number()
+        await order.withdraw_on_chain()
+        mined = await place.chains["person"].block_number()
+        await until(lambda: person.parts.chain_head.head >= mined)
+        await place.forget_blocks(mined - head)
+        digest, signer = message_hash(order.message), place.address("person")
+        used = partial(place.chains["person"].liabilities.is_used, order.message, order_hash=digest, signer=signer)
+        assert not await used()
+        await until_found(used)
 
 
 async def test_orders_of_another_program_of_the_account_are_followed_too(place: Place) -> None:
