@@ -134,6 +134,9 @@ class RangeReader:
             if last < head.number:
                 # If the node only claims to have that head, reading towards it would never end.
                 await self._node.block_hash(last)
+            if first < head.number and await self._node.block_hash(head.number) != head.hash:
+                # Some of the answers may be of the blocks that were replaced, and their events are of both.
+                raise ReplacedWhileReading
             for block in blocks:
                 yield _with_hash_of(block, head)
             first = last + 1

@@ -391,6 +391,22 @@ CANDIDATES: Final = (
         seeds=100,
     ),
     Mutation(
+        "blocks that were replaced while several were read are believed",
+        "mesh.chain.reader:RangeReader.read_to",
+        "if first < head.number and await",
+        "if False and await",
+        REORGANISATIONS + ",late,unreachable",
+        seeds=100,
+    ),
+    Mutation(
+        "a withdrawal that a reorganisation reverted is not made again",
+        "mesh.agent.trade:Trader.reorganised",
+        'self._tasks.start(withdraw_again(self._parts), "withdraw again on the chain")',
+        "pass",
+        REORGANISATIONS + ",withdraw",
+        seeds=100,
+    ),
+    Mutation(
         "robots leave late results to providers",
         "mesh.agent.late_results:LateResults._finalize_if_late",
         "if head < self._late_from[address]:",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import aclosing, asynccontextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -197,6 +197,35 @@ async def test_a_reorganisation_of_the_whole_depth_is_reverted_and_a_deeper_one_
             await _until(events, _reaches(head + 10))
     assert isinstance(caught.value, ChainWentBack)
     assert (caught.value.cursor, caught.value.head) == (head - 3, head + 1)
+
+
+@pytest.mark.parametrize("fork", ["embedded"], indirect=True)
+async def test_no_event_is_lost_if_blocks_are_replaced_while_several_are_read(
+    fork: Fork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The block before them, which had no event, is replaced by one that has."""
+    chain, node = fork.chain, fork.chain.node
+    start = await fork.approve(1)
+    async with aclosing(chain.follow(start)) as events:
+        await _until(events, _reaches(start))
+        await fork.request("evm_mine")
+        await _until(events, _reaches(start + 1))
+        await fork.request("evm_mine", 2)
+        original, replaced = node.logs, list[int]()
+
+        async def logs(first: int, last: int, **options: Any) -> Any:
+            if first < last and not replaced:
+                replaced.append(first)
+                await fork.request("evm_revert", hex(start))
+                await fork.approve(8)
+                await fork.approve(9)
+                await fork.request("evm_mine", 2)
+            return await original(first, last, **options)
+
+        monkeypatch.setattr(node, "logs", logs)
+        blocks = await _until(events, _reaches(start + 4))
+    assert replaced == [start + 2]
+    assert [value for block in blocks for value in _values(block.events)] == [8, 9]
 
 
 async def test_a_block_that_was_not_handled_completely_is_yielded_again_or_reverted(fork: Fork) -> None:
