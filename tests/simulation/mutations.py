@@ -174,8 +174,8 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the outbox sends everything once",
-        "mesh.work.outbox:Outbox._send",
-        "attempts.backoff.next_delay() or 0.0",
+        "mesh.work.outbox:Outbox.send_due",
+        "one.backoff.next_delay() or 0.0",
         "1e9",
         "drop",
     ),
