@@ -14,7 +14,7 @@ from mesh.agent.offers import OpenOffers
 from mesh.agent.orders import Order, OrderState, TermsWriter, TradedOrder
 from mesh.agent.progress import Progress, report, seen_offers
 from mesh.agent.statements import received_declines, received_rejections
-from mesh.agent.withdrawing import withdraw_again
+from mesh.agent.withdrawing import ChainWithdrawals
 from mesh.background import Background
 from mesh.chain import Allowances, OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
@@ -60,6 +60,7 @@ class Trader(Lifecycle):
         self._hear_declines: Callable[[], None] = lambda: None
         self._answers = OpenOffers()
         self._changing = asyncio.Lock()
+        self._chain_withdrawals = ChainWithdrawals(parts)
         self.contracts = WatchedContracts(parts, reports)
         self.customers = KnownSenders()
         """Who demanded the contracts of this account."""
@@ -188,7 +189,7 @@ class Trader(Lifecycle):
     def reorganised(self) -> None:
         """A reorganisation may have reverted the allowance of open orders, which wait for it, and withdrawals."""
         self._send_when_covered([order for order in self._orders.values() if order.is_open])
-        self._tasks.start(withdraw_again(self._parts), "withdraw again on the chain")
+        self._tasks.start(self._chain_withdrawals.make_again(), "withdraw again on the chain")
 
     async def new_head(self, block: int) -> None:
         """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""

@@ -249,8 +249,7 @@ class Confirmation:
             waits = "%(tx)s waits for nonce %(nonce)d of its account, which no transaction of this program has"
             log.warning(waits, facts, extra=log_event("transaction-blocked", **facts))
             return
-        gas = await self._node.estimate_gas({"from": address, "to": address, "data": "0x", "value": 0})
-        fields = self._entry.fields | {"to": address, "data": "0x", "value": 0, "gas": gas}
+        fields = self._entry.fields | {"to": address, "data": "0x", "value": 0}
         signed = self._account.sign_transaction({**fields, "nonce": nonce})
         filler = PendingTransaction(nonce=nonce, fields=fields, versions=[signed])
         async with self._pending.lock:

@@ -5,6 +5,7 @@ The node keeps no filters for us, so a restart on either side loses nothing. `me
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import aclosing
 from dataclasses import dataclass
 from functools import partial
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 
 MAX_RANGE: Final = 2_000
 """Blocks in one request. Halved each time a node refuses, and grown by a quarter each time it answers."""
+
+LIST_ATTEMPTS: Final = 5
+"""How often blocks are read again that were replaced meanwhile, where nothing is followed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,10 +182,16 @@ async def read_created(node: Node, factory: str, first: int, last: int, header: 
 
 async def list_created(node: Node, factory: str, from_block: int) -> list[NewLiability | NewLighthouse]:
     """What the factory created from a block to the latest one. Raises `NodeUnreachable`, `RequestRefused`."""
-    ranges = RangeReader(node, partial(read_created, node, factory))
-    async with aclosing(ranges.read_to(from_block, await node.latest_header())) as blocks:
-        events = [event async for block in blocks for event in block.events]
-    return [event for event in events if isinstance(event, NewLiability | NewLighthouse)]
+    for _ in range(LIST_ATTEMPTS):
+        ranges = RangeReader(node, partial(read_created, node, factory))
+        try:
+            async with aclosing(ranges.read_to(from_block, await node.latest_header())) as blocks:
+                events = [event async for block in blocks for event in block.events]
+        except ReplacedWhileReading:
+            await asyncio.sleep(node.timing.poll_interval)
+        else:
+            return [event for event in events if isinstance(event, NewLiability | NewLighthouse)]
+    raise NodeUnreachable(node.endpoint, "its blocks are replaced whenever they are read")
 
 
 def _topics(*contracts: str) -> list[bytes]:

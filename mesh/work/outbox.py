@@ -8,6 +8,7 @@ import random
 import time
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from mesh.flood import Rate, RateLimiter
@@ -124,11 +125,11 @@ class Outbox:
 
     async def settle(self, identity: str) -> bool:
         """Stop sending a message: its effect was seen. False if it was not in the outbox."""
-        return await self._without(identity, self._ledger.settle(identity))
+        return await self._without(identity, partial(self._ledger.settle, identity))
 
     async def spend(self, identity: str, liability: str) -> None:
         """Stop sending an order: it became the contract at the address `liability`, unless that is reverted."""
-        await self._without(identity, self._ledger.spend(identity, liability))
+        await self._without(identity, partial(self._ledger.spend, identity, liability))
 
     async def unspend(self, liability: str) -> list[Outgoing]:
         """Take back the orders of a reverted contract; they are sent again after `release`. Returns them."""
@@ -139,12 +140,13 @@ class Outbox:
 
     async def withdraw(self, withdrawal: Withdrawal) -> None:
         """Stop sending an order, and send its signed withdrawal until the order's deadline."""
-        await self._without(withdrawal.order, self._ledger.withdraw(withdrawal.order, outgoing(withdrawal)))
+        order = withdrawal.order
+        await self._without(order, partial(self._ledger.withdraw, order, outgoing(withdrawal)))
         await self.send_new()
 
     async def replace(self, identity: str, message: SignedMessage) -> None:
         """Send a signed message instead of the one called `identity`."""
-        await self._without(identity, self._ledger.replace(identity, outgoing(message)))
+        await self._without(identity, partial(self._ledger.replace, identity, outgoing(message)))
         await self.send_new()
 
     def hold(self, identities: Iterable[str]) -> None:
@@ -207,11 +209,11 @@ class Outbox:
                 await self._wait()
                 self.send_due()
 
-    async def _without(self, identity: str, removal: Awaitable[T]) -> T:
-        """Await what removes a message from the ledger."""
+    async def _without(self, identity: str, remove: Callable[[], Awaitable[T]]) -> T:
+        """Call what removes a message from the ledger."""
         async with self._lock:
             self._attempts.pop(identity, None)
-            return await removal
+            return await remove()
 
     def _first_attempt(self, one: Outgoing) -> _Attempts:
         message = decode(one.payload)

@@ -401,7 +401,7 @@ CANDIDATES: Final = (
     Mutation(
         "a withdrawal that a reorganisation reverted is not made again",
         "mesh.agent.trade:Trader.reorganised",
-        'self._tasks.start(withdraw_again(self._parts), "withdraw again on the chain")',
+        'self._tasks.start(self._chain_withdrawals.make_again(), "withdraw again on the chain")',
         "pass",
         REORGANISATIONS + ",withdraw",
         seeds=100,

@@ -228,6 +228,25 @@ async def test_no_event_is_lost_if_blocks_are_replaced_while_several_are_read(
     assert [value for block in blocks for value in _values(block.events)] == [8, 9]
 
 
+async def test_a_list_is_read_again_if_blocks_are_replaced_meanwhile(
+    fork: Fork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node, asked = fork.chain.node, list[int]()
+    before = await fork.chain.lighthouses.list()
+    await fork.approve(1)
+    original = node.logs
+
+    async def logs(first: int, last: int, **options: Any) -> Any:
+        asked.append(first)
+        if len(asked) == 1:
+            await fork.replace_last(1)
+        return await original(first, last, **options)
+
+    monkeypatch.setattr(node, "logs", logs)
+    assert await fork.chain.lighthouses.list() == before
+    assert len(asked) == 2
+
+
 async def test_a_block_that_was_not_handled_completely_is_yielded_again_or_reverted(fork: Fork) -> None:
     """The cursor of a reader that fell over in the middle of a block is behind the history."""
     chain, history = fork.chain, History()
