@@ -172,12 +172,8 @@ class Outbox:
 
     def send_due(self) -> None:
         """Send the messages whose time has come."""
-        now, head = self._clock(), self._head()
-        due = [
-            (identity, one)
-            for identity, one in self._attempts.items()
-            if one.next_at <= now and identity not in self._held and one.is_open(head)
-        ]
+        now = self._clock()
+        due = [(identity, one) for identity, one in self._sendable() if one.next_at <= now]
         offers = [(identity, one) for identity, one in due if isinstance(one.message, Offer)]
         others = [(identity, one) for identity, one in due if not isinstance(one.message, Offer)]
         for identity, one in (*others, *reversed(offers)):
@@ -209,6 +205,11 @@ class Outbox:
                 await self._wait()
                 self.send_due()
 
+    def _sendable(self) -> list[tuple[str, _Attempts]]:
+        """The messages that are neither held nor expired."""
+        head, held = self._head(), self._held
+        return [(name, one) for name, one in self._attempts.items() if name not in held and one.is_open(head)]
+
     async def _without(self, identity: str, remove: Callable[[], Awaitable[T]]) -> T:
         """Call what removes a message from the ledger."""
         async with self._lock:
@@ -224,8 +225,7 @@ class Outbox:
         """Wait until the next attempt is due."""
         while True:
             self._changed.clear()
-            free = (one.next_at for identity, one in self._attempts.items() if identity not in self._held)
-            next_at = min(free, default=None)
+            next_at = min((one.next_at for _, one in self._sendable()), default=None)
             remaining = None if next_at is None else next_at - self._clock()
             if remaining is not None and remaining <= 0:
                 return

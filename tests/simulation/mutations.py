@@ -219,8 +219,8 @@ MUTATIONS: Final = (
     Mutation(
         "an order that waits for its allowance keeps its agent busy",
         "mesh.work.outbox:Outbox._wait",
-        " if identity not in self._held",
-        "",
+        "asyncio.timeout(remaining)",
+        "asyncio.timeout(0 if self._held else remaining)",
         f"{REORGANISATIONS},revoke,late,unreachable",
         seeds=40,
     ),

@@ -44,8 +44,9 @@ class Post:
         )
 
     def _read_head(self) -> int:
-        """The head, which the outbox reads once each time it looks for messages to send."""
+        """The head, which the outbox reads a few times each time it looks for messages to send."""
         self.rounds += 1
+        assert self.rounds < 10_000, "the outbox looks without a pause"
         return self.head
 
 
@@ -199,6 +200,20 @@ async def test_each_message_backs_off_on_its_own(
         await until(lambda: received[-1][1] == second)
         await sent_at(155.9)
         await sent_at(156, first, second)
+
+
+async def test_an_order_that_has_expired_keeps_nothing_busy(post: Post, received: list[tuple[str, Any]]) -> None:
+    """Until the listener says so, the outbox holds it."""
+    await listened_to(post)
+    async with Background() as tasks:
+        tasks.start(post.outbox.run(), "outbox")
+        await post.outbox.post(demand(deadline=10))
+        await until(lambda: len(received) >= 2)
+        post.head = 10
+        await asyncio.sleep(0.3)
+        post.rounds, before = 0, len(received)
+        await asyncio.sleep(0.5)
+        assert (post.rounds, len(received)) == (0, before)
 
 
 async def test_what_is_settled_while_the_ledger_is_read_is_sent_no_more(
