@@ -189,7 +189,8 @@ class Trader(Lifecycle):
     def reorganised(self) -> None:
         """A reorganisation may have reverted the allowance of open orders, which wait for it, and withdrawals."""
         self._send_when_covered([order for order in self._orders.values() if order.is_open])
-        self._tasks.start(self._chain_withdrawals.make_again(), "withdraw again on the chain")
+        if self.is_open:
+            self._tasks.start(self._chain_withdrawals.make_again(), "withdraw again on the chain")
 
     async def new_head(self, block: int) -> None:
         """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
