@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import builtins
 import errno
-import fcntl
 import io
 import os
 import shutil
@@ -20,6 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
+from mesh.content.files import is_locked
 from tests.simulation.threads import scheduler
 
 if TYPE_CHECKING:
@@ -133,13 +133,13 @@ class SimulatedDisk:
             elif path.endswith(INDEX):
                 os.unlink(path)
             elif not power:
-                if inode in self.databases or inode in self.logs or _is_locked(path):
+                if inode in self.databases or inode in self.logs or is_locked(Path(path)):
                     self._copy(path, inode, Path(path).read_bytes())
             elif (left := self._after_power_failure(path, inode, now := Path(path).read_bytes(), entries)) is None:
                 self._draw.counts["file-lost"] += 1
                 os.unlink(path)
             else:
-                if left != now or inode in self.databases or inode in self.logs or _is_locked(path):
+                if left != now or inode in self.databases or inode in self.logs or is_locked(Path(path)):
                     inode = self._copy(path, inode, left)
                 if inode in self.logs:
                     self.logs[inode] = self.logs[inode].ending_at(len(left))
@@ -204,17 +204,6 @@ class SimulatedDisk:
             return connection
 
         sqlite3.connect = connect_here  # type: ignore[assignment]
-
-
-def _is_locked(path: str) -> bool:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
 
 
 def _checked(disk: SimulatedDisk, write: Any) -> Any:
