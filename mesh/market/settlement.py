@@ -140,8 +140,13 @@ class Settlement:
         return None
 
     def set_aside(self, order: Verified[Order], reason: str) -> None:
-        """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
-        if self._refusal(order) is None and order_id(order) not in self._book and self._unfunded.add(order):
+        """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that.
+
+        Its maker is told with each copy: an earlier rejection may have been lost.
+        """
+        if self._refusal(order) is None and order_id(order) not in self._book:
+            self._unfunded.add(order)
+        if order in self._unfunded:
             self.rejections.reject(order, reason, "its maker lacks the money, or the factory may not take it")
         self._forget(order, after=self._pause)
 

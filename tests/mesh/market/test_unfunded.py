@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mesh.background import Background
@@ -12,7 +13,7 @@ from mesh.retry import RetryPolicy
 from schemas import verify_message
 from tests.mesh.market.observation import until_read
 from tests.support.orders import LIGHTHOUSE, verified_demand, verified_offer
-from tests.support.waiting import until
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -137,3 +138,18 @@ async def test_a_demand_is_matched_when_its_allowance_is_raised(local: LocalMark
         local.publish(demand)
         await local.liability_of(demand)
         assert gas == 0
+
+
+async def test_the_maker_of_an_unfunded_order_is_told_again_when_it_sends_the_order_again(local: LocalMarket) -> None:
+    """The first rejection may have been lost, and without one the maker would wait until the deadline."""
+    await local.chain.tokens.approve(local.chain.factory, 6)
+    async with local.provider() as provider:
+        demand = local.demand(cost=7)
+
+        async def told(times: int) -> bool:
+            local.publish(demand)
+            return len(local.rejections) >= times
+
+        await until_found(partial(told, 3), what="three rejections")
+        assert {one.reason for one in local.rejections} == {"ERC20InsufficientAllowance"}
+        assert len(provider.book) == 1
