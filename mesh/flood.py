@@ -10,7 +10,8 @@ import asyncio
 import logging
 import threading
 from collections import Counter, OrderedDict, deque
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 from mesh.clock import SYSTEM_CLOCK
 from mesh.log_context import log_event
@@ -50,36 +51,15 @@ class BoundedDict(OrderedDict[K, V]):
             self.popitem(last=False)
 
 
-class RecentDict(Generic[K, V]):
-    """A dict with the keys that were set last, `limit` of them at most, and half of that at least.
+def forget_oldest(remembered: dict[Any, Any], limit: int) -> None:
+    """Remove the oldest keys of a dict that has more than `limit`, until half of the limit is left.
 
-    It has two generations, the older of which is forgotten when the younger one is full: that is faster than a
-    `BoundedDict`, and takes half of its memory.
+    A plain dict that is trimmed now and then is faster than a `BoundedDict`, and takes half of its memory. A key keeps
+    its place when it is set again; pop it first to make it the youngest.
     """
-
-    def __init__(self, limit: int) -> None:
-        self._half = max(limit // 2, 1)
-        self._young: dict[K, V] = {}
-        self._old: dict[K, V] = {}
-
-    def __len__(self) -> int:
-        return len(self._young) + len(self._old)
-
-    def __contains__(self, key: K) -> bool:
-        return key in self._young or key in self._old
-
-    def __setitem__(self, key: K, value: V) -> None:
-        if len(self._young) >= self._half:
-            self._young, self._old = {}, self._young
-        self._young[key] = value
-
-    def get(self, key: K, default: V) -> V:
-        """The value of a key, or `default` for an unknown one."""
-        return self._young[key] if key in self._young else self._old.get(key, default)
-
-    def pop(self, key: K, default: V) -> V:
-        """Remove a key; returns its value, or `default` for an unknown one."""
-        return self._young.pop(key, self._old.pop(key, default))
+    if len(remembered) > limit:
+        for key in list(islice(remembered, len(remembered) - limit // 2)):
+            remembered.pop(key, None)
 
 
 class Rate(NamedTuple):

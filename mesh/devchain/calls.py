@@ -12,7 +12,7 @@ from eth_utils.exceptions import ValidationError
 from mesh.chain.reverts import REVERTED
 from mesh.devchain.bounded_vm import GAS_LIMIT, bounded
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data, parse_quantity
-from mesh.flood import RecentDict
+from mesh.flood import forget_oldest
 
 if TYPE_CHECKING:
     from eth.abc import BlockHeaderAPI, ChainAPI, ComputationAPI
@@ -34,14 +34,14 @@ class Calls:
     def __init__(self, chain: ChainAPI, *, run_seconds: float) -> None:
         self._chain: Any = chain
         self._run_seconds = run_seconds
-        self._answers: RecentDict[tuple[Any, ...], bytes] = RecentDict(ANSWERS)
+        self._answers: dict[tuple[Any, ...], bytes] = {}
         """What calls have returned, by block, second and call: a contract may ask for the time."""
 
     def call(self, fields: Call, height: int) -> bytes:
         """What a call returns. Raises `RpcError` with the revert data when it fails."""
         block = self._chain.get_canonical_block_header_by_number(height).hash
         asked = (block, int(time.time()), *sorted(fields.items()))
-        if known := self._answers.get(asked, b""):
+        if known := self._answers.get(asked):
             return known
         with bounded(self._run_seconds):
             computation = self._run(fields, height, gas=_gas_of(fields))
@@ -49,6 +49,7 @@ class Calls:
         answer = bytes(computation.output)
         if len(answer) + len(fields["data"]) <= LONGEST_KEPT:
             self._answers[asked] = answer
+            forget_oldest(self._answers, ANSWERS)
         return answer
 
     def estimate(self, fields: Call, height: int) -> int:

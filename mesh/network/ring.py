@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, Final
 
-from mesh.flood import RecentDict
+from mesh.flood import forget_oldest
 
 REMEMBERED: Final = 65_536
 """Items that the ring remembers, at most; half of them at least."""
@@ -26,7 +26,8 @@ class _Lane(deque[tuple[Any, int]]):
         """Add an item; returns how many were dropped for it."""
         self.append((item, size))
         self.size += size
-        before = len(self)
+        if (before := len(self)) <= self._capacity and self.size <= self._capacity_bytes:
+            return 0
         while len(self) > self._capacity or (self.size > self._capacity_bytes and len(self) > 1):
             self.size -= self.popleft()[1]
         return before - len(self)
@@ -52,7 +53,7 @@ class ReceiveRing:
         self._lanes = [_Lane(capacity, capacity_bytes)]
         if second_chance:
             self._lanes += [_Lane(capacity // COPIES, capacity_bytes // COPIES) for _ in range(COPIES - 1)]
-        self._copies: RecentDict[int, int] = RecentDict(REMEMBERED)
+        self._copies: dict[int, int] = {}
         """How often an item came, by its hash with a key that only this process knows."""
 
     def __len__(self) -> int:
@@ -60,11 +61,13 @@ class ReceiveRing:
 
     def append(self, item: Any, size: int) -> int:
         """Add an item of `size` bytes; returns how many were dropped for it."""
-        lane = 0
-        if self._second_chance:
-            number = hash(item)
-            lane = self._copies.get(number, 0)
-            self._copies[number] = min(lane + 1, COPIES - 1)
+        if not self._second_chance:
+            return self._lanes[0].add(item, size)
+        copies, number = self._copies, hash(item)
+        lane = copies.pop(number, 0)
+        copies[number] = lane + 1 if lane < COPIES - 1 else lane
+        if len(copies) > REMEMBERED:
+            forget_oldest(copies, REMEMBERED)
         return self._lanes[lane].add(item, size)
 
     def take(self, number: int) -> list[Any]:

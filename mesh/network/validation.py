@@ -16,7 +16,7 @@ import msgspec
 
 from mesh.clock import SYSTEM_CLOCK
 from mesh.errors import AiraError, InvalidMessage
-from mesh.flood import RecentDict
+from mesh.flood import forget_oldest
 from mesh.network.lookups import M, NameCache, Unresolved
 from schemas import (
     ZERO_ADDRESS,
@@ -119,8 +119,9 @@ class MessageValidator(Generic[M]):
         self._blocked = blocked
         self._lock = threading.Lock()
         self._clock = clock
-        self._seen: RecentDict[int, int] = RecentDict(2 * deduplication_limit)
+        self._seen: dict[int, int] = {}
         """Of the accepted messages, each by the other: what makes a message one, and the hash of its bytes."""
+        self._remembered = 2 * deduplication_limit
         self._forgetting: deque[tuple[float, int]] = deque(maxlen=deduplication_limit)
         """When messages will be forgotten, and what makes them one."""
         self._invalid: Counter[str] = Counter()
@@ -177,7 +178,9 @@ class MessageValidator(Generic[M]):
         }
         keys = dict(zip(signed, recover_keys(signed.values()), strict=True))
         with self._lock:
-            return [found for each in prepared if (found := self._verify(each, keys)) is not None]
+            verified = [found for each in prepared if (found := self._verify(each, keys)) is not None]
+            forget_oldest(seen, self._remembered)
+        return verified
 
     def _verify(
         self, prepared: _Prepared[M] | Unresolved[M], keys: Mapping[int, bytes]
@@ -186,11 +189,11 @@ class MessageValidator(Generic[M]):
         if isinstance(prepared, Unresolved):
             return prepared
         identity, seen = prepared.identity, self._seen
-        if identity not in keys or identity in seen:
+        if (key := keys.get(identity)) is None or identity in seen:
             self._duplicate += 1
             return None
         try:
-            verified = verify_recovered(prepared.message, prepared.hash, keys[identity])
+            verified = verify_recovered(prepared.message, prepared.hash, key)
         except InvalidMessage as error:
             self._invalid[error.reason] += 1
             return None
