@@ -106,7 +106,7 @@ def _write_summary(total: Report, path: str) -> None:
         new.replace(path)
 
 
-def _options(arguments: Sequence[str]) -> argparse.Namespace:
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='make simulate ARGS="…"', description=__doc__)
     parser.add_argument("--seed", type=int, default=None, help="the seed of the first history; a new one by default")
     parser.add_argument("--jobs", type=int, default=JOBS, help="jobs in all")
@@ -126,16 +126,23 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--chain", choices=(ON_MODEL, ON_EVM), default=None, help="what runs the contracts; by default the seed chooses"
     )
-    parser.add_argument("--workers", type=int, default=1, help="histories at a time")
+    parser.add_argument("--workers", type=int, default=0, help="histories at a time; by default one for each core")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first failure")
     parser.add_argument("--only", default="", help="the kinds of faults, with commas; `none` for none")
     parser.add_argument("--without", default="", help="kinds of faults that do not happen, with commas")
+    return parser
+
+
+def _options(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = _parser()
     options = parser.parse_args(arguments)
     if options.seed is None:
         options.seed = random.SystemRandom().getrandbits(32)  # `os.urandom` is simulated
         print(f"seed {options.seed}", file=sys.stderr)
-    if min(options.jobs, options.history_jobs, options.workers) < 1:
-        parser.error("--jobs, --history-jobs and --workers are at least 1")
+    if min(options.jobs, options.history_jobs) < 1 or options.workers < 0:
+        parser.error("--jobs and --history-jobs are at least 1, --workers at least 0")
+    if not options.workers:  # what several print would mix
+        options.workers = 1 if options.trace or options.log or options.switches else len(os.sched_getaffinity(0))
     only, without = (frozenset(filter(None, text.split(","))) for text in (options.only, options.without))
     if (only | without) - {*KINDS, "none"}:
         parser.error(f"faults are {', '.join(sorted(KINDS))}")
