@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
     from mesh.validator.evidence import Evidence
     from mesh.validator.validator import Validator
-    from mesh.work.ledger import WrongPhase
     from mesh.work.objectives import ObjectiveUnfit
+    from mesh.work.phases import WrongPhase
     from schemas import (
         STRING,
         ZERO_ADDRESS,

@@ -6,4 +6,4 @@ from mesh.agent.errors import Declined, LiabilityReverted, OrderClosed, OrderExp
 from mesh.agent.orders import Order, OrderState
 from mesh.agent.progress import Progress
 from mesh.work.job import Job, JobFailed
-from mesh.work.ledger import Phase
+from mesh.work.phases import Phase

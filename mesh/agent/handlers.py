@@ -22,7 +22,7 @@ from schemas.errors import InvalidCid, InvalidKey
 if TYPE_CHECKING:
     from mesh.network import Reading, ReadingSubscription, Subscription
     from mesh.work.job import Job
-    from mesh.work.ledger import Phase
+    from mesh.work.phases import Phase
     from schemas.verdicts import ValidatorReport
 
 log = logging.getLogger(__name__)

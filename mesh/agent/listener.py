@@ -28,8 +28,8 @@ from mesh.chain import (
 )
 from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.retry import Backoff
-from mesh.work.ledger import TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
+from mesh.work.phases import TO_BE_DONE, Phase, advance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -21,8 +21,8 @@ from mesh.chain import NotALiability
 from mesh.role import Role
 from mesh.telemetry.logs import LogService
 from mesh.work.executor import Executor
-from mesh.work.ledger import UNFINISHED, Phase
 from mesh.work.objectives import Objectives
+from mesh.work.phases import UNFINISHED, Phase
 from mesh.work.playbacks import Playbacks
 from schemas import ZERO_ADDRESS, Demand, decode
 from schemas.agent_keys import EventKey, LiabilityEvent

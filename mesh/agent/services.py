@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from mesh.agent.errors import ServiceClosed
 from mesh.errors import InputError
 from mesh.log_context import log_event
-from mesh.work.ledger import WrongPhase
+from mesh.work.phases import WrongPhase
 from schemas import (
     Demand,
     Offer,

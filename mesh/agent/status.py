@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import mesh
 from mesh.network.metrics import drop_family, link_state, message_families, network_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
-from mesh.work.ledger import UNFINISHED, Phase
+from mesh.work.phases import UNFINISHED, Phase
 from schemas.status import ALIVE, OFF, Status, StoreUse, Work
 
 if TYPE_CHECKING:

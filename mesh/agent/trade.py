@@ -23,7 +23,7 @@ from mesh.log_context import log_event
 from mesh.market.book import Refusal
 from mesh.role import Lifecycle
 from mesh.work.database import LedgerUnusable
-from mesh.work.ledger import Phase
+from mesh.work.phases import Phase
 from schemas import Demand, Offer, Withdrawal, decode
 
 if TYPE_CHECKING:

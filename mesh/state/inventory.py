@@ -31,7 +31,7 @@ from mesh.state.layout import (
 from mesh.validator.ledger import VerdictLedger
 from mesh.work import Ledger
 from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
-from mesh.work.ledger import UNFINISHED
+from mesh.work.phases import UNFINISHED
 from schemas import Demand, Offer, decode
 
 if TYPE_CHECKING:

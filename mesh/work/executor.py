@@ -18,9 +18,9 @@ from mesh.errors import AiraError, ClosedError, ContentError, InputError
 from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.recording import RecordingFailed
 from mesh.work.database import LedgerUnusable
-from mesh.work.ledger import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
 from mesh.work.notes import note_of
 from mesh.work.outbox import outgoing
+from mesh.work.phases import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
 from mesh.work.run import RecordingIncomplete
 from schemas import Result
 

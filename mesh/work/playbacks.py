@@ -14,7 +14,7 @@ from mesh.content.files import sync_directory
 from mesh.errors import AiraError
 from mesh.log_context import liability_context, log_event
 from mesh.recording import AtOnce, RecordedTimes, Recorders, RecordingAbout
-from mesh.work.ledger import Phase
+from mesh.work.phases import Phase
 from mesh.work.run import JobRun, RecordingIncomplete
 
 if TYPE_CHECKING:

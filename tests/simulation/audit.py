@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.chain import Chain, Finalized, NewLiability, Transfer
 from mesh.evidence.claims import Claim
 from mesh.evidence.verification import verify
-from mesh.work.ledger import Phase
+from mesh.work.phases import Phase
 from schemas import ZERO_ADDRESS
 from tests.simulation.chain import NodeFaults, SimulatedNode
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from mesh.agent.components import AgentComponents
     from mesh.chain import Approval, Chain, Transfer
-    from mesh.work.ledger import Phase
+    from mesh.work.phases import Phase
     from schemas import Liability
     from tests.support.market import Place
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mesh.work import Phase, WrongPhase
-from mesh.work.ledger import NEXT, UNFINISHED, advance
+from mesh.work.phases import NEXT, UNFINISHED, advance
 
 LIABILITY = "0x" + "12" * 20
 
