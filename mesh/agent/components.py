@@ -117,7 +117,7 @@ async def working(
         if chain is None:
             chain = await enter(chain_of(settings, account))
         directory = await state_folder(settings, chain, account.address)
-        ledger = await enter(Ledger(directory / LEDGER))
+        ledger = await enter(Ledger(directory / LEDGER, reorg_depth=chain.node.timing.reorg_depth))
         chain_head = ChainHead(await _handled(ledger, chain))
         network, channel = await enter(connected(settings, chain, chain_head, drops))
         store = await asyncio.to_thread(

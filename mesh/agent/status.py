@@ -73,7 +73,7 @@ class AgentStatus:
             heaviest=parts.drops.senders(),
             work=Work(
                 jobs=await parts.ledger.jobs_by_phase(),
-                outbox=sum((await parts.ledger.waiting_by_kind()).values()),
+                outbox=sum((await parts.ledger.waiting_by_kind(head=parts.chain_head.head)).values()),
                 store=StoreUse(files=usage.files, bytes=usage.bytes, quota=usage.quota),
             ),
         )
@@ -119,7 +119,8 @@ class AgentStatus:
         )
 
     async def _outbox(self) -> tuple[MetricFamily, ...]:
-        kinds = {"demand": 0, "offer": 0, "withdrawal": 0, "result": 0} | await self._parts.ledger.waiting_by_kind()
+        waiting = await self._parts.ledger.waiting_by_kind(head=self._parts.chain_head.head)
+        kinds = {"demand": 0, "offer": 0, "withdrawal": 0, "result": 0} | waiting
         meaning = "Messages that are sent again until their effect is on the chain"
         return (by_label("aira_outbox_messages", "gauge", meaning, "kind", kinds),)
 

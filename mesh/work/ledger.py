@@ -73,12 +73,14 @@ class Ledger:
     """The ledger in the file at `path`, created if missing: `async with Ledger(path) as ledger`.
 
     A file belongs to one agent. Calls run in order, in a thread of their own. Every call raises `LedgerUnusable`.
-    `spent_kept` is how many spent orders it remembers, for contracts that a reorganisation takes back.
+    For contracts that a reorganisation takes back, or brings back, it remembers the last `spent_kept` spent orders, and
+    expired orders for `reorg_depth` blocks.
     """
 
-    def __init__(self, path: Path, *, spent_kept: int = SPENT_KEPT) -> None:
+    def __init__(self, path: Path, *, spent_kept: int = SPENT_KEPT, reorg_depth: int = 0) -> None:
         self._database = Database(path)
         self._spent_kept = spent_kept
+        self._reorg_depth = reorg_depth
 
     async def __aenter__(self) -> Self:
         await self._database.open()
@@ -225,7 +227,10 @@ class Ledger:
         await self._database.run_together(remove, (POST, _posted(outgoing)))
 
     async def orders(self) -> list[StoredOrder]:
-        """The orders that can still become contracts, oldest first: those in the outbox, then the withdrawn ones."""
+        """The orders that may still become contracts, oldest first: those in the outbox, then the withdrawn ones.
+
+        Check their deadlines: expired ones are among them.
+        """
         rows = await self._database.rows(
             "SELECT identity, payload, posted, 0 FROM outbox WHERE kind IN ('demand', 'offer')"
             " UNION ALL SELECT identity, payload, posted, 1 FROM withdrawn WHERE used_by = '' ORDER BY 4, 3"
@@ -233,22 +238,27 @@ class Ledger:
         return [StoredOrder(identity=row[0], payload=row[1], posted=row[2], is_withdrawn=bool(row[3])) for row in rows]
 
     async def outbox(self, *, head: int) -> list[Outgoing]:
-        """The messages to send, oldest first. Deletes those whose deadline block `head` has reached."""
+        """The messages to send, oldest first: not those whose deadline block `head` has reached.
+
+        Deletes the latter `reorg_depth` blocks after their deadline.
+        """
+        last = head - self._reorg_depth
         rows = await self._database.rows(
             "SELECT identity, kind, payload, deadline, rowid FROM outbox"
             " UNION ALL SELECT identity, kind, payload, deadline, 0 FROM withdrawn WHERE deadline <= ? ORDER BY rowid",
-            (head,),
+            (last,),
         )
-        if any(row[3] is not None and row[3] <= head for row in rows):
+        if any(row[3] is not None and row[3] <= last for row in rows):
             await self._database.run_together(
-                *((f"DELETE FROM {table} WHERE deadline <= ?", (head,)) for table in ("outbox", "withdrawn")),
+                *((f"DELETE FROM {table} WHERE deadline <= ?", (last,)) for table in ("outbox", "withdrawn")),
                 sync=False,
             )
         return [Outgoing(*row[:4]) for row in rows if row[3] is None or row[3] > head]
 
-    async def waiting_by_kind(self) -> dict[str, int]:
-        """The messages in the outbox of each kind (`demand`, `offer`, `withdrawal`, `result`) that has any."""
-        return dict(await self._database.rows("SELECT kind, COUNT(*) FROM outbox GROUP BY kind"))
+    async def waiting_by_kind(self, *, head: int) -> dict[str, int]:
+        """The messages to send of each kind (`demand`, `offer`, `withdrawal`, `result`) that has any."""
+        statement = "SELECT kind, COUNT(*) FROM outbox WHERE deadline IS NULL OR deadline > ? GROUP BY kind"
+        return dict(await self._database.rows(statement, (head,)))
 
     async def cursor(self) -> tuple[int | None, bytes]:
         """The last block that the listener has handled (None: it never handled one), and its encoded chain history."""

@@ -144,7 +144,7 @@ async def test_a_ledger_written_during_the_backup_is_consistent_in_it(folder: Fo
         copy.write_bytes(members(tmp_path / f"{number}")[f"{ADDRESS}/{CHAIN}/ledger.sqlite"])
         async with Ledger(copy) as ledger:
             phases = await ledger.jobs_by_phase()
-            waiting = sum((await ledger.waiting_by_kind()).values())
+            waiting = sum((await ledger.waiting_by_kind(head=0)).values())
             assert phases.get("complete", 0) == waiting - 1, "a job's end and its Result are one"
             counts.append(phases.get("complete", 0))
         database = sqlite3.connect(copy)

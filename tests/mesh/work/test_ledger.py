@@ -261,3 +261,26 @@ async def test_an_order_is_replaced_at_its_place_in_one_step(ledger: Ledger) -> 
     await ledger.post(old)
     await ledger.replace(old.identity, new)
     assert await ledger.outbox(head=0) == [new]
+
+
+@pytest.mark.parametrize("is_withdrawn", [False, True], ids=["open", "withdrawn"])
+async def test_an_expired_order_is_known_while_a_reorganisation_may_bring_its_contract_back(
+    path: Path, *, is_withdrawn: bool
+) -> None:
+    signed = demand(deadline=50)
+    order = outgoing(signed)
+    async with Ledger(path, reorg_depth=12) as ledger:
+        await ledger.post(order)
+        if is_withdrawn:
+            await ledger.withdraw(order.identity, outgoing(withdrawal(signed)))
+        await ledger.spend(order.identity, "the contract")
+        await ledger.unspend("the contract")
+        assert await ledger.outbox(head=61) == []
+        assert await ledger.waiting_by_kind(head=61) == {}
+        await ledger.spend(order.identity, "the contract")
+        assert await ledger.contracts("demand") == [(order.payload, "the contract")]
+
+        await ledger.unspend("the contract")
+        assert await ledger.outbox(head=62) == []
+        await ledger.spend(order.identity, "the contract")
+        assert await ledger.contracts("demand") == [], "it is forgotten"

@@ -208,14 +208,14 @@ async def test_what_is_not_committed_is_not_read(ledger: Ledger, monkeypatch: py
     async with asyncio.TaskGroup() as tasks:
         completing = tasks.create_task(completed(ledger))
         await reached.wait()
-        sending = tasks.create_task(ledger.waiting_by_kind())
+        sending = tasks.create_task(ledger.waiting_by_kind(head=0))
         await asyncio.wait([sending], timeout=0.2)
         held.set()
         assert isinstance(await completing, LedgerUnusable)
         assert await sending == {}
     monkeypatch.setattr(aiosqlite.Connection, "commit", commit)
     assert not await completed(ledger)
-    assert sum((await ledger.waiting_by_kind()).values()) == 1
+    assert sum((await ledger.waiting_by_kind(head=0)).values()) == 1
 
 
 async def completed(ledger: Ledger) -> LedgerUnusable | None:
