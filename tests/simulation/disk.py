@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import builtins
 import errno
+import fcntl
 import io
 import os
 import shutil
@@ -38,6 +39,8 @@ SALTS: Final = slice(16, 24)
 """Where a log's header has what changes whenever SQLite begins it again."""
 INDEX_HEADER: Final = struct.Struct("=14xHI12x8s56xI")
 """The index: the page's size, the log's frames, its salts, and how many frames are in the database."""
+LOCK_POLL_NS: Final = 1_000_000
+"""Between two looks at a file that another thread has locked."""
 WRITES: Final = ("INSERT", "UPDATE", "DELETE", "REPLACE", "CREATE", "ALTER", "DROP", "COMMIT")
 
 
@@ -190,9 +193,10 @@ class SimulatedDisk:
         return now[: self._draw.random.randint(len(synced), len(now))]
 
     def install(self) -> None:
-        """Take the place of `os.fsync`, of what writes to files, and of SQLite's connections."""
+        """Take the place of `os.fsync`, of what locks and writes files, and of SQLite's connections."""
         module: Any = os
         module.fsync = self.fsync
+        fcntl.flock = _waiting(fcntl.flock)
         for name in ("write", "pwrite"):
             setattr(os, name, _checked(self, getattr(os, name)))
         io.open = builtins.open = _opener(self)
@@ -204,6 +208,21 @@ class SimulatedDisk:
             return connection
 
         sqlite3.connect = connect_here  # type: ignore[assignment]
+
+
+def _waiting(flock: Any) -> Any:
+    """`flock` that lets others run while it waits: one of them may have the lock."""
+
+    def lock(descriptor: Any, operation: int) -> None:
+        while True:
+            try:
+                return flock(descriptor, operation | fcntl.LOCK_NB)  # type: ignore[no-any-return]
+            except BlockingIOError:
+                if operation & fcntl.LOCK_NB:
+                    raise
+            scheduler().wait(LOCK_POLL_NS)
+
+    return lock
 
 
 def _checked(disk: SimulatedDisk, write: Any) -> Any:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 MOST_CPU_SECONDS: Final = 60
 """Of a history, and `MOST_CPU_A_JOB` for each of its jobs: ten times as many as the longest ones take."""
 MOST_CPU_A_JOB: Final = 15
+MOST_REAL_TIMES: Final = 4
+"""How many times as many real seconds it may take: one that waits for ever takes no CPU."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,7 @@ def _play(market: Deployed, run: Run, writing: int, *, trace: bool, switches: st
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     limit = MOST_CPU_SECONDS + MOST_CPU_A_JOB * run.jobs
     resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+    signal.alarm(MOST_REAL_TIMES * limit)
     try:
         if run.plant:
             planted(run.plant).apply()
