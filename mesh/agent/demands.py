@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.agent.declines import BUSY, grounds_of
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call
+from mesh.chain import NodeUnreachable, RequestRefused, TransactionTimeout
 from mesh.content import ContentUnavailable
 from mesh.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
 from mesh.work.objectives import Buyer, ObjectiveNotFetched
@@ -149,6 +150,8 @@ class DemandDispatcher:
                     self._drop(demand, f"objective-{error.reason}")
                 elif isinstance(error, ContentUnavailable):
                     self._drop(demand, "objective-missing")
+                elif isinstance(error, NodeUnreachable | RequestRefused | TransactionTimeout):
+                    self._drop(demand, error.code)
                 if error is not None and (reason := grounds_of(error)) is not None:
                     grounds.append(reason)
             if grounds:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.chain import NodeUnreachable, RequestRefused, TransactionTimeout
 from mesh.network import Channel, Endpoints, Network
 from schemas import Demand, Signer, cid_of_bytes
 from tests.support import orders
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.agent import Agent
+    from mesh.errors import AiraError
     from schemas import Verified
 
 BEFORE_ITS_TURN = 30.0
@@ -110,6 +112,32 @@ async def test_a_demand_is_handled_once_its_maker_can_pay(place: Place) -> None:
 
         await until(resend, pause=0.05)
         assert [one.message for one in handled] == [demand]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        NodeUnreachable("http://there", "it is away"),
+        RequestRefused("eth_call", -32000, "busy"),
+        TransactionTimeout("0x01", 9.0),
+    ],
+    ids=lambda error: error.code,
+)
+async def test_a_demand_is_handled_again_when_the_node_failed(place: Place, error: AiraError) -> None:
+    """Nobody else may be there to offer, and the demand would wait until its deadline."""
+    robot, attempts = place.agent("robot"), list[str]()
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        attempts.append(demand.hash.hex())
+        if len(attempts) == 1:
+            raise error
+        await robot.offer(demand)
+
+    async with place.at_work(robot) as person:
+        await person.demand(place.save(objective(("/go", "there"))), cost=100)
+        assert len(attempts) > len(set(attempts)) == 1
+        assert robot.drops.totals() == {error.code: 1}
 
 
 async def test_of_many_free_demands_few_are_handled(place: Place) -> None:
