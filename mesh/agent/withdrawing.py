@@ -1,26 +1,34 @@
-"""Withdrawals on the chain that a reorganisation reverts are made again."""
+"""Withdrawals on the chain that a reorganisation reverts are made again, and the nonces that it freed used up."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from mesh.agent.orders import TermsWriter
 from mesh.chain import OrderAlreadyUsed
 from mesh.errors import AiraError
 from mesh.log_context import log_event
 from schemas import Demand, Offer, decode
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from mesh.agent.components import AgentComponents
+    from mesh.agent.orders import TradedOrder
     from mesh.work.ledger import WithdrawnOrder
 
 log = logging.getLogger(__name__)
 
 
+LOOKS: Final = 3
+"""Polls of the chain after which a node that was behind has its latest block."""
+
+
 class ChainWithdrawals:
-    """The orders of an account that it has withdrawn on the chain."""
+    """What an account withdraws on the chain unasked: orders that it has withdrawn there before, and freed nonces."""
 
     def __init__(self, parts: AgentComponents) -> None:
         self._parts = parts
@@ -40,6 +48,28 @@ class ChainWithdrawals:
                 except AiraError as error:
                     facts = log_event("order-not-withdrawn", order=order.identity, code=error.code)
                     log.warning("order %s is not withdrawn on the chain now: %s", order.identity, error, extra=facts)
+
+    async def use_up_nonces(self, order: TradedOrder, *, is_waiting: Callable[[int], bool]) -> None:
+        """Use up the nonces before that of an open order, unless another open order of the account has one.
+
+        In generation 5 a reorganisation may free them: it reverts the contract of an earlier order, which has expired
+        or was withdrawn since. The open order may not be signed again with such a nonce: both could become contracts.
+        """
+        if self._lock.locked():
+            return
+        parts, write = self._parts, TermsWriter(self._parts, {}).sign_again
+        async with self._lock:
+            await asyncio.sleep(LOOKS * parts.chain.node.timing.poll_interval)
+            try:
+                while order.is_open and not is_waiting(nonce := await parts.chain.liabilities.next_nonce()):
+                    if order.nonce is None or order.nonce <= nonce:
+                        return
+                    await parts.chain.liabilities.withdraw(await write(order.signed))
+                    facts = log_event("nonce-used-up", order=order.identity, nonce=nonce)
+                    log.warning("the nonce %d before that of the %s was free; used up", nonce, order, extra=facts)
+            except AiraError as error:
+                facts = log_event("nonce-not-used-up", order=order.identity, code=error.code)
+                log.warning("the nonce before that of the %s can't be used up now: %s", order, error, extra=facts)
 
     async def _ensure(self, withdrawn: WithdrawnOrder) -> None:
         parts, order = self._parts, decode(withdrawn.payload)

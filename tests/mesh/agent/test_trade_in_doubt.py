@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from mesh.agent import Agent, LiabilityReverted, OrderExpired, Progress
 from mesh.chain import Chain, Timing
+from mesh.chain.liabilities import Liabilities
 from mesh.chain.validators import Validators
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
@@ -85,6 +86,29 @@ async def test_the_reason_of_the_contracts_is_reported(place: Place, monkeypatch
         assert await waiting(person) == ["demand"]
         demand.cancel()
         await asyncio.wait([demand])
+
+
+async def test_nonces_that_a_reorganisation_freed_do_not_keep_the_next_order_waiting(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each account's orders count up in generation 5, and the earlier orders have expired."""
+    async with (
+        place.provider(),
+        working(place.agent("robot", generation=5)),
+        place.agent("person", generation=5) as person,
+    ):
+        liabilities = person.parts.chain.liabilities
+        free = await liabilities.next_nonce()
+
+        async def before_the_reorganisation(liabilities: Liabilities, address: str | None = None) -> int:
+            return free + 2
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Liabilities, "next_nonce", before_the_reorganisation)
+            order = await person.order(OBJECTIVE, cost=7)
+        contract = await order.contract()
+        assert (await place.chains["person"].liabilities.order_hashes(contract.address))[0].hex() == order.hash
+        assert await liabilities.next_nonce() == free + 3
 
 
 def rejection(place: Place, role: str, order: str, *, reason: str = "Unwanted") -> Rejection:
