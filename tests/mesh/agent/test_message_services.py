@@ -77,7 +77,7 @@ async def heard(messages: Subscription[Any]) -> Verified[Any]:
 
 
 async def waiting(agent: Agent) -> list[bytes]:
-    return [waiting.payload for waiting in await agent.parts.ledger.outbox(head=0)]
+    return [waiting.payload for waiting in await agent.parts.ledger.outbox(head=agent.parts.chain_head.head)]
 
 
 async def until_settled(agent: Agent) -> None:

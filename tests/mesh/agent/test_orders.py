@@ -33,7 +33,11 @@ async def allowance(place: Place, role: str) -> int:
 
 async def withdrawals(agent: Agent) -> list[Withdrawal]:
     """The withdrawals that an agent sends."""
-    found = [decode(one.payload) for one in await agent.parts.ledger.outbox(head=0) if one.kind == "withdrawal"]
+    found = [
+        decode(one.payload)
+        for one in await agent.parts.ledger.outbox(head=agent.parts.chain_head.head)
+        if one.kind == "withdrawal"
+    ]
     return [message for message in found if isinstance(message, Withdrawal)]
 
 

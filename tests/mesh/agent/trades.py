@@ -34,7 +34,7 @@ def job(place: Place) -> Path:
 
 async def waiting(agent: Agent) -> list[str]:
     """The kinds of the messages in an agent's outbox."""
-    return [message.kind for message in await agent.parts.ledger.outbox(head=0)]
+    return [message.kind for message in await agent.parts.ledger.outbox(head=agent.parts.chain_head.head)]
 
 
 async def posted(agent: Agent) -> None:
