@@ -98,7 +98,7 @@ _NAMES: Final = {
     "mesh.validator.evidence": "Evidence",
     "mesh.validator.validator": "Validator",
     "mesh.work.job": "Job JobFailed",
-    "mesh.work.ledger": "Phase WrongPhase",
+    "mesh.work.phases": "Phase WrongPhase",
     "mesh.work.objectives": "ObjectiveUnfit",
     "schemas": (
         "Demand Empty InvalidPayload Liability Offer Payload PayloadType Result STRING String Verified ZERO_ADDRESS"

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 from mesh.agent.declines import BUSY, grounds_of
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call
-from mesh.chain import NodeUnreachable, RequestRefused, TransactionTimeout
 from mesh.content import ContentUnavailable
 from mesh.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
 from mesh.work.objectives import Buyer, ObjectiveNotFetched
@@ -150,7 +149,7 @@ class DemandDispatcher:
                     self._drop(demand, f"objective-{error.reason}")
                 elif isinstance(error, ContentUnavailable):
                     self._drop(demand, "objective-missing")
-                elif isinstance(error, NodeUnreachable | RequestRefused | TransactionTimeout):
+                elif error is not None and _is_outage(error):
                     self._drop(demand, error.code)
                 if error is not None and (reason := grounds_of(error)) is not None:
                     grounds.append(reason)
@@ -168,3 +167,10 @@ class DemandDispatcher:
         """Count a demand that is not handled now, and let its next copy through, `after` seconds."""
         self._drops.count(reason, demand.signer)
         self._subscription.forget(demand, after=after)
+
+
+def _is_outage(error: AiraError) -> bool:
+    """Whether a handler ended because the node failed."""
+    from mesh.chain import NodeUnreachable, RequestRefused, TransactionTimeout
+
+    return isinstance(error, NodeUnreachable | RequestRefused | TransactionTimeout)
