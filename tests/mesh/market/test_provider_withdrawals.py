@@ -131,8 +131,8 @@ async def test_withdrawals_are_known_until_no_reorganisation_reaches_their_deadl
         assert len(provider.withdrawals) == 1
 
     async with local.provider(withdrawals=path) as provider:  # it reads the blocks again that may be replaced
-        local.publish(demand, local.offer(deadline=demand.deadline))
-        await until(lambda: provider.earnings().rejected == {"withdrawn": 1})
+        await until_read(local, provider)
+        assert len(provider.withdrawals) == 1
         await local.mine(REORG_DEPTH)
         await until_read(local, provider)
         assert len(provider.withdrawals) == 0
