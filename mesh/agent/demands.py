@@ -171,6 +171,7 @@ class DemandDispatcher:
 
 def _is_outage(error: AiraError) -> bool:
     """Whether a handler ended because the node failed."""
-    from mesh.chain import NodeUnreachable, RequestRefused, TransactionTimeout
+    from mesh.chain import TransactionTimeout
+    from mesh.chain.following import NODE_ERRORS
 
-    return isinstance(error, NodeUnreachable | RequestRefused | TransactionTimeout)
+    return isinstance(error, (*NODE_ERRORS, TransactionTimeout))

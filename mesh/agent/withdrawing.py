@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-
 LOOKS: Final = 3
-"""Polls of the chain after which a node that was behind has its latest block."""
+"""Poll intervals to wait before a nonce counts as free: the node may have been a block behind."""
 
 
 class ChainWithdrawals:

@@ -142,7 +142,7 @@ class Settlement:
     def set_aside(self, order: Verified[Order], reason: str) -> None:
         """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that.
 
-        Its maker is told with each copy: an earlier rejection may have been lost.
+        Each copy is rejected, because an earlier rejection may have been lost.
         """
         if self._refusal(order) is None and order_id(order) not in self._book:
             self._unfunded.add(order)

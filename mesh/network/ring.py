@@ -26,8 +26,7 @@ class _Lane(deque[tuple[Any, int]]):
         """Add an item; returns how many were dropped for it."""
         self.append((item, size))
         self.size += size
-        if (before := len(self)) <= self._capacity and self.size <= self._capacity_bytes:
-            return 0
+        before = len(self)
         while len(self) > self._capacity or (self.size > self._capacity_bytes and len(self) > 1):
             self.size -= self.popleft()[1]
         return before - len(self)

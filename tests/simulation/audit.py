@@ -90,10 +90,10 @@ class Audit:
             self._market.violated("tokens-not-conserved", "sent and received amounts differ")
 
     async def promises(self) -> None:
-        """What people were told is what happened, and nobody paid for an order that they believed dead.
+        """What people were told has happened, and nobody paid for an order that they believed dead.
 
-        People are told after one confirmation: what a reorganisation takes back is no broken promise. A payment that it
-        takes back is made again unless the robot never returns: only the robot keeps its result for sure.
+        People are told after one confirmation, so a reorganisation may contradict that. A payment that it reverts is
+        made again, unless the robot has left for good: only the robot is sure to keep its result.
         """
         node = SimulatedNode(self._chain, NodeFaults())
         told = {order.contract: order for person in self._market.people for order in person.orders if order.contract}

@@ -415,7 +415,7 @@ CANDIDATES: Final = (
         seeds=100,
     ),
     Mutation(
-        "the maker of an unfunded order is told once",
+        "an unfunded order is rejected once only",
         "mesh.market.settlement:Settlement.set_aside",
         "if order in self._unfunded:",
         "if False:",
@@ -423,7 +423,7 @@ CANDIDATES: Final = (
         seeds=100,
     ),
     Mutation(
-        "an expired order is forgotten although its contract may come back",
+        "an order is forgotten at its deadline",
         "mesh.work.ledger:Ledger.outbox",
         "head - self._reorg_depth",
         "head",
@@ -431,7 +431,7 @@ CANDIDATES: Final = (
         seeds=100,
     ),
     Mutation(
-        "free nonces before an open order are left free",
+        "nonces that a reorganisation freed are never used up",
         "mesh.agent.trade:Trader._rejected",
         "order.nonce > used",
         "False",

@@ -15,7 +15,7 @@ from schemas.keys import market_key
 from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.rpc import Approve
 from tests.mesh.agent.conftest import Asker, asking
-from tests.mesh.agent.trades import all_posted
+from tests.mesh.agent.trades import all_posted, unsettled
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until_found, until_heard
@@ -77,7 +77,7 @@ async def heard(messages: Subscription[Any]) -> Verified[Any]:
 
 
 async def waiting(agent: Agent) -> list[bytes]:
-    return [waiting.payload for waiting in await agent.parts.ledger.outbox(head=agent.parts.chain_head.head)]
+    return [waiting.payload for waiting in await unsettled(agent)]
 
 
 async def until_settled(agent: Agent) -> None:

@@ -15,7 +15,7 @@ from mesh.chain import BlockHeader, InsufficientTokens
 from mesh.chain.answers import Count, Word
 from mesh.chain.heads import Heads
 from schemas import Demand, Offer, Withdrawal, cid_of_bytes, decode, message_hash
-from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, waiting, working
+from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, unsettled, waiting, working
 from tests.support.log_events import logged_facts
 from tests.support.waiting import until, until_found
 
@@ -33,11 +33,7 @@ async def allowance(place: Place, role: str) -> int:
 
 async def withdrawals(agent: Agent) -> list[Withdrawal]:
     """The withdrawals that an agent sends."""
-    found = [
-        decode(one.payload)
-        for one in await agent.parts.ledger.outbox(head=agent.parts.chain_head.head)
-        if one.kind == "withdrawal"
-    ]
+    found = [decode(one.payload) for one in await unsettled(agent) if one.kind == "withdrawal"]
     return [message for message in found if isinstance(message, Withdrawal)]
 
 

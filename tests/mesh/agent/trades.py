@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent import Agent
+    from mesh.work import Outgoing
     from mesh.work.job import Job
 
 OBJECTIVE = cid_of_bytes(b"something to be done")
@@ -32,9 +33,14 @@ def job(place: Place) -> Path:
     return place.save(objective(("/go", "there")))
 
 
+async def unsettled(agent: Agent) -> list[Outgoing]:
+    """The messages that an agent sends until their effect is on the chain."""
+    return await agent.parts.ledger.outbox(head=agent.parts.chain_head.head)
+
+
 async def waiting(agent: Agent) -> list[str]:
-    """The kinds of the messages in an agent's outbox."""
-    return [message.kind for message in await agent.parts.ledger.outbox(head=agent.parts.chain_head.head)]
+    """The kinds of those messages."""
+    return [message.kind for message in await unsettled(agent)]
 
 
 async def posted(agent: Agent) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mesh.chain.policy import REORG_DEPTH
-from mesh.market import order_id
+from mesh.market import Refusal, order_id
 from mesh.market.withdrawals import withdrawn_id
 from schemas import Withdrawal, verify_message
 from tests.mesh.market.held_node import HeldNode
@@ -131,8 +131,8 @@ async def test_withdrawals_are_known_until_no_reorganisation_reaches_their_deadl
         assert len(provider.withdrawals) == 1
 
     async with local.provider(withdrawals=path) as provider:  # it reads the blocks again that may be replaced
-        await until_read(local, provider)
-        assert len(provider.withdrawals) == 1
+        assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
+        assert provider.earnings().rejected == {"withdrawn": 1}
         await local.mine(REORG_DEPTH)
         await until_read(local, provider)
         assert len(provider.withdrawals) == 0

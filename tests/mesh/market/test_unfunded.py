@@ -140,16 +140,16 @@ async def test_a_demand_is_matched_when_its_allowance_is_raised(local: LocalMark
         assert gas == 0
 
 
-async def test_the_maker_of_an_unfunded_order_is_told_again_when_it_sends_the_order_again(local: LocalMarket) -> None:
+async def test_each_copy_of_an_unfunded_order_is_rejected(local: LocalMarket) -> None:
     """The first rejection may have been lost, and without one the maker would wait until the deadline."""
     await local.chain.tokens.approve(local.chain.factory, 6)
     async with local.provider() as provider:
         demand = local.demand(cost=7)
 
-        async def told(times: int) -> bool:
+        async def is_rejected(times: int) -> bool:
             local.publish(demand)
             return len(local.rejections) >= times
 
-        await until_found(partial(told, 3), what="three rejections")
+        await until_found(partial(is_rejected, 3), what="three rejections")
         assert {one.reason for one in local.rejections} == {"ERC20InsufficientAllowance"}
         assert len(provider.book) == 1
