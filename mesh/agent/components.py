@@ -147,14 +147,15 @@ async def working(
 async def _handled(ledger: Ledger, chain: Chain) -> int:
     """The last block that an agent has handled. Later ones may have made contracts of its orders, also of expired ones.
 
-    A new agent begins at the head, and remembers that before it posts an order. Raises `ChainWentBack` if the chain
-    lacks blocks that were handled, and more than it may replace.
+    A new agent begins at the head, and remembers that block before it posts an order: if it is replaced, the order can
+    become a contract in an earlier one. Raises `ChainWentBack` if the chain lacks blocks that were handled, and more
+    than it may replace.
     """
     from mesh.chain import ChainWentBack
 
     (handled, _), head = await ledger.cursor(), await chain.block_number()
     if handled is None:
-        await ledger.set_cursor(head)
+        await ledger.set_cursor(head, history=(await chain.history_at(head)).encode())
         return head
     if handled > head + chain.node.timing.reorg_depth:
         raise ChainWentBack(handled + 1, head)

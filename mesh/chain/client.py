@@ -11,7 +11,7 @@ from mesh.chain.admission import OrderCosts
 from mesh.chain.artifacts import is_code_of
 from mesh.chain.contracts import Contracts, contract_version
 from mesh.chain.errors import NoContracts, UnknownName
-from mesh.chain.following import NODE_ERRORS, follow, retrying
+from mesh.chain.following import NODE_ERRORS, follow, history_at, retrying
 from mesh.chain.funds import Funds
 from mesh.chain.liabilities import Liabilities
 from mesh.chain.lighthouses import Lighthouses
@@ -173,6 +173,10 @@ class Chain:
     async def block_number(self) -> int:
         """Number of the latest block."""
         return await self.node.block_number()
+
+    async def history_at(self, block_number: int) -> History:
+        """The history of a consumer that has read nothing yet and begins after a block: see `following`."""
+        return await history_at(self.node, block_number)
 
     def follow(
         self,

@@ -24,7 +24,8 @@ block again: handling must be idempotent.
 **The history** (`History`) holds the hashes and events of the last `Timing.reorg_depth` blocks that were yielded.
 Hashes are compared with the chain's to notice a reorganisation; the events are what it reverts. `follow` fills the
 history that it is given. Save it with the cursor and pass it again after a restart: blocks that were replaced in the
-meantime are then reverted first. Without one, only a reorganisation that happens while following is noticed.
+meantime are then reverted first. Without one, only a reorganisation that happens while following is noticed:
+`history_at` is for a consumer that must know of each since it decided where to begin.
 
 **When the node fails**, the failure is logged once (`OutageLog`) and reading continues from the cursor as soon as the
 node answers, with the backoff `Timing.outage_retry`. What stops `follow` is a chain that can't be the one that was
@@ -141,6 +142,20 @@ class History:
         return history
 
 
+async def history_at(node: Node, block_number: int) -> History:
+    """The history of a consumer that has read nothing yet and begins after a block: `follow` notices its replacement.
+
+    It holds that block and earlier ones, at twice the distance each time and at last a whole depth below it. If blocks
+    are replaced, reading goes back to the newest of these that was not. Raises `NodeUnreachable` if the node lacks one.
+    """
+    history = History(node.timing.reorg_depth)
+    distances = [0, *(1 << power for power in range(history.depth.bit_length())), history.depth]
+    numbers = sorted({block_number - min(distance, history.depth, block_number) for distance in distances})
+    for number, block_hash in zip(numbers, await asyncio.gather(*map(node.block_hash, numbers)), strict=True):
+        history.remember(SeenBlock(number, block_hash, ()))
+    return history
+
+
 async def follow(
     node: Node, read: ReadRange, cursor: int, *, history: History | None = None, outages: OutageLog | None = None
 ) -> AsyncGenerator[BlockEvents, None]:
@@ -215,7 +230,9 @@ class _Follower:
             self.cursor = min(self.cursor, replaced.block_number + 1)
             yield replaced
         self._history.forget_above(self.cursor - 1)
-        await self._remember_start(head)
+        if not self._history.blocks and 0 < self.cursor <= head.number + 1:
+            for block in (await history_at(self._node, self.cursor - 1)).blocks:
+                self._history.remember(block)
         try:
             async with aclosing(self._ranges.read_to(self.cursor, head)) as blocks:
                 async for block in blocks:
@@ -248,19 +265,6 @@ class _Follower:
         if known:
             raise ReorganisedTooDeep(known[0].block_number, head.number)
         return None
-
-    async def _remember_start(self, head: BlockHeader) -> None:
-        """Remember the block before the first one that is read, and the one a whole depth below it.
-
-        A reorganisation that begins before the start goes back to the lower one, and all blocks after it are read.
-        """
-        if self._history.blocks or not 0 < self.cursor <= head.number + 1:
-            return
-        last = self.cursor - 1
-        for number in sorted({max(0, last - self._history.depth), last}):
-            before = await self._node.header(number)
-            if before is not None:
-                self._history.remember(SeenBlock(before.number, before.hash, ()))
 
     async def _is_on_chain(self, block: SeenBlock, head: BlockHeader) -> bool:
         """Whether the chain that ends at `head` has the block."""

@@ -101,7 +101,9 @@ async def opened(
     settings, account = place.settings("robot"), place.market.accounts["robot"]
     async with working(settings, account, chain or place.chains["robot"], drops=Drops()) as parts:
         if (await ledger.cursor())[0] is None:
-            await ledger.set_cursor(parts.chain_head.head)
+            block, history = await parts.ledger.cursor()
+            assert block is not None
+            await ledger.set_cursor(block, history=history)
         yield kind(dataclasses.replace(parts, ledger=ledger))
 
 

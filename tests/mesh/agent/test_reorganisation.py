@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.background import Background
 from mesh.chain import Approval, Chain, ChainWentBack, History, NewLiability, Timing, Transfer
 from tests.mesh.agent.listeners import contract, finalize, ledger, listening, opened, started
 from tests.support.market import QUICK
@@ -51,6 +52,22 @@ async def test_a_finalization_reverted_while_the_agent_was_down_is_reported(plac
     async with listening(place, ledger) as listener:
         await until(lambda: listener.reverted_ends)
     assert listener.reverted_ends == [address]
+
+
+async def test_a_new_agent_finds_a_contract_in_a_block_that_replaced_the_one_it_began_at(
+    place: Place, ledger: Ledger
+) -> None:
+    await contract(place)
+    before = await place.chains["robot"].block_number()
+    await place.node.mine(8)
+    async with opened(place, ledger) as listener, Background() as tasks:
+        await place.node.request("evm_revert", [hex(before)])
+        address, *_ = await contract(place)
+        assert await place.chains["robot"].block_number() < before + 8
+        await place.node.mine(8)
+        tasks.start(listener.run(), "listener")
+        await until(lambda: listener.liabilities)
+    assert [liability.address for liability, *_ in listener.liabilities] == [address], "no earlier one"
 
 
 async def test_a_reverted_contract_is_reported_and_again_when_it_is_created(place: Place, ledger: Ledger) -> None:
