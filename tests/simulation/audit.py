@@ -13,6 +13,7 @@ from mesh.evidence.verification import verify
 from mesh.work.phases import Phase
 from schemas import ZERO_ADDRESS
 from tests.simulation.chain import NodeFaults, SimulatedNode
+from tests.simulation.faults import MOST_BLOCKS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from mesh.work.ledger import JobRecord
     from schemas import Liability
     from tests.simulation.market import Market
-    from tests.simulation.roles import Role
+    from tests.simulation.roles import Ordered, Role
 
 INVALID: Final = frozenset(
     {
@@ -93,7 +94,8 @@ class Audit:
         """What people were told has happened, and nobody paid for an order that they believed dead.
 
         People are told after one confirmation, so a reorganisation may contradict that. A payment that it reverts is
-        made again, unless the robot has left for good: only the robot is sure to keep its result.
+        made again, unless the robot has left for good (only the robot is sure to keep its result), or the payment came
+        so late that a refund may be mined instead.
         """
         node = SimulatedNode(self._chain, NodeFaults())
         told = {order.contract: order for person in self._market.people for order in person.orders if order.contract}
@@ -110,7 +112,8 @@ class Audit:
                     self._market.violated("promise-broken", f"{believed.person} was told {believed.told!r}; {address}")
                 record = await chain.liabilities.get(address)
                 self._promisors[address] = record.promisor
-                self._told(address, told.get(address), record)
+                if (order := told.get(address)) is not None:
+                    self._told(order, record, refundable_from=await chain.liabilities.refundable_from(address))
                 if record.is_finalized and record.is_success:
                     if self._market.fails(address):
                         self._market.violated("failed-job-paid", address)
@@ -125,12 +128,14 @@ class Audit:
         """The liabilities of a robot."""
         return {address for address, promisor in self._promisors.items() if promisor == robot.account.address}
 
-    def _told(self, address: str, order: object, record: Liability) -> None:
-        told = getattr(order, "told", None)
+    def _told(self, order: Ordered, record: Liability, *, refundable_from: int) -> None:
+        told = order.told
         if told in ("paid", "refunded") and (told == "paid") != record.is_success:
-            if told == "paid" and self._chain.reorganisations and self._has_left(record.promisor):
+            is_late = order.told_block + MOST_BLOCKS >= refundable_from
+            if told == "paid" and self._chain.reorganisations and (is_late or self._has_left(record.promisor)):
                 return
-            self._market.violated("promise-broken", f"{address}: told {told!r}, but success is {record.is_success}")
+            detail = f"{record.address}: told {told!r}, but success is {record.is_success}"
+            self._market.violated("promise-broken", detail)
 
     def _has_left(self, account: str) -> bool:
         return any(robot.has_left for robot in self._market.robots if robot.account.address == account)

@@ -52,7 +52,8 @@ class Ordered:
     told: str = ""
     """The last thing: ordered, accepted, withdrawn, expired, paid, refunded, reverted, or an error's code."""
     told_ns: int = 0
-    """When."""
+    told_block: int = 0
+    """When, and at which block."""
 
     @property
     def is_over(self) -> bool:

@@ -131,7 +131,7 @@ class StepAudit:
     def told(self, person: PersonRole, number: int) -> None:
         """A person was told something of an order."""
         order = person.orders[number]
-        order.told_ns = self._market.scheduler.now_ns
+        order.told_ns, order.told_block = self._market.scheduler.now_ns, self._chain.evm.head
         if not order.is_dead or order.told_ns < self._reorganised_ns + UNSETTLED_NS:
             return
         mine = {demand for demand, maker in self.demands.items() if maker == (person, number)}
