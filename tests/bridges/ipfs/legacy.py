@@ -26,6 +26,10 @@ def multibase(data: bytes) -> str:
     return "u" + urlsafe_b64encode(data).decode().rstrip("=")
 
 
+LONGEST_CALL = aiohttp.ClientTimeout(total=120)
+"""A daemon looks for content without end: a test fails sooner, and says where."""
+
+
 class LegacyClient:
     """A client of the daemon whose RPC is at `api`. `heard` are the messages received since `listen` returned.
 
@@ -40,7 +44,7 @@ class LegacyClient:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> Self:
-        self._http = aiohttp.ClientSession()
+        self._http = aiohttp.ClientSession(timeout=LONGEST_CALL)
         return self
 
     async def __aexit__(
