@@ -8,13 +8,14 @@ the others for open orders and withdrawals.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from mesh.blocklist import Blocklist
 from mesh.chain import InsufficientFunds
-from mesh.flood import Drops, FairQueue
+from mesh.flood import Drops
 from mesh.fresh_file import CHECK_INTERVAL
 from mesh.log_context import LogSource, source_context
+from mesh.market.arrivals import Arrivals
 from mesh.market.book import LIMIT, Match, OrderBook
 from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.liability_events import OPEN_LIABILITIES
@@ -32,7 +33,7 @@ from mesh.telemetry.logs import LogService
 from schemas import Demand, Offer, Result, Withdrawal
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from contextlib import AsyncExitStack
     from pathlib import Path
 
@@ -40,19 +41,12 @@ if TYPE_CHECKING:
 
     from mesh.blocklist import BlockedSigners
     from mesh.chain import Chain
-    from mesh.flood import KnownSenders
-    from mesh.market.book import Order
-    from mesh.network import Network, Subscription
+    from mesh.network import Network
     from mesh.retry import RetryPolicy
     from mesh.telemetry.metrics import MetricFamily
     from schemas import Verified
 
 __all__ = ["Earnings", "Provider", "ProviderProcess", "check_account"]
-
-CHECKED: Final = 512
-"""Orders whose makers' funds are asked for at once."""
-WAITING: Final = 32_768
-"""Orders that wait for that."""
 
 
 class Provider(Role):
@@ -224,43 +218,6 @@ class Provider(Role):
         async for result in self.results:
             await self.queue.has_room()
             await self.settlement.results.add(result)
-
-
-class Arrivals:
-    """Takes orders from subscriptions (`take`), and passes them to `settlement` (`run`).
-
-    Those of known signers go first. What an order says that it pays counts only when its maker can pay it.
-    """
-
-    def __init__(
-        self, settlement: Settlement, *, known: KnownSenders, has_room: Callable[[], Awaitable[None]], drops: Drops
-    ) -> None:
-        self._settlement = settlement
-        self._known = known
-        self._has_room = has_room
-        self._drops = drops
-        self._queue: FairQueue[tuple[Verified[Order], Subscription[Any]]] = FairQueue(per_sender=WAITING, total=WAITING)
-
-    async def take(self, orders: Subscription[Any]) -> None:
-        """Take the open orders of other providers, then those that are published, until cancelled."""
-        await orders.recall()
-        async for order in orders:
-            is_known = order.signer in self._known
-            for dropped, subscription in self._queue.put(order.signer, (order, orders), priority=int(is_known)):
-                self._drops.count("queue-full", dropped.signer)
-                subscription.forget(dropped)
-
-    async def run(self) -> None:
-        """Pass on what was taken, until cancelled."""
-        while True:
-            batch = [order for order, _ in await self._queue.get_batch(CHECKED)]
-            await self._has_room()
-            for order, shortage in zip(batch, await self._settlement.shortages(batch), strict=True):
-                if shortage:
-                    self._drops.count("unfunded", order.signer)
-                    self._settlement.set_aside(order, shortage)
-                else:
-                    self._settlement.add(order)
 
 
 class ProviderProcess:

@@ -137,12 +137,8 @@ class MessageValidator(Generic[M]):
         self._count_duplicate()
         return True
 
-    def check(self, key: str, payload: bytes) -> Verified[M] | Unresolved[M] | None:
-        """The verified message in `payload`; an `Unresolved` one; or None, which is counted under its reason."""
-        return next((found for some in self.check_all([(key, payload)]) for found in some), None)
-
     def check_all(self, received: Iterable[tuple[str, bytes]]) -> Iterator[list[Verified[M] | Unresolved[M]]]:
-        """The messages among keys and payloads, as `check` finds them, some of them every few milliseconds.
+        """The verified or `Unresolved` messages of keys and payloads, some every few milliseconds; others are counted.
 
         All are decoded before signatures are verified: each is twice as fast while its code stays in the CPU's caches.
         """
@@ -162,7 +158,9 @@ class MessageValidator(Generic[M]):
                 raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self.kind.__name__}")
             # A name has a dot, which JSON may write with a backslash.
             if (_DOT in payload or _BACKSLASH in payload) and (names := names_in(message)):
-                if (addresses := self._known_names(names)) is None:
+                if self._names is None:
+                    raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
+                if (addresses := self._names.known(names)) is None:
                     return Unresolved(message, key, fingerprint)
                 message = resolve_names(message, addresses)
             return self._hashed(message, key, fingerprint)
@@ -205,11 +203,6 @@ class MessageValidator(Generic[M]):
         seen[identity], seen[prepared.fingerprint] = prepared.fingerprint, identity
         self._accepted += 1
         return verified
-
-    def _known_names(self, names: frozenset[str]) -> dict[str, str] | None:
-        if self._names is None:
-            raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
-        return self._names.known(names)
 
     async def complete(self, unresolved: Unresolved[M]) -> Verified[M] | None:
         """Ask the chain about a message; the verified message, or None, which is counted under its reason."""

@@ -12,6 +12,7 @@ from mesh.blocklist import Blocklist, BlocklistUnusable, blocklist_at
 from mesh.fresh_file import CHECK_INTERVAL
 from mesh.network.validation import MessageValidator, message_key
 from schemas import Demand, Signer, encode
+from tests.mesh.network.validating import check_payload
 from tests.schemas.samples import DEMAND
 from tests.support.clocks import SECOND, SetClock
 
@@ -66,8 +67,8 @@ def test_messages_of_a_blocked_signer_are_rejected(tmp_path: Path) -> None:
         Demand, lighthouse=LIGHTHOUSE, address=None, head=lambda: 0, blocked=Blocklist(path, clock=clock)
     )
     first, second = (MALLORY.sign(replace(DEMAND, nonce=f"{number}" * 64)) for number in (1, 2))
-    assert validator.check(message_key(LIGHTHOUSE, first), encode(first)) is not None
+    assert check_payload(validator, message_key(LIGHTHOUSE, first), encode(first)) is not None
     path.write_text(MALLORY.address)
     clock.pass_by(int(CHECK_INTERVAL * SECOND))
-    assert validator.check(message_key(LIGHTHOUSE, second), encode(second)) is None
+    assert check_payload(validator, message_key(LIGHTHOUSE, second), encode(second)) is None
     assert validator.statistics(received=2, dropped=0).invalid == {"blocked": 1}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mesh.background import Background
 from mesh.flood import Drops, KnownSenders
 from mesh.market import Added, OrderBook, Refusal
-from mesh.market.provider import CHECKED, Arrivals
+from mesh.market.arrivals import CHECKED, Arrivals
 from schemas import Demand, Signer, verify_message
 from tests.mesh.market.test_provider_withdrawals import withdrawal_of
 from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand, verified_offer

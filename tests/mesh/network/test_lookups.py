@@ -16,7 +16,7 @@ from mesh.flood import Drops
 from mesh.network import Channel, message_key
 from mesh.network.lookups import FAILURE_KEPT, KEPT, NameCache, Unresolved
 from schemas import Demand, Offer, Verified, encode, message_hash
-from tests.mesh.network.validating import NAME, check, counted, validator
+from tests.mesh.network.validating import NAME, check, check_payload, counted, validator
 from tests.support.clocks import SECOND, SetClock
 from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER, demand, offer
 from tests.support.waiting import until, until_heard
@@ -56,12 +56,12 @@ async def test_a_message_with_a_name_is_accepted_once_the_name_is_resolved() -> 
     named = json.loads(encode(message)) | {"token": NAME.upper()}
     key = message_key(MARKET, message)
 
-    waiting = checked.check(key, json.dumps(named).encode())
+    waiting = check_payload(checked, key, json.dumps(named).encode())
 
     assert isinstance(waiting, Unresolved)
     assert waiting.message.token == NAME
     assert await checked.complete(waiting) == Verified(message, message_hash(message), PERSON.address)
-    assert checked.check(key, json.dumps(named).encode()) is None, "a duplicate is not resolved again"
+    assert check_payload(checked, key, json.dumps(named).encode()) is None, "a duplicate is not resolved again"
     assert await checked.complete(waiting) is None, "it was accepted meanwhile"
     assert checked.statistics(received=0, dropped=0).duplicate == 2
 
@@ -69,7 +69,7 @@ async def test_a_message_with_a_name_is_accepted_once_the_name_is_resolved() -> 
 async def test_a_message_with_an_unknown_name_is_counted() -> None:
     checked, message = validator(resolver=resolving({})), demand(token=STRANGER.address)
     named = json.loads(encode(message)) | {"token": NAME}
-    waiting = checked.check(message_key(MARKET, message), json.dumps(named).encode())
+    waiting = check_payload(checked, message_key(MARKET, message), json.dumps(named).encode())
     assert isinstance(waiting, Unresolved)
 
     assert await checked.complete(waiting) is None
@@ -79,7 +79,7 @@ async def test_a_message_with_an_unknown_name_is_counted() -> None:
 async def test_a_message_whose_name_resolves_to_another_address_is_not_its_signers() -> None:
     checked, message = validator(resolver=resolving({NAME: ROBOT.address})), demand(token=STRANGER.address)
     named = json.loads(encode(message)) | {"token": NAME}
-    waiting = checked.check(message_key(MARKET, message), json.dumps(named).encode())
+    waiting = check_payload(checked, message_key(MARKET, message), json.dumps(named).encode())
     assert isinstance(waiting, Unresolved)
 
     verified = await checked.complete(waiting)
@@ -90,14 +90,14 @@ async def test_a_message_whose_name_resolves_to_another_address_is_not_its_signe
 async def test_a_forgotten_message_with_a_name_is_accepted_once_more() -> None:
     checked, message = validator(resolver=resolving({NAME: STRANGER.address})), demand(token=STRANGER.address)
     named = json.dumps(json.loads(encode(message)) | {"token": NAME}).encode()
-    waiting = checked.check(message_key(MARKET, message), named)
+    waiting = check_payload(checked, message_key(MARKET, message), named)
     assert isinstance(waiting, Unresolved)
     verified = await checked.complete(waiting)
     assert isinstance(verified, Verified)
 
     checked.forget(verified)
 
-    assert checked.check(message_key(MARKET, message), named) == verified, "its name is known"
+    assert check_payload(checked, message_key(MARKET, message), named) == verified, "its name is known"
 
 
 async def test_an_order_is_accepted_once_its_validator_is_known_to_be_safe() -> None:
@@ -105,7 +105,7 @@ async def test_an_order_is_accepted_once_its_validator_is_known_to_be_safe() -> 
     checked, message = validator(validators=known), demand(validator=STRANGER.address)
     key = message_key(MARKET, message)
 
-    waiting = checked.check(key, encode(message))
+    waiting = check_payload(checked, key, encode(message))
     assert isinstance(waiting, Unresolved)
     assert await checked.complete(waiting) == Verified(message, message_hash(message), PERSON.address)
     assert check(checked, message) is None, "a duplicate"
@@ -117,7 +117,7 @@ async def test_an_order_whose_validator_is_a_lighthouse_is_counted() -> None:
     known = Known(**{STRANGER.address: False})
     checked = validator(Offer, validators=known)
     message = offer(validator=STRANGER.address)
-    waiting = checked.check(message_key(MARKET, message), encode(message))
+    waiting = check_payload(checked, message_key(MARKET, message), encode(message))
     assert isinstance(waiting, Unresolved)
 
     assert await checked.complete(waiting) is None
@@ -129,7 +129,7 @@ async def test_an_order_whose_validator_can_t_be_checked_is_counted_and_may_come
     known = Known()
     checked, message = validator(validators=known), demand(validator=STRANGER.address)
     for _ in range(2):
-        waiting = checked.check(message_key(MARKET, message), encode(message))
+        waiting = check_payload(checked, message_key(MARKET, message), encode(message))
         assert isinstance(waiting, Unresolved)
         assert await checked.complete(waiting) is None
     assert counted(checked) == {"validator": 2}

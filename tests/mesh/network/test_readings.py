@@ -35,6 +35,7 @@ from schemas import (
     recover,
 )
 from schemas.signing import Rejection
+from tests.mesh.network.validating import check_payload
 from tests.support.orders import MARKET
 
 LIGHTHOUSES: Final = tuple(checksum_address(bytes([number]) * 20) for number in (0x11, 0x12, 0x13))
@@ -125,7 +126,7 @@ def is_accepted(message: SignedMessage, *, factory: Factory | None) -> bool:
         validator = MessageValidator(
             type(message), lighthouse=MARKET, address=lighthouse, head=lambda: 0, validators=factory
         )
-        accepted = validator.check(message_key(MARKET, message), encode(message))
+        accepted = check_payload(validator, message_key(MARKET, message), encode(message))
         assert not isinstance(accepted, Unresolved)
         if accepted is not None:
             return True

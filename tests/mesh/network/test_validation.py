@@ -13,7 +13,7 @@ import pytest
 from mesh.network import ValidationStatistics, message_key, validation
 from schemas import Demand, Offer, Result, Verified, encode, message_hash
 from schemas.signing import SignedDigest, recover_keys
-from tests.mesh.network.validating import HEAD, check, counted, validator
+from tests.mesh.network.validating import HEAD, check, check_payload, counted, validator
 from tests.support.clocks import SECOND, SetClock
 from tests.support.orders import (
     MARKET,
@@ -82,7 +82,7 @@ def test_an_invalid_order_is_counted_under_its_reason(reason: str) -> None:
 def test_invalid_input_is_counted_under_its_reason(payload: bytes, reason: str) -> None:
     checked = validator()
 
-    assert checked.check(message_key(MARKET, demand()), payload) is None
+    assert check_payload(checked, message_key(MARKET, demand()), payload) is None
     assert counted(checked) == {reason: 1}
 
 
@@ -119,7 +119,7 @@ def test_a_changed_message_is_not_its_signers_and_does_not_keep_the_original_out
     changes = {"cost": 2} if isinstance(message, Demand) else {"success": not message.success}
     altered = json.dumps(json.loads(encode(message)) | changes).encode()
 
-    verified = checked.check(message_key(MARKET, message), altered)
+    verified = check_payload(checked, message_key(MARKET, message), altered)
 
     signer = PERSON if isinstance(message, Demand) else ROBOT
     assert not isinstance(verified, Verified) or verified.signer != signer.address

@@ -22,7 +22,12 @@ def counted(checked: MessageValidator[Any]) -> dict[str, int]:
     return dict(checked.statistics(received=0, dropped=0).invalid)
 
 
+def check_payload(checked: MessageValidator[Any], key: str, payload: bytes) -> Verified[Any] | Unresolved[Any] | None:
+    """What becomes of a payload that is received alone."""
+    return next((found for some in checked.check_all([(key, payload)]) for found in some), None)
+
+
 def check(checked: MessageValidator[Any], message: SignedMessage, key: str | None = None) -> Verified[Any] | None:
-    accepted = checked.check(key or message_key(MARKET, message), encode(message))
+    accepted = check_payload(checked, key or message_key(MARKET, message), encode(message))
     assert not isinstance(accepted, Unresolved)
     return accepted
