@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, settings
 
 from tests.support.ci import IN_CI
 from tests.support.nodes import Anvil
+from tests.support.ports import hold_unreachable_ports
 from tests.support.routers import EmbeddedRouter, Zenohd
 
 if TYPE_CHECKING:
@@ -26,6 +27,13 @@ ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
 
 MEASURED: Final = ("tests/schemas/", "tests/mesh/")
 """Whose tests measure coverage: those of the packages that have a bar for it."""
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Keep all processes of a long run from ports that can't be reached."""
+    is_worker = hasattr(session.config, "workerinput")
+    if not is_worker and (IN_CI or session.config.getoption("numprocesses", None)):
+        hold_unreachable_ports()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

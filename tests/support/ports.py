@@ -5,8 +5,10 @@ from __future__ import annotations
 import atexit
 import random
 import socket
+import struct
 from functools import cache
 from itertools import cycle
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -14,8 +16,14 @@ if TYPE_CHECKING:
 
 FIRST: Final = 10_000
 BEYOND: Final = 32_700
-"""The first port that the kernel gives to connections and to servers that ask for port 0."""
+"""Below the ephemeral ports."""
 SHARE: Final = 200
+EPHEMERAL: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
+"""The first and the last port that Linux gives to connections and to servers that ask for port 0."""
+PATIENCE: Final = 0.5
+"""Seconds until a port counts as unreachable: it takes microseconds."""
+RESET: Final = struct.pack("ii", 1, 0)
+"""To linger for no time: a closed connection then does not occupy its ports for a minute."""
 
 
 def free_port() -> int:
@@ -37,6 +45,39 @@ def answers(port: int) -> bool:
     with socket.socket() as probe:
         probe.settimeout(1)
         return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def hold_unreachable_ports() -> list[int]:
+    """Hold the ephemeral ports until this process ends whose connections on loopback get lost, and return them.
+
+    A sandbox or a firewall may have one or two. A server that got one by chance would never be reached, and its test
+    would wait for minutes. Looking takes two seconds.
+    """
+    if not EPHEMERAL.exists():
+        return []
+    first, last = map(int, EPHEMERAL.read_text().split())
+    return [port for port in range(first, last + 1) if not _is_reachable(port)]
+
+
+def _is_reachable(port: int) -> bool:
+    """Whether a server on a port can be reached, or has the port already. Others are held."""
+    server = socket.socket()
+    try:
+        server.bind(("127.0.0.1", port))
+        server.listen(1)
+    except OSError:
+        server.close()
+        return True
+    with socket.socket() as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+        client.settimeout(PATIENCE)
+        try:
+            client.connect(("127.0.0.1", port))
+        except TimeoutError:
+            atexit.register(server.close)
+            return False
+    server.close()
+    return True
 
 
 @cache

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 from tests.support import ports
 from tests.support.commands import run
-from tests.support.ports import answers, free_port
+from tests.support.ports import answers, free_port, hold_unreachable_ports
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pytest
 
 OTHER = "from tests.support.ports import free_port, SHARE; print(*(free_port() for _ in range(SHARE)))"
@@ -37,3 +39,25 @@ def test_two_processes_never_get_the_same_port(pytestconfig: pytest.Config) -> N
     other = run(sys.executable, "-c", OTHER, PYTHONPATH=str(pytestconfig.rootpath))
     assert other.stderr == ""
     assert mine.isdisjoint(map(int, other.stdout.split()))
+
+
+def test_ports_that_can_be_reached_or_are_taken_are_not_held(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    free, taken = free_port(), free_port()
+    looked_at = tmp_path / "range"
+    looked_at.write_text(f"{free}\t{taken}\n")
+    monkeypatch.setattr(ports, "EPHEMERAL", looked_at)
+    with socket.create_server(("127.0.0.1", taken)):
+        assert hold_unreachable_ports() == []
+    with socket.create_server(("127.0.0.1", free)):
+        assert answers(free)
+
+
+def test_a_port_that_can_t_be_reached_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(client: socket.socket, address: tuple[str, int]) -> None:
+        raise TimeoutError(f"{client} waits for {address}")
+
+    port = free_port()
+    with monkeypatch.context() as patched:
+        patched.setattr(socket.socket, "connect", lost)
+        assert not ports._is_reachable(port)
+    assert not ports._is_free(port)

@@ -48,7 +48,6 @@ async def test_demands_with_dead_cids_do_not_delay_a_result(
         assert counts.adds_queued + counts.fetches_queued > DEAD, "the flood still waits"
         assert counts.failed > 0, "one signer had too many"
         assert drops.heaviest("content-queue-full", 1)[0][0] == "one signer"
-        await swarm.join()  # among so many searches a daemon may have dropped the other one
         assert await bob.cat(cid) == content
 
 
