@@ -60,7 +60,7 @@ class Trader(Lifecycle):
         self._hear_declines: Callable[[], None] = lambda: None
         self._answers = OpenOffers()
         self._changing = asyncio.Lock()
-        self._chain_withdrawals = ChainWithdrawals(parts)
+        self._chain_withdrawals = ChainWithdrawals(parts, self._orders)
         self.contracts = WatchedContracts(parts, reports)
         self.customers = KnownSenders()
         """Who demanded the contracts of this account."""
@@ -260,16 +260,12 @@ class Trader(Lifecycle):
         if reason == "ERC20InsufficientAllowance" and not order.is_overtaken(used - 1):
             self._send_when_covered([order])  # a reorganisation took the allowance in a block that was not read here
         if order.nonce is not None and order.nonce > used:
-            using_up = self._chain_withdrawals.use_up_nonces(order, is_waiting=self._is_waiting)
-            self._tasks.start(using_up, f"use up the nonces before {identity}")
+            self._tasks.start(self._chain_withdrawals.use_up_nonces(order), f"use up the nonces before {identity}")
         if order.is_overtaken(used - 1):
             await self._renew_overtaken(used - 1)
         elif order.reject(rejection):
             facts = log_event("order-rejected", order=identity, provider=provider, reason=reason)
             log.warning("%s can't use the %s now (%s: %s)", provider, order, reason, rejection.detail, extra=facts)
-
-    def _is_waiting(self, nonce: int) -> bool:
-        return any(one.is_open and one.nonce == nonce for one in self._orders.values())
 
     async def _renew_overtaken(self, used: int | None) -> None:
         """Sign the orders of generation 5 again whose nonce another order of the account has used."""

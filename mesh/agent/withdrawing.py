@@ -14,7 +14,7 @@ from mesh.log_context import log_event
 from schemas import Demand, Offer, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Mapping
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.orders import TradedOrder
@@ -29,8 +29,10 @@ LOOKS: Final = 3
 class ChainWithdrawals:
     """What an account withdraws on the chain unasked: orders that it has withdrawn there before, and freed nonces."""
 
-    def __init__(self, parts: AgentComponents) -> None:
+    def __init__(self, parts: AgentComponents, orders: Mapping[str, TradedOrder]) -> None:
         self._parts = parts
+        self._orders = orders
+        """The account's orders that can still become contracts."""
         self._lock = asyncio.Lock()
 
     async def make_again(self) -> None:
@@ -48,7 +50,7 @@ class ChainWithdrawals:
                     facts = log_event("order-not-withdrawn", order=order.identity, code=error.code)
                     log.warning("order %s is not withdrawn on the chain now: %s", order.identity, error, extra=facts)
 
-    async def use_up_nonces(self, order: TradedOrder, *, is_waiting: Callable[[int], bool]) -> None:
+    async def use_up_nonces(self, order: TradedOrder) -> None:
         """Use up the nonces before that of an open order, unless another open order of the account has one.
 
         In generation 5 a reorganisation may free them: it reverts the contract of an earlier order, which has expired
@@ -60,12 +62,16 @@ class ChainWithdrawals:
         async with self._lock:
             await asyncio.sleep(LOOKS * parts.chain.node.timing.poll_interval)
             try:
-                while order.is_open and not is_waiting(nonce := await parts.chain.liabilities.next_nonce()):
-                    if order.nonce is None or order.nonce <= nonce:
+                while order.is_open:
+                    nonce = await parts.chain.liabilities.next_nonce()
+                    is_waiting = any(one.is_open and one.nonce == nonce for one in self._orders.values())
+                    if is_waiting or order.nonce is None or order.nonce <= nonce:
                         return
                     await parts.chain.liabilities.withdraw(await write(order.signed))
                     facts = log_event("nonce-used-up", order=order.identity, nonce=nonce)
                     log.warning("the nonce %d before that of the %s was free; used up", nonce, order, extra=facts)
+            except OrderAlreadyUsed:
+                return  # another program of the account was faster
             except AiraError as error:
                 facts = log_event("nonce-not-used-up", order=order.identity, code=error.code)
                 log.warning("the nonce before that of the %s can't be used up now: %s", order, error, extra=facts)
