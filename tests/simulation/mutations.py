@@ -255,6 +255,7 @@ MUTATIONS: Final = (
         "if kind is Count and number >> 63:",
         "if False:",
         "spoilt",
+        seeds=160,
     ),
     Mutation(
         "messages are recorded with the time of day",
@@ -278,6 +279,7 @@ MUTATIONS: Final = (
         "await self._parts.outbox.unspend(address)",
         "None",
         REORGANISATIONS + ",crash_every",
+        seeds=60,
     ),
     Mutation(
         "an order that its maker can't pay is forgotten",
@@ -289,6 +291,13 @@ MUTATIONS: Final = (
 )
 
 CANDIDATES: Final = (
+    Mutation(
+        "a new agent does not remember the block at which it began",
+        "mesh.agent.components:_handled",
+        "head, history=(await chain.history_at(head)).encode()",
+        "head",
+        REORGANISATIONS,
+    ),
     Mutation(
         "a job that was set aside is never taken up again",
         "mesh.work.ledger:Ledger.add_job",
