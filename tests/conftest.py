@@ -25,9 +25,6 @@ gc.disable()  # until all tests are collected: they stay, and looking through th
 ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
 """Parameters that name a second implementation of what another parameter of the same test names already."""
 
-SLOW: Final = frozenset({"py-evm"})
-"""Of two implementations the one that takes several times as long as its alternative."""
-
 MEASURED: Final = ("tests/schemas/", "tests/mesh/")
 """Whose tests measure coverage: those of the packages that have a bar for it."""
 
@@ -40,14 +37,15 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """In CI everything, but of `sample` parameters on the slow EVM one value; by default less, see CONTRIBUTING.md."""
-    kept, groups = set[pytest.Item](), dict[tuple[object, ...], list[pytest.Item]]()
+    """Everything in CI; by default one EVM and one router, no `full` tests, and one value of `sample` parameters."""
+    if IN_CI:
+        return
+    groups: dict[tuple[object, ...], list[pytest.Item]] = {}
     for item in items:
-        if IN_CI and not _has_parameter(item, SLOW):
-            kept.add(item)
-        elif IN_CI or not _is_only_in_ci(item):
+        if not _is_only_in_ci(item):
             groups.setdefault(_without_samples(item), []).append(item)
     sampled_before: Counter[object] = Counter()
+    kept = set[pytest.Item]()
     for (path, *_), group in groups.items():
         kept.add(group[sampled_before[path] % len(group)])
         sampled_before[path] += len(group) > 1
@@ -118,9 +116,8 @@ def _without_samples(item: pytest.Item) -> tuple[object, ...]:
 
 def _is_only_in_ci(item: pytest.Item) -> bool:
     """Whether `item` is `full`, or one with an alternative among its parameters."""
-    return item.get_closest_marker("full") is not None or _has_parameter(item, ALTERNATIVES)
-
-
-def _has_parameter(item: pytest.Item, values: frozenset[str]) -> bool:
     call = getattr(item, "callspec", None)
-    return call is not None and any(isinstance(value, str) and value in values for value in call.params.values())
+    values = call.params.values() if call is not None else ()
+    return item.get_closest_marker("full") is not None or any(
+        isinstance(value, str) and value in ALTERNATIVES for value in values
+    )
