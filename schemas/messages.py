@@ -14,13 +14,14 @@ block number (the order is valid while `block.number < deadline`). Source: the w
 
 from __future__ import annotations
 
+from functools import lru_cache
 from sys import intern
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, NoReturn, TypeAlias, TypeVar
 
 from msgspec import Struct
 from msgspec.structs import force_setattr, replace
 
-from schemas.address import parse_address
+from schemas.address import parse_address, parse_address_or_name
 from schemas.cid import parse_cid
 from schemas.errors import InvalidAddress, InvalidCid, InvalidMessage
 from schemas.keys import MarketKind  # msgspec reads the annotations
@@ -29,7 +30,19 @@ from schemas.message_fields import are_canonical, check_uint256, hex_digits, set
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+_CACHED: Final = 8192
 _NO_NAMES: Final[frozenset[str]] = frozenset()
+
+
+@lru_cache(maxsize=_CACHED)
+def _market_fields(model: str, token: str, lighthouse: str, validator: str) -> tuple[str, str, str, str]:
+    """The canonical texts of what most orders of a market have in common: checked once, and in memory once."""
+    parse_cid(model)
+    token, lighthouse, validator = (parse_address_or_name(text) for text in (token, lighthouse, validator))
+    if validator == lighthouse:
+        # With the two exchanged, an offer is a demand with the same signature: see mesh/chain/validators.py.
+        raise InvalidMessage("validator", "the lighthouse can't be the validator")
+    return intern(model), token, lighthouse, validator
 
 
 class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True, gc=False):
@@ -76,19 +89,18 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
 
     def __post_init__(self) -> None:
         try:
-            parse_cid(self.model)
-            force_setattr(self, "model", intern(self.model))
+            model, token, lighthouse, validator = _market_fields(
+                self.model, self.token, self.lighthouse, self.validator
+            )
             parse_cid(self.objective)
-            set_address(self, "token", self.token)
-            set_address(self, "lighthouse", self.lighthouse)
-            set_address(self, "validator", self.validator)
             if self.sender is not None:
                 set_address(self, "sender", self.sender)
         except (InvalidCid, InvalidAddress) as error:
             _raise_invalid(self, error)
-        if self.validator == self.lighthouse:
-            # With the two exchanged, an offer is a demand with the same signature: see mesh/chain/validators.py.
-            raise InvalidMessage("validator", "the lighthouse can't be the validator")
+        force_setattr(self, "model", model)
+        force_setattr(self, "token", token)
+        force_setattr(self, "lighthouse", lighthouse)
+        force_setattr(self, "validator", validator)
         check_uint256("cost", self.cost)
         check_uint256("deadline", self.deadline)
         nonce, signature = self.nonce, self.signature

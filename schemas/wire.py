@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 import msgspec
 
 from schemas.address import address_bytes, keccak256
-from schemas.cid import parse_cid
+from schemas.cid import CID_LENGTH, parse_ahead, parse_cid
 from schemas.errors import InvalidAddress, InvalidMessage
 from schemas.messages import MESSAGE_TYPES, Demand, Message, Offer, Order, Result, TransactionFeedback, Withdrawal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
 MAX_MESSAGE_SIZE: Final = 16_384
 """The longest payload, in bytes, that is decoded. Real messages have about 700."""
@@ -28,6 +28,10 @@ _MARKS: Final = tuple((f'"{mark}"'.encode(), kind) for mark, kind in _TYPE_OF_MA
 _DECODERS: Final = {kind: msgspec.json.Decoder(kind) for kind in MESSAGE_TYPES}
 _FIELDS: Final = {kind: msgspec.structs.fields(kind) for kind in MESSAGE_TYPES}
 _FIELD_COUNTS: Final = {kind: len(fields) for kind, fields in _FIELDS.items()}
+_NEW_CIDS: Final[dict[type[Any], bytes]] = {Demand: b'"objective":"', Offer: b'"objective":"', Result: b'"result":"'}
+"""What stands before the CID of a message that no other message has."""
+_FEW: Final = 8
+"""Fewer CIDs are as fast one by one."""
 _ANY_OBJECT: Final = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _ENCODER: Final = msgspec.json.Encoder()
 
@@ -72,6 +76,17 @@ def decode(payload: bytes, likely: type[Any] | None = None) -> Message:
     if payload.count(b":") != count:
         _explain(payload, kind, "a field is repeated", reason="duplicate-field")
     return message
+
+
+def parse_cids_ahead(payloads: Iterable[bytes], likely: type[Any]) -> None:
+    """Parse together what is new in each payload, its CID: `decode` of those of the `likely` kind is faster then."""
+    mark = _NEW_CIDS.get(likely)
+    if mark is None:
+        return
+    starts = [(payload, payload.find(mark) + len(mark)) for payload in payloads]
+    texts = [payload[start : start + CID_LENGTH] for payload, start in starts if start >= len(mark)]
+    if len(texts) >= _FEW:
+        parse_ahead([text.decode("ascii", "replace") for text in texts])
 
 
 def encode(message: Message) -> bytes:

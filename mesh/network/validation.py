@@ -33,6 +33,7 @@ from schemas import (
 )
 from schemas.keys import market_key
 from schemas.signing import SignedDigest, recover_keys, signed_digest, verify_recovered
+from schemas.wire import parse_cids_ahead
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -142,6 +143,8 @@ class MessageValidator(Generic[M]):
 
         All are decoded before signatures are verified: each is twice as fast while its code stays in the CPU's caches.
         """
+        received = list(received)
+        parse_cids_ahead((payload for _, payload in received), self.kind)
         prepared = [each for key, payload in received if (each := self._prepare(key, payload)) is not None]
         for start in range(0, len(prepared), SLICE):
             yield self._verify_all(prepared[start : start + SLICE])

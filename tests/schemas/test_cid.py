@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from schemas import InputError, InvalidCid, cid_of_digest, format_cid, parse_cid
-from schemas.cid import decode_base58, encode_base58
+from schemas.cid import decode_base58, encode_base58, parse_ahead
 
 EMPTY_FILE = "QmbFMke1KXqnYyBBWxB74N4c5SBnJMVAiMNRcGu6x1AwQH"
 
@@ -49,10 +49,28 @@ def test_cids_of_other_hashes_are_refused(text: str) -> None:
     assert caught.value.text == text
 
 
-@given(
-    st.text(max_size=60)
-    | st.text("123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz", min_size=46, max_size=46)
-)
+BASE58 = st.text("123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz", min_size=46, max_size=46)
+CIDS = st.binary(min_size=32, max_size=32).map(cid_of_digest)
+
+
+@given(st.lists(CIDS | BASE58 | st.text(max_size=60), max_size=300))
+@example([])
+@example([EMPTY_FILE, "é" * 46, "z" * 46])
+def test_parsing_ahead_changes_nothing(texts: list[str]) -> None:
+    parse_ahead([])
+    expected = [_parsed(text) for text in texts]
+    parse_ahead(texts)
+    assert [_parsed(text) for text in texts] == expected
+
+
+def _parsed(text: str) -> bytes | None:
+    parse_cid.cache_clear()
+    with suppress(InvalidCid):
+        return parse_cid(text)
+    return None
+
+
+@given(st.text(max_size=60) | BASE58)
 def test_any_text_is_a_cid_or_raises_invalid_cid(text: str) -> None:
     with suppress(InvalidCid):
         assert format_cid(parse_cid(text)) == text

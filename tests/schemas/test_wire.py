@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 import schemas
 from schemas import (
@@ -19,11 +20,15 @@ from schemas import (
     Message,
     Offer,
     OrderFeedback,
+    Result,
     TransactionFeedback,
+    cid,
+    cid_of_digest,
     encode,
     verify,
 )
 from schemas.messages import MESSAGE_TYPES
+from schemas.wire import parse_cids_ahead
 from tests.schemas.samples import (
     DEMAND,
     DEMAND_5,
@@ -307,3 +312,15 @@ def test_damaged_messages_decode_or_raise_invalid_message(fields: dict[str, Any]
     for damaged in (whole[:position] + damage + whole[position + len(damage) :], whole[:position] + damage):
         with suppress(InvalidMessage):
             assert decode(encode(decode(damaged))) == decode(damaged)
+
+
+@pytest.mark.parametrize("message", [DEMAND, DEMAND_5, OFFER, RESULT])
+def test_new_cids_of_many_messages_are_parsed_together(
+    message: Demand | Offer | Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field = "result" if isinstance(message, Result) else "objective"
+    cids = [cid_of_digest(bytes([number] * 32)) for number in range(20)]
+    payloads = [encode(replace(message, **{field: cid})) for cid in cids]
+    parse_cids_ahead([*payloads, b"", b'"objective":"', b'"result":"\xff'], type(message))
+    monkeypatch.setattr(cid, "base58_number", None)
+    assert [getattr(schemas.decode(payload), field) for payload in payloads] == cids
