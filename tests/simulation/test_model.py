@@ -5,24 +5,32 @@ from __future__ import annotations
 import os
 from typing import Any, Final
 
+import pytest
 from eth_bloom.bloom import BloomFilter
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
 from schemas import keccak256
 from tests.simulation.model import bloom_of
 from tests.simulation.model_history import ModelHistory, twins
-from tests.support.ci import IN_CI
+from tests.support.ci import IN_CI, seed_of_part
 
 HISTORIES: Final = int(os.environ.get("AIRA_MODEL_HISTORIES", "30" if IN_CI else "8"))
+AT_A_TIME: Final = 6
+"""Histories in one test: few enough to stay far below the time limit of a test on a busy machine."""
 STEPS: Final = 60
 SHOWN: Final = ("status", "contractAddress", "from", "to", "blockNumber", "transactionIndex", "type")
 
 
-@settings(max_examples=HISTORIES, deadline=None, suppress_health_check=list(HealthCheck))
-@given(seed=st.integers(0, 2**64), steps=st.integers(1, STEPS))
-def test_the_model_does_what_the_contracts_do(seed: int, steps: int) -> None:
-    ModelHistory(seed, steps).play()
+@pytest.mark.parametrize("first", range(0, HISTORIES, AT_A_TIME))
+def test_the_model_does_what_the_contracts_do(first: int) -> None:
+    @seed(seed_of_part(first))
+    @settings(max_examples=min(AT_A_TIME, HISTORIES - first), deadline=None, suppress_health_check=list(HealthCheck))
+    @given(number=st.integers(0, 2**64), steps=st.integers(1, STEPS))
+    def play(number: int, steps: int) -> None:
+        ModelHistory(number, steps).play()
+
+    play()
 
 
 def test_the_chain_of_the_model_shows_what_the_chain_of_the_evm_shows() -> None:
