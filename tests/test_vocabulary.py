@@ -74,9 +74,11 @@ def import_everything() -> None:
             import_module(path.removesuffix(".py").removesuffix("/__init__").replace("/", "."))
 
 
-def codes_of_errors() -> dict[type[AiraError], str | None]:
+def codes_of_errors() -> dict[str, str | None]:
+    """The code of each class, by its name: another test may have loaded a module, and so a class, a second time."""
     import_everything()
-    return {kind: kind.__dict__.get("code") for kind in error_classes() if kind.__module__.startswith(PACKAGES)}
+    ours = (kind for kind in error_classes() if kind.__module__.startswith(PACKAGES))
+    return {f"{kind.__module__}.{kind.__qualname__}": kind.__dict__.get("code") for kind in ours}
 
 
 def documented(heading: str) -> set[str]:
