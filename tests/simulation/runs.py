@@ -164,6 +164,8 @@ def _play(market: Deployed, run: Run, writing: int, *, trace: bool, switches: st
             print(plan, *lines, sep="\n", flush=True)
         with os.fdopen(writing, "w") as pipe:
             json.dump(asdict(report), pipe)
+    except BrokenPipeError:
+        pass  # the run was ended, and nobody waits for the report
     except BaseException:
         traceback.print_exc()
     finally:
