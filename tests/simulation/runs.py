@@ -10,6 +10,7 @@ import signal
 import sys
 import traceback
 from collections import deque
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NoReturn
@@ -162,10 +163,9 @@ def _play(market: Deployed, run: Run, writing: int, *, trace: bool, switches: st
         report, lines = history.run_history(market, run.seed, run.jobs, plan, left_out=run.left_out, switches=switches)
         if trace:
             print(plan, *lines, sep="\n", flush=True)
-        with os.fdopen(writing, "w") as pipe:
+        # When the run is ended, nobody waits for the report.
+        with suppress(BrokenPipeError), os.fdopen(writing, "w") as pipe:
             json.dump(asdict(report), pipe)
-    except BrokenPipeError:
-        pass  # the run was ended, and nobody waits for the report
     except BaseException:
         traceback.print_exc()
     finally:
