@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from selenium.webdriver.remote.webelement import WebElement
 
-PATIENCE: Final = 60.0
+PATIENCE: Final = 120.0
 """Seconds until what a test waits for must have come, on a busy machine."""
 DESKTOP: Final = (1280, 900)
 PHONE: Final = (390, 844)
