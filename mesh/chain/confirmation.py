@@ -1,7 +1,7 @@
-"""Giving a signed transaction to the node, and waiting until it is mined and confirmed.
+"""Waiting until a sent transaction is mined and confirmed.
 
-While it waits, a transaction is replaced by one with higher fees when it is stuck, sent again when the node lost it or
-its block was replaced, and given up when another transaction was mined with its nonce.
+Meanwhile it is replaced by one with higher fees when it is stuck, sent again when its block was replaced, and given up
+when another transaction was mined with its nonce.
 """
 
 from __future__ import annotations
@@ -11,10 +11,8 @@ import logging
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
-from mesh.chain.errors import NodeUnreachable, RequestRefused, TransactionTimeout
-from mesh.chain.metrics import TransactionOutcome
-from mesh.chain.pending import PendingTransaction
-from mesh.chain.policy import Fees
+from mesh.chain.errors import RequestRefused, TransactionTimeout
+from mesh.chain.submission import Resubmission, is_known
 from mesh.log_context import log_event
 from mesh.retry import Backoff
 
@@ -24,66 +22,16 @@ if TYPE_CHECKING:
     from mesh.chain.accounts import Account, SignedTransaction
     from mesh.chain.answers import MinedTransaction
     from mesh.chain.node import Node
-    from mesh.chain.pending import PendingTransactions
+    from mesh.chain.pending import PendingTransaction, PendingTransactions
 
 log = logging.getLogger(__name__)
 
 NONCE_CHECKS: Final = 3
 """How often in a row a node has to say that a nonce is used by another transaction: its index may be behind."""
 
-NONCE_TAKEN: Final = (
-    "nonce too low",
-    "nonce too high",
-    "underpriced",
-    "already known",
-    "known transaction",
-    "already imported",
-    "alreadyknown",
-    "oldnonce",
-)
-"""What geth, anvil, nethermind, erigon and the embedded chain say when another transaction has the nonce."""
-
 
 class NonceLost(Exception):
     """Another transaction was mined with the nonce: this one never will be, and may be sent with another nonce."""
-
-
-def is_nonce_taken(refused: RequestRefused) -> bool:
-    """Whether a node refused a transaction because of its nonce."""
-    return any(words in refused.detail.lower() for words in NONCE_TAKEN)
-
-
-def is_waiting_elsewhere(refused: RequestRefused) -> bool:
-    """Whether it did so because another transaction with the nonce waits, which it may not count."""
-    return is_nonce_taken(refused) and "nonce" not in refused.detail.lower()
-
-
-async def submit(node: Node, signed: SignedTransaction) -> None:
-    """Give a transaction to the node, and again after a lost connection: the same bytes never count twice.
-
-    Once an attempt may have arrived, the refusal of a later one may mean just that. Raises `NodeUnreachable`,
-    `RequestRefused`.
-    """
-    backoff, may_have_arrived = Backoff(node.timing.request_retry), False
-    while True:
-        try:
-            return await node.send_raw(signed.raw)
-        except NodeUnreachable:
-            may_have_arrived = True
-            if not await backoff.wait():
-                raise
-        except RequestRefused:
-            if may_have_arrived and await node.has_transaction(signed.hash):
-                return None
-            raise
-
-
-async def is_known(node: Node, versions: Iterable[SignedTransaction]) -> bool:
-    """Whether the node has one of the versions of a transaction, mined or waiting."""
-    for signed in versions:
-        if await node.has_transaction(signed.hash):
-            return True
-    return False
 
 
 async def find_receipt(
@@ -114,7 +62,7 @@ class Confirmation:
     ) -> None:
         self._node = node
         self._account = account
-        self._pending = pending
+        self._resubmission = Resubmission(node, account, pending)
         self._entry = entry
         self._seen = since
         """The hash of the latest block when the receipt was looked for last."""
@@ -124,8 +72,6 @@ class Confirmation:
         self._was_mined = False
         self._was_missed = False
         """Whether a new block was looked at that may have had it, and had it not: rarely is its nonce lost by then."""
-        self._missing: int | None = None
-        """The nonce before this one's that nothing was known to have when that was looked for last."""
         self._nonce_used = 0
         """Checks in a row that found the nonce used by another transaction."""
 
@@ -148,7 +94,7 @@ class Confirmation:
                             await self._check_nonce()
                         self._was_missed = True
                         if loop.time() >= self._replace_at:
-                            await self._unblock()
+                            await self._resubmission.unblock(self._entry)
                             self._replace_at = loop.time() + timing.replace_after
         except TimeoutError:
             raise TransactionTimeout(self._entry.newest.hash, timing.receipt_timeout) from None
@@ -208,7 +154,7 @@ class Confirmation:
                 tx,
                 extra=log_event("transaction-reverted", tx=tx),
             )
-            await self._send_again(self._entry)
+            await self._resubmission.send_again(self._entry)
         return None
 
     async def _check_nonce(self) -> None:
@@ -221,75 +167,3 @@ class Confirmation:
         self._nonce_used += 1
         if self._nonce_used == NONCE_CHECKS:
             raise NonceLost
-
-    async def _unblock(self) -> None:
-        """Replace the transaction that holds up the account's others, if it is this one or nothing waits for it."""
-        nonce = await self._node.transaction_count(self._account.address)
-        if nonce == self._entry.nonce:
-            await self._replace(self._entry)
-        elif nonce < self._entry.nonce:
-            blocking = self._pending.blocking(nonce)
-            if blocking is not None and await self._pending.take_over(blocking):
-                try:
-                    await self._replace(blocking)
-                finally:
-                    self._pending.abandon(blocking)
-            elif nonce not in self._pending.taken:
-                await self._fill(nonce)
-
-    async def _fill(self, nonce: int) -> None:
-        """Use a nonce that the node knows no transaction of, so that later ones can be mined.
-
-        A reorganisation took the one that had it, and a restart made us forget it. Others of the account may still send
-        it: only a nonce that was missing twice is filled.
-        """
-        was_missing, self._missing, address = self._missing == nonce, nonce, self._account.address
-        if not was_missing or await self._node.transaction_count(address, pending=True) != nonce:
-            facts = {"tx": self._entry.newest.hash, "nonce": nonce}
-            waits = "%(tx)s waits for nonce %(nonce)d of its account, which no transaction of this program has"
-            log.warning(waits, facts, extra=log_event("transaction-blocked", **facts))
-            return
-        fields = self._entry.fields | {"to": address, "data": "0x", "value": 0}
-        signed = self._account.sign_transaction({**fields, "nonce": nonce})
-        filler = PendingTransaction(nonce=nonce, fields=fields, versions=[signed])
-        async with self._pending.lock:
-            await self._pending.refresh()
-            if nonce in self._pending.taken or not await self._pending.add(filler):
-                return
-            try:
-                await self._send_again(filler)
-            finally:
-                self._pending.abandon(filler)
-        facts = {"tx": signed.hash, "nonce": nonce}
-        filled = "nonce %(nonce)d of the account was lost; %(tx)s takes its place, and does nothing"
-        log.warning(filled, facts, extra=log_event("transaction-filled", **facts))
-
-    async def _replace(self, entry: PendingTransaction) -> None:
-        """Send another version with higher fees, or the old one again if the ceiling leaves no room."""
-        fees = self._node.fees.replacement(await self._node.gas_market(), Fees.of(entry.fields))
-        stuck = entry.newest.hash
-        if fees is None:
-            log.warning(
-                "the transaction %s is stuck, and its fees are at the ceiling",
-                stuck,
-                extra=log_event("transaction-stuck", tx=stuck),
-            )
-        else:
-            fields = entry.fields | fees.fields()
-            signed = self._account.sign_transaction({**fields, "nonce": entry.nonce})
-            await self._pending.add_version(entry, fields, signed)
-            self._node.metrics.count(TransactionOutcome.REPLACED)
-            log.warning(
-                "the transaction %s is stuck; replaced by %s with higher fees",
-                stuck,
-                signed.hash,
-                extra=log_event("transaction-replaced", tx=stuck, replacement=signed.hash),
-            )
-        await self._send_again(entry)
-
-    async def _send_again(self, entry: PendingTransaction) -> None:
-        """Give the newest version to the node, which may have it, or may have mined another in the meantime."""
-        try:
-            await submit(self._node, entry.newest)
-        except RequestRefused as refused:
-            log.debug("%s: %s", entry.newest.hash, refused)

@@ -102,6 +102,10 @@ class PendingTransactions:
         self._elsewhere: frozenset[int] = frozenset()
         self._mined: BoundedDict[int, PendingTransaction] = BoundedDict(MINED_KEPT)
         self._counted: _Count | None = None
+        self._unblock_at = 0.0
+        self.missing: int | None = None
+        """The nonce that the next transactions waited for, and that nothing was known to have, when that was looked at.
+        """
 
     def counted(self, head: BlockHeader | None) -> int | None:
         """How many transactions the account has sent, if that was counted at block `head` or at its parent.
@@ -137,13 +141,17 @@ class PendingTransactions:
         """Transactions that nothing waits for any more, by nonce: their sender lost the node, gave up or ended."""
         return tuple(entry for _, entry in sorted(self._entries.items()) if not entry.is_watched)
 
-    def blocking(self, nonce: int) -> PendingTransaction | None:
-        """The transaction with that nonce that nothing waits for, though others wait for it: to be replaced.
+    def sent(self, nonce: int) -> PendingTransaction | None:
+        """The transaction with that nonce: one that waits, or was mined and a reorganisation took out of its block."""
+        return self._entries.get(nonce, self._mined.get(nonce))
 
-        It is abandoned, or was mined and a reorganisation sent it back to the pool.
-        """
-        entry = self._entries.get(nonce, self._mined.get(nonce))
-        return None if entry is None or entry.is_watched else entry
+    def may_unblock(self, pause: float) -> bool:
+        """Whether a task may see to the nonces that others wait for: one does, once in `pause` seconds."""
+        now = asyncio.get_running_loop().time()
+        if now < self._unblock_at:
+            return False
+        self._unblock_at = now + pause
+        return True
 
     async def add(self, entry: PendingTransaction) -> bool:
         """Take the entry's nonce, also from an abandoned one; False if another process was faster."""
@@ -165,7 +173,7 @@ class PendingTransactions:
             await _in_thread(partial(entry.locked.append, entry.version))
 
     async def take_over(self, entry: PendingTransaction) -> bool:
-        """Wait for a transaction of `abandoned` or `blocking` from now on; False if another process was faster."""
+        """Wait for a transaction that nothing waits for from now on; False if another process was faster."""
         if self._mined.get(entry.nonce) is entry:
             entry.is_watched = True
             return await self.add(entry)

@@ -14,18 +14,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain.accounts import created_address
-from mesh.chain.confirmation import (
-    Confirmation,
-    NonceLost,
-    find_receipt,
-    is_known,
-    is_nonce_taken,
-    is_waiting_elsewhere,
-    submit,
-)
+from mesh.chain.confirmation import Confirmation, NonceLost, find_receipt
 from mesh.chain.errors import FeeTooHigh, InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
 from mesh.chain.metrics import TransactionOutcome
 from mesh.chain.pending import PendingTransaction, effect_of
+from mesh.chain.submission import is_known, is_nonce_taken, is_waiting_elsewhere, submit
 from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
 

@@ -176,6 +176,31 @@ async def test_a_nonce_that_a_reorganisation_freed_and_nobody_remembers_is_fille
         assert await node.transaction_count(account.address) == 2
 
 
+async def test_all_nonces_that_a_reorganisation_freed_are_filled_together(anvil: Anvil) -> None:
+    wire, others, count = _Recording(anvil.url), [unused_address() for _ in range(3)], 3
+    account, timing = Account.from_key(anvil.private_keys[0]), replace(QUICK, replace_after=0.5)
+    async with Node(anvil.url, timing=timing) as node, Node(wire, timing=timing) as restarted:
+        before = await node.request("evm_snapshot")
+        forgotten = TransactionSender(node, account)
+        first = [asyncio.create_task(forgotten.send(to=unused_address(), data=b"", value=5)) for _ in range(count)]
+        await until_pending(node, count)
+        await node.request("evm_mine")
+        await asyncio.gather(*first)
+        sender = TransactionSender(restarted, account)
+        second = [asyncio.create_task(sender.send(to=other, data=b"", value=7)) for other in others]
+        await until_pending(node, len(others))
+        await node.request("evm_revert", before)
+        async with asyncio.timeout(60):
+            while not all(sending.done() for sending in second):
+                await node.request("evm_mine")
+                await asyncio.sleep(0.05)
+            await asyncio.gather(*second)
+        assert [await node.eth_balance(other) for other in others] == [7, 7, 7]
+        fillers = {raw for raw in wire.sent if account.address[2:].lower() in raw}
+        assert len(fillers) == count, "each nonce is filled once, though three tasks wait for it"
+    await wire.close()
+
+
 class _Indexing(HttpTransport):
     """A node that is still busy with its index, and says so when it is asked for a receipt."""
 
