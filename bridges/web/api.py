@@ -25,7 +25,7 @@ from bridges.web.orders import PER_SIGNER
 from bridges.web.reference import OPENAPI
 from bridges.web.validators import ValidatorApi
 from bridges.web.views import liability_json
-from mesh.agent.orders import default_lifetime
+from mesh.agent.terms import default_lifetime
 from mesh.errors import ChainError
 from mesh.network import call
 from mesh.watching.logs import LogReader

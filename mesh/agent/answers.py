@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.components import AgentComponents
-    from mesh.agent.orders import Terms, TermsWriter
+    from mesh.agent.terms import Terms, TermsWriter
     from mesh.network import Subscription
 
 log = logging.getLogger(__name__)

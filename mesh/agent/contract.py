@@ -183,7 +183,7 @@ class WatchedContracts:
             raise
 
     def watch(self, liability: Liability, *, order: str = "") -> Contract:
-        """The contract of `liability`, which was created from our `order` (hash), if from any."""
+        """The contract of `liability`, which was created from our `order` (lasting hash), if from any."""
         watched = self._watch(liability.address)
         contract = Contract(liability, watched.ended, self._parts, self._reports)
         self._reports.follow(liability)
@@ -194,7 +194,7 @@ class WatchedContracts:
         return contract
 
     def created(self, liability: Liability, order: str) -> Contract | None:
-        """The contract exists, perhaps again. Returns the one that was watched before for our `order` (hash).
+        """The contract exists, perhaps again. Returns the one that was watched before for our `order` (lasting hash).
 
         After a reorganisation the contract of an order may be at another address.
         """

@@ -3,40 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-import secrets
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, Protocol
-
-from msgspec.structs import replace
 
 from mesh.agent.contract import fail_future
 from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.progress import Progress, nothing, report, stated
 from mesh.market.book import Refusal
-from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
+from schemas import Demand, Offer, message_hash
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Mapping
+    from collections.abc import Mapping
 
-    from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
     from mesh.agent.progress import OnProgress
-    from mesh.chain import Chain
     from schemas.signing import Decline, Rejection
 
     Terms = Mapping[str, Any]
 
 STATEMENTS_KEPT: Final = 64
 """Most providers whose rejection of an order is remembered, and most agents whose decline is."""
-REPEATED: Final = ("model", "objective", "token", "cost", "lighthouse", "validator", "sender")
-"""The fields that are the same when an order is posted again; its nonce and perhaps its deadline are new."""
-LIFETIME: Final = 600.0
-"""Seconds for which an order is valid by default."""
-FEWEST_BLOCKS, MOST_BLOCKS = 50, 20_000
-"""The bounds of the default lifetime, whatever block time was measured."""
-MEASURED_BLOCKS: Final = 100
-"""The latest blocks, whose times give the block time."""
 
 
 class OrderState(StrEnum):
@@ -232,69 +219,3 @@ class Order:
         was withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
         """
         return await self._actions.contract_of(self._traded, on_progress)
-
-
-class TermsWriter:
-    """Fills in and signs the orders of one account, in the generation of its settings. `known` are hashes of others."""
-
-    def __init__(self, parts: AgentComponents, known: Container[str]) -> None:
-        self._settings, self._signer, self._known = parts.settings, parts.signer, known
-        self._chain, self._chain_head = parts.chain, parts.chain_head
-
-    async def terms(
-        self, *, model: str, objective: str, cost: int | str, token: str, validator: str, lifetime: int | None
-    ) -> Terms:
-        """The fields that a demand and an offer share, with names resolved, valid for `lifetime` blocks.
-
-        By default they are valid for about `LIFETIME` seconds. Raises `InvalidAmount`, `NotAToken`.
-        """
-        settings, names = self._settings, self._chain.names
-        if not isinstance(cost, int):
-            cost = (await self._chain.tokens.unit(token or settings.erc20_token)).amount(cost)
-        blocks = await default_lifetime(self._chain) if lifetime is None else lifetime
-        return {
-            "model": await names.model(model),
-            "objective": objective,
-            "token": await names.address(token or settings.erc20_token),
-            "cost": cost,
-            "lighthouse": await names.address(settings.lighthouse_contract),
-            "validator": await names.address(validator) if validator else ZERO_ADDRESS,
-            "deadline": (await self._chain.node.heads.recent()).number + blocks,
-            "sender": None if settings.generation == 3 else self._signer.address,
-        }
-
-    def terms_of(self, order: Demand | Offer) -> Terms:
-        """The terms of a stranger's order, for one that answers it; its deadline counts up to `deadline_limit`."""
-        latest = self._chain_head.head + self._settings.deadline_limit
-        return {**self._repeated(order), "deadline": min(order.deadline, latest)}
-
-    def _repeated(self, order: Demand | Offer) -> Terms:
-        sender = None if order.generation == 3 else self._signer.address
-        return {field: getattr(order, field) for field in (*REPEATED, "deadline")} | {"sender": sender}
-
-    async def sign(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Demand | Offer:
-        """An order with these terms and a fresh nonce, signed, unlike the known ones. Raises `UnsafeValidator`."""
-        is_counted = terms["sender"] is not None
-        nonce = await self._chain.liabilities.next_nonce(self._signer.address) if is_counted else secrets.token_hex(32)
-        order = kind(**terms, nonce=nonce, **fee)
-        await self._chain.validators.check(order)
-        while message_hash(order).hex() in self._known:  # equal orders have the same nonce until one is a contract
-            order = replace(order, deadline=order.deadline - 1)
-        return self._signer.sign(order)
-
-    async def sign_again(self, order: Demand | Offer) -> Demand | Offer:
-        """An order like this one, with a fresh nonce."""
-        if isinstance(order, Demand):
-            return await self.sign(Demand, self._repeated(order), validator_fee=order.validator_fee)
-        return await self.sign(Offer, self._repeated(order), lighthouse_fee=order.lighthouse_fee)
-
-
-def is_repeated(demand: Demand, terms: Terms, *, validator_fee: int) -> bool:
-    """Whether a demand differs from these terms in nonce and deadline only."""
-    return demand.validator_fee == validator_fee and all(getattr(demand, field) == terms[field] for field in REPEATED)
-
-
-async def default_lifetime(chain: Chain) -> int:
-    """How many blocks an order is valid by default: about `LIFETIME`, by the time between the latest blocks."""
-    block_time = await chain.node.heads.block_time(MEASURED_BLOCKS)
-    return round(LIFETIME) if block_time is None else min(max(round(LIFETIME / block_time), FEWEST_BLOCKS), MOST_BLOCKS)

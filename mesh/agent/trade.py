@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.agent.contract import Contract, WatchedContracts, fail_future
 from mesh.agent.demands import current_buyer
 from mesh.agent.offers import OpenOffers
-from mesh.agent.orders import Order, OrderState, TermsWriter, TradedOrder
+from mesh.agent.orders import Order, OrderState, TradedOrder
 from mesh.agent.progress import Progress, report, seen_offers
 from mesh.agent.statements import received_declines, received_rejections
+from mesh.agent.terms import TermsWriter
+from mesh.agent.versions import earlier_version, lasting_hash
 from mesh.agent.withdrawing import ChainWithdrawals
 from mesh.background import Background
 from mesh.chain import Allowances, OrderAlreadyUsed
@@ -31,9 +33,9 @@ if TYPE_CHECKING:
     from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
-    from mesh.agent.orders import Terms
     from mesh.agent.progress import OnProgress
     from mesh.agent.reports import ContractReports
+    from mesh.agent.terms import Terms
     from schemas import Liability
     from schemas.signing import Rejection
 
@@ -164,17 +166,22 @@ class Trader(Lifecycle):
         offer = offer_hash.hex() if liability.promisor == self._address else ""
         if offer:
             self.customers.add(liability.promisee)
-        known = self.contracts.created(liability, demand or offer)
-        for identity in filter(None, (demand, offer)):
-            if (order := self._orders.get(identity)) is not None:
+        orders = {identity: self._orders.get(identity) for identity in (demand, offer) if identity}
+        if demand and orders[demand] is None:
+            orders[demand] = earlier_version(self._orders.values(), liability, demand)
+        lasting = [lasting_hash(order.signed) if order else identity for identity, order in orders.items()]
+        known = self.contracts.created(liability, next(iter(lasting), ""))
+        for (identity, order), lasts in zip(orders.items(), lasting, strict=True):
+            if order is not None:
                 log.info("matched our %s %s", order.state, order, extra=log_event("contract-created", order=identity))
                 order.state, order.liability = OrderState.MATCHED, liability.address
                 self._forget(order)
-            await self._parts.outbox.spend(identity, liability.address)
+            await self._parts.outbox.spend(identity if order is None else order.identity, liability.address)
             if order is not None:
                 if order.created is not None and not order.created.done():
-                    order.created.set_result(known or self.contracts.watch(liability, order=identity))
-                await self._renew_overtaken(order.nonce)
+                    order.created.set_result(known or self.contracts.watch(liability, order=lasts))
+                is_earlier = order.nonce is not None and order.identity != identity
+                await self._renew_overtaken(order.nonce - 1 if is_earlier and order.nonce else order.nonce)
 
     async def liability_reverted(self, address: str) -> None:
         """A reorganisation reverted the contract at `address`: its orders are open again, and sent when covered."""

@@ -25,9 +25,9 @@ from schemas.cid import is_cid
 if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
-    from mesh.agent.orders import Terms
     from mesh.agent.progress import OnProgress
     from mesh.agent.runtime import AgentRuntime
+    from mesh.agent.terms import Terms
     from mesh.agent.validators import AnnouncedValidator
     from mesh.content import Store
     from mesh.network import Channel, Network

@@ -7,7 +7,7 @@ import logging
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from mesh.agent.orders import TermsWriter
+from mesh.agent.terms import TermsWriter
 from mesh.chain import OrderAlreadyUsed
 from mesh.errors import AiraError
 from mesh.log_context import log_event

@@ -179,7 +179,7 @@ async def _confirm(reasons: str, *, confirmed: bool, quiet: bool) -> None:
 
 async def _block_time(chain: Chain) -> float | None:
     """Seconds between the latest blocks; None if that is not known."""
-    from mesh.agent.orders import MEASURED_BLOCKS
+    from mesh.agent.terms import MEASURED_BLOCKS
 
     try:
         return await chain.node.heads.block_time(MEASURED_BLOCKS)

@@ -56,7 +56,7 @@ async def _equal(
     agent: Agent, objective: str, *, cost: int, validator: str = "", validator_fee: int
 ) -> tuple[list[Order], Contract | None]:
     """The open demands with these terms, and the latest contract of one if it has not ended."""
-    from mesh.agent.orders import is_repeated
+    from mesh.agent.terms import is_repeated
     from schemas import Demand, decode
 
     fields: dict[str, Any] = {"model": agent.model, "objective": objective, "cost": cost, "validator": validator}

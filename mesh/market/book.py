@@ -43,6 +43,8 @@ class Refusal(StrEnum):
     """The book is full; try again later."""
     WITHDRAWN = "withdrawn"
     """Its maker has withdrawn it."""
+    REPLACED = "replaced"
+    """Its maker has signed it again, or another version of it has become a contract."""
     BLOCKED = "blocked"
     """Its maker is blocked; this is not published."""
 

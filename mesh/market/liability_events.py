@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mesh.chain import BlockEvents, Chain
     from mesh.market.book import OrderBook
     from mesh.market.earnings import EarningsLedger
+    from mesh.market.versions import OrderVersions
     from mesh.market.withdrawals import Withdrawals
     from schemas import Liability, Verified
 
@@ -52,6 +53,7 @@ class LiabilityEvents:
         lighthouse: str,
         *,
         book: OrderBook,
+        versions: OrderVersions,
         withdrawals: Withdrawals,
         earnings: EarningsLedger,
         head: int,
@@ -69,6 +71,7 @@ class LiabilityEvents:
         self._chain = chain
         self._lighthouse = lighthouse
         self._book = book
+        self._versions = versions
         self._withdrawals = withdrawals
         self._earnings = earnings
         self._forget = forget
@@ -155,6 +158,8 @@ class LiabilityEvents:
         for digest, signer in zip(order_hashes, (liability.promisee, liability.promisor), strict=True):
             self.parties.add(signer)
             identity = digest + address_bytes(signer)
+            if (newest := self._versions.use(identity, liability.address)) is not None:
+                self._book.remove(newest)
             order = self._book.remove(identity) or self.unconfirmed.get(identity)
             if order is not None:
                 self.unconfirmed.created(liability.address, block, order)
@@ -172,6 +177,7 @@ class LiabilityEvents:
         for creation in created:
             self._earnings.creation_reverted(creation.liability, creation.tx)
             self.open.pop(creation.liability, None)
+            self._versions.free(creation.liability)
             again += self.unconfirmed.reverted(creation.liability, Demand, Offer)
         for end in finalized:
             self._earnings.reverted(end.tx)

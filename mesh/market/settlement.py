@@ -21,6 +21,7 @@ from mesh.market.funding import Commitments, UnfundedOrders, creation_stakes
 from mesh.market.judgements import ResultSettlement
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
 from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
+from mesh.market.versions import OrderVersions
 from mesh.market.withdrawals import withdrawn_id
 from schemas import Result
 
@@ -41,7 +42,7 @@ log = logging.getLogger(__name__)
 
 
 class MatchWithdrawn(ChainError, code="match-withdrawn"):
-    """An order of a match was withdrawn, or its signer blocked, before a transaction was sent: none is created."""
+    """An order of a match was withdrawn or replaced, or its signer blocked, before a transaction was sent."""
 
 
 class Settlement:
@@ -80,10 +81,12 @@ class Settlement:
         self._withdrawals = withdrawals
         self._drops = drops
         self.rejections: Final = RejectionPublisher(channel, chain.account, earnings, drops)
+        self._versions = OrderVersions()
         self.events: Final = LiabilityEvents(
             chain,
             channel.address,
             book=book,
+            versions=self._versions,
             withdrawals=withdrawals,
             earnings=earnings,
             head=head,
@@ -120,6 +123,8 @@ class Settlement:
         if order.signer in self.blocked:
             self._drop_blocked(order)
             return Refusal.BLOCKED
+        if (replaced := self._versions.note(order)) is not None:
+            self._book.remove(replaced)
         outcome = self._refusal(order) or self._book.add(order)
         for evicted in outcome.evicted if isinstance(outcome, Added) else ():
             self._drops.count("book-full", evicted.signer)
@@ -132,10 +137,12 @@ class Settlement:
             self.events.unconfirmed.begin(*outcome)
             self._tasks.create_task(self._create(outcome))
         elif isinstance(outcome, Refusal):
-            if outcome is not Refusal.DUPLICATE:
+            # A withdrawal that is not on the disk is no promise yet.
+            is_forgettable = outcome is Refusal.WITHDRAWN and not self._withdrawals.is_kept(order_id(order))
+            if outcome is not Refusal.DUPLICATE and not is_forgettable:
                 self.rejections.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
             if outcome not in (Refusal.DUPLICATE, Refusal.WITHDRAWN):
-                self._forget(order, after=self._pause if outcome is Refusal.FULL else 0.0)
+                self._forget(order, after=self._pause if outcome in (Refusal.FULL, Refusal.REPLACED) else 0.0)
             return outcome
         return None
 
@@ -163,7 +170,9 @@ class Settlement:
             return Refusal.DUPLICATE
         if order in self.events.unconfirmed:
             return Refusal.DUPLICATE
-        return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None
+        if order_id(order) in self._withdrawals:
+            return Refusal.WITHDRAWN
+        return Refusal.REPLACED if self._versions.is_replaced(order_id(order)) else None
 
     def withdraw(self, withdrawal: Verified[Withdrawal]) -> None:
         """Honour a withdrawal: its order leaves the book, and is refused until its deadline.
@@ -221,15 +230,14 @@ class Settlement:
     def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
         """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`.
 
-        The latter if an order is withdrawn or of a blocked signer, and no earlier attempt may still be mined.
+        The latter if an order is withdrawn, replaced or of a blocked signer, and no earlier attempt may still be mined.
         """
         may_be_sent = False
 
         async def attempt() -> Created:
             nonlocal may_be_sent
-            is_taken_back = any(order_id(one) in self._withdrawals or one.signer in self.blocked for one in match)
-            if is_taken_back and not may_be_sent:
-                raise MatchWithdrawn("an order was withdrawn before its contract was created, or its signer blocked")
+            if not may_be_sent and (self._is_taken_back(match.demand) or self._is_taken_back(match.offer)):
+                raise MatchWithdrawn("an order was withdrawn or replaced before its contract was created")
             try:
                 return await self._chain.liabilities.create(self._lighthouse, match.demand.message, match.offer.message)
             except (NodeUnreachable, TransactionTimeout):
@@ -237,6 +245,11 @@ class Settlement:
                 raise
 
         return attempt
+
+    def _is_taken_back(self, order: Verified[Order]) -> bool:
+        identity = order_id(order)
+        is_replaced = identity in self._withdrawals or self._versions.is_replaced(identity)
+        return is_replaced or order.signer in self.blocked
 
     def _put_back(self, match: Match) -> None:
         """No transaction of a match waits any more: put its orders back into the book unless they were used."""

@@ -10,7 +10,7 @@ import pytest
 
 from mesh.agent import OrderClosed, OrderState
 from mesh.agent.listener import ChainListener
-from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, default_lifetime
+from mesh.agent.terms import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, default_lifetime
 from mesh.chain import BlockHeader, InsufficientTokens
 from mesh.chain.answers import Count, Word
 from mesh.chain.heads import Heads

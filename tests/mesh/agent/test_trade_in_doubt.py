@@ -9,6 +9,8 @@ import pytest
 from msgspec.structs import replace
 
 from mesh.agent import Agent, LiabilityReverted, OrderExpired, Progress
+from mesh.agent.orders import OrderState
+from mesh.agent.terms import REPEATED
 from mesh.chain import Chain, Timing
 from mesh.chain.liabilities import Liabilities
 from mesh.chain.validators import Validators
@@ -298,3 +300,29 @@ async def test_an_offer_that_can_not_be_signed_again_does_not_stop_the_agent(
             await robot.offer(objective=again)
             assert (await person.demand(again)).liability.promisor == place.address("robot")
     await place.chains["person"].tokens.transfer(place.address("robot"), 5)
+
+
+async def test_an_earlier_version_of_an_order_that_a_reorganisation_makes_valid_is_that_order(place: Place) -> None:
+    """Generation 5: the order was signed again, because the contract of another one had used its nonce."""
+    robot, provider = place.market.accounts["robot"], place.chains["provider"]
+    lighthouse = place.market.deployment.lighthouse
+
+    async def create(demand: Demand | Offer) -> None:
+        assert isinstance(demand, Demand)
+        ours = {field: getattr(demand, field) for field in (*REPEATED, "deadline")}
+        nonce = await provider.liabilities.next_nonce(robot.address)
+        offer = robot.signer.sign(Offer(**ours | {"sender": robot.address}, nonce=nonce, lighthouse_fee=0))
+        await provider.liabilities.create(lighthouse, demand, offer)
+
+    async with place.agent("person", generation=5) as person:
+        order = await person.order(OBJECTIVE, cost=7)
+        other = await person.order(OBJECTIVE, cost=8)
+        earlier, blocks = order.message, await provider.block_number()
+        await create(other.message)
+        await until(lambda: order.hash not in {one.hash for one in person.orders()})
+        await place.forget_blocks(await provider.block_number() - blocks)
+        await until(lambda: other.hash in {one.hash for one in person.orders()})
+        await create(earlier)
+        contract = await asyncio.wait_for(order.contract(), 60)
+        assert (await provider.liabilities.order_hashes(contract.address))[0].hex() == message_hash(earlier).hex()
+        await until(lambda: [one.message.cost for one in person.orders(OrderState.OPEN)] == [8])

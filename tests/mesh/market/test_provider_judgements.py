@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 REFUND_DELAY = 12
 COST = 5
+LAST_BLOCK = 1_000_000
 FEE = 7
 OTHER_RECORDING = cid_of_bytes(b"another recording")
 FLOOD = 1_500
@@ -71,6 +72,7 @@ class Court:
         offer_author: dict[str, Any] = {}
         if generation == 5:
             demand_author, offer_author = await self._author("person"), await self._author("robot")
+            offer_author["deadline"] = demand_author["deadline"] = LAST_BLOCK - provider.earnings().created
         demand = self.local.demand(cost=COST, validator=validator, validator_fee=FEE, **demand_author)
         before = provider.earnings().created
         self.local.publish(demand, self.local.offer(cost=COST, validator=validator, **offer_author))

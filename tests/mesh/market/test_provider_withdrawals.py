@@ -106,6 +106,18 @@ async def test_withdrawals_survive_a_restart(local: LocalMarket, tmp_path: Path)
         assert await local.liabilities_of(demand) == []
 
 
+async def test_a_withdrawal_that_is_not_on_the_disk_is_not_promised(local: LocalMarket, tmp_path: Path) -> None:
+    path, demand = tmp_path / "withdrawals.sqlite", local.demand()
+    path.write_bytes(b"not a database, however you look at it" * 100)
+    async with local.provider(withdrawals=path) as provider:
+        local.publish(withdrawal := withdrawal_of(local, demand))
+        await until(lambda: withdrawn_id(verify_message(withdrawal)) in provider.withdrawals)
+        assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
+        local.publish(known := local.demand(cost=2**200))
+        await local.rejection_of(known)
+        assert local.rejected_makers.keys() == {verify_message(known).hash.hex()}
+
+
 async def test_a_provider_that_starts_later_learns_withdrawals_from_others(local: LocalMarket) -> None:
     async with local.provider():
         demand = local.demand()

@@ -1,0 +1,84 @@
+"""The versions of an order of generation 5: orders that differ in their nonce only.
+
+When another order of an account has used a nonce, the account signs its open orders with that nonce again. A
+reorganisation may free the nonce: then the older version would be valid again, and after it the newer one. A provider
+settles the newest version only, and none once another version has become a contract.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from msgspec.structs import replace
+
+from mesh.flood import BoundedDict
+from mesh.market.book import order_id
+from schemas import address_bytes, message_hash
+
+if TYPE_CHECKING:
+    from mesh.market.book import Order
+    from schemas import Verified
+
+LIMIT: Final = 32_768
+"""Orders that are remembered, at most."""
+
+
+class _Newest(NamedTuple):
+    nonce: int
+    identity: bytes
+
+
+def is_counted(order: Order) -> bool:
+    """Whether the nonce of an order counts its maker's orders."""
+    return order.generation == 5
+
+
+class OrderVersions:
+    """The versions of the orders that a provider has seen; the last `limit` of them."""
+
+    def __init__(self, *, limit: int = LIMIT) -> None:
+        self._keys: BoundedDict[bytes, bytes] = BoundedDict(limit)
+        """Of each version (identity) what it is a version of."""
+        self._newest: BoundedDict[bytes, _Newest] = BoundedDict(limit)
+        self._used: BoundedDict[bytes, bytes] = BoundedDict(limit)
+        """The version that has become a contract."""
+        self._contracts: BoundedDict[str, tuple[bytes, ...]] = BoundedDict(limit)
+        """What each contract (address) is of."""
+
+    def note(self, order: Verified[Order]) -> bytes | None:
+        """Remember an order. Returns the identity of the version that it replaces, if that was the newest."""
+        if not is_counted(order.message):
+            return None
+        identity, nonce = order_id(order), int(order.message.nonce)
+        key = self._keys.get(identity)
+        if key is None:
+            key = message_hash(replace(order.message, nonce=0)) + address_bytes(order.signer)
+            self._keys[identity] = key
+        before = self._newest.get(key)
+        if before is not None and before.nonce >= nonce:
+            return None
+        self._newest[key] = _Newest(nonce, identity)
+        return None if before is None else before.identity
+
+    def is_replaced(self, identity: bytes) -> bool:
+        """Whether there is a newer version of an order, or another one has become a contract."""
+        key = self._keys.get(identity)
+        if key is None:
+            return False
+        newest = self._newest.get(key)
+        return self._used.get(key, identity) != identity or (newest is not None and newest.identity != identity)
+
+    def use(self, identity: bytes, liability: str) -> bytes | None:
+        """A version became the contract at an address. Returns the identity of the newest one, if that is another."""
+        key = self._keys.get(identity)
+        if key is None:
+            return None
+        self._used[key] = identity
+        self._contracts[liability] = (*self._contracts.get(liability, ()), key)
+        newest = self._newest.get(key)
+        return None if newest is None or newest.identity == identity else newest.identity
+
+    def free(self, liability: str) -> None:
+        """A reorganisation reverted the contract at an address."""
+        for key in self._contracts.pop(liability, ()):
+            self._used.pop(key, None)
