@@ -105,9 +105,13 @@ class Audit:
             for order in person.orders
             if order.order and order.is_dead
         }
+        makers: dict[object, str] = {}
         async with Chain(node, ens=self._market.deployed.market.deployment.ens) as chain:
             for address in self.liabilities():
                 demand, _ = await chain.liabilities.order_hashes(address)
+                maker = self._market.steps.demands.get(demand.hex())
+                if maker is not None and (other := makers.setdefault(maker, address)) != address:
+                    self._market.violated("ordered-twice", f"{maker[0].name}'s job {maker[1]}: {other} and {address}")
                 if (believed := dead.get(demand.hex())) is not None and not self._chain.reorganisations:
                     self._market.violated("promise-broken", f"{believed.person} was told {believed.told!r}; {address}")
                 record = await chain.liabilities.get(address)

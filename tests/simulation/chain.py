@@ -6,6 +6,7 @@ Each process reaches it through a node of its own, which may be slow, silent or 
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -25,7 +26,7 @@ from tests.simulation.threads import scheduler
 
 if TYPE_CHECKING:
     import random
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from mesh.chain import ChainEvent
     from tests.simulation.model import ModelChain
@@ -96,6 +97,10 @@ class EvmChain(Evm):
         """A signed transaction. Raises `RpcError`."""
         return read_transaction(raw)
 
+    def mine_together(self, raws: Sequence[bytes]) -> set[bytes]:
+        """Not here: the embedded EVM has one transaction in a block."""
+        raise NotImplementedError
+
 
 class SimulatedChain:
     """The chain that all nodes show. `began` is the height at which the history began."""
@@ -106,8 +111,9 @@ class SimulatedChain:
         self.instant = True
         """Mine each transaction at once, as while the contracts are deployed."""
         self.pool: dict[tuple[bytes, int], PooledTransaction] = {}
-        self.mined: dict[int, PooledTransaction] = {}
-        """By block: there is one transaction in a block at most."""
+        self.mined: dict[int, list[PooledTransaction]] = {}
+        """By block."""
+        self.most_in_block = 1
         self.faults = MiningFaults()
         self.began = 0
         self.reorganisations = 0
@@ -186,7 +192,7 @@ class SimulatedChain:
         return hash_
 
     def mine(self) -> None:
-        """Mine what the pool has, a block for each transaction; an empty block if there is none."""
+        """Mine what the pool has, with `most_in_block` transactions in a block; an empty block if there is none."""
         self._cache.clear()
         if not self._mine_pool():
             self.evm.mine(1)
@@ -200,8 +206,11 @@ class SimulatedChain:
             return
         head = self.evm.head
         self.evm.rewind(head - depth)
-        for number in sorted(number for number in self.mined if number > head - depth):
-            transaction = self.mined.pop(number)
+        for transaction in [
+            one
+            for number in sorted(number for number in self.mined if number > head - depth)
+            for one in self.mined.pop(number)
+        ]:
             if not self.faults.draw("transaction-forgotten", forget):
                 self.pool.setdefault((transaction.sender, transaction.nonce), transaction)
         self.reorganisations += 1
@@ -212,10 +221,11 @@ class SimulatedChain:
         self.on_block()
 
     def _mine_pool(self) -> bool:
-        chance, mined = scheduler().random, False
+        chance, chosen, expected = scheduler().random, list[PooledTransaction](), dict[bytes, int]()
         waiting = sorted(self.pool.values(), key=lambda one: (one.sender, one.nonce))
         chance.shuffle(waiting)
         waiting.sort(key=lambda one: one.nonce)  # stable: of each sender in order
+        head = self.evm.head
         for one in waiting:
             if self.faults.draw("transaction-forgotten", self.faults.forget):
                 del self.pool[one.sender, one.nonce]
@@ -224,19 +234,29 @@ class SimulatedChain:
                 continue
             if one.price < self.evm.base_fee * self.faults.price_factor:
                 continue
-            expected = self.evm.nonce(one.sender, self.evm.head)
-            if one.nonce != expected:
-                if one.nonce < expected:
+            nonce = expected.setdefault(one.sender, self.evm.nonce(one.sender, self.evm.head))
+            if one.nonce != nonce:
+                if one.nonce < nonce:
                     del self.pool[one.sender, one.nonce]
                 continue
             del self.pool[one.sender, one.nonce]
-            try:
-                self.evm.send(one.raw)
-            except RpcError:
-                continue
-            self.mined[self.evm.head] = one
-            mined = True
-        return mined
+            expected[one.sender] += 1
+            chosen.append(one)
+            if len(chosen) == self.most_in_block:
+                self._mine_block(chosen)
+                chosen, expected = [], {}
+        if chosen:
+            self._mine_block(chosen)
+        return self.evm.head > head
+
+    def _mine_block(self, chosen: list[PooledTransaction]) -> None:
+        if self.most_in_block > 1:
+            hashes = self.evm.mine_together([one.raw for one in chosen])
+            self.mined[self.evm.head] = [one for one in chosen if one.hash in hashes]
+            return
+        with suppress(RpcError):
+            self.evm.send(chosen[0].raw)
+            self.mined[self.evm.head] = chosen
 
     def _next_nonce(self, sender: bytes) -> int:
         nonce = self.evm.nonce(sender, self.evm.head)

@@ -22,6 +22,12 @@ ENDPOINT: Final = "tcp/127.0.0.1:7447"
 JOBS: Final = 6
 """Jobs in a history, at most; with more, it is a long one."""
 BLOCK_SECONDS: Final = 6.0
+CROWDED_JOBS: Final = 100
+"""From so many jobs on, people have several orders open at a time."""
+AT_ONCE: Final = {3: (10, 30), 5: (2, 4)}
+"""How many, each, at least and at most. In generation 5, an account's orders become contracts one after the other."""
+FULL_BLOCK: Final = 100
+"""Transactions in a block of a crowded market, at most."""
 LONG_BLOCK_SECONDS: Final = 12.0
 """In long histories: as on Ethereum."""
 TIMING: Final = Timing(poll_interval=3.0, receipt_interval=1.0, replace_after=30.0)
@@ -71,9 +77,13 @@ class MarketPlan:
     nodes: int = 1
     """How many each process knows."""
     people: int = PEOPLE
+    at_once: int = 1
+    """The most orders that a person has open at a time."""
     pause: float = PAUSES[0]
     step_ns: int = STEPS_NS[0]
     block_seconds: float = BLOCK_SECONDS
+    most_in_block: int = 1
+    """The most transactions in a block."""
     jurors: int = 0
     """How many a validator has, which all demands name; a majority must agree."""
 
@@ -85,6 +95,7 @@ class MarketPlan:
             "two-providers": self.providers > 1,
             "two-nodes": self.nodes > 1,
             "more-people": self.people > PEOPLE,
+            "crowded": self.at_once > 1,
             "long-pauses": self.pause > PAUSES[0],
             "long-jobs": self.step_ns > STEPS_NS[0],
             "validated": self.jurors > 0,
@@ -102,7 +113,12 @@ def market_plan(seed: int, jobs: int = JOBS) -> MarketPlan:
     if jobs <= JOBS:
         return plan
     people, pause, step_ns = chance.randint(PEOPLE, MOST_PEOPLE), chance.choice(PAUSES), chance.choice(STEPS_NS)
-    return replace(plan, people=people, pause=pause, step_ns=step_ns, block_seconds=LONG_BLOCK_SECONDS)
+    plan = replace(plan, people=people, pause=pause, step_ns=step_ns, block_seconds=LONG_BLOCK_SECONDS)
+    if jobs < CROWDED_JOBS:
+        return plan
+    # Robots do one job at a time: with long ones they would have too much to do.
+    at_once = random.Random(f"at once {seed}").randint(*AT_ONCE[plan.generation])
+    return replace(plan, at_once=at_once, step_ns=STEPS_NS[0], most_in_block=FULL_BLOCK)
 
 
 def found(chain: SimulatedChain, scheduler: Scheduler, *, jurors: int = 0) -> Deployed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import random
 import shutil
@@ -62,7 +63,7 @@ def plan_of(
 ) -> FaultPlan:
     """The faults of a seed, of some kinds `only`, or `without` some. In long histories they last longer."""
     plan = choose(random.Random(f"faults {seed}"), only=only, without=without)
-    plan.lasts *= max(1.0, jobs / JOBS)
+    plan.lasts *= max(1.0, jobs / JOBS / market_plan(seed, jobs).at_once)
     return plan
 
 
@@ -114,7 +115,7 @@ def _play(market: Market, plan: FaultPlan) -> None:
     faults = Faults(market, plan)
     market.begin()
     faults.start()
-    most = max(person.wanted for person in market.people)
+    most = math.ceil(max(person.wanted for person in market.people) / market.plan.at_once)
     pause = market.plan.pause - PAUSES[0]
     chaos = plan.lasts or (CHAOS_SECONDS + pause) * most
     scheduler.run(

@@ -77,6 +77,7 @@ class Market:
         self.steps = StepAudit(self)
         self.router.tap = self.steps.sent
         self.deployed.chain.on_block = self.steps.block
+        self.deployed.chain.most_in_block = self.plan.most_in_block
 
     def begin(self) -> None:
         """Start everything."""

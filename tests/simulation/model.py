@@ -6,7 +6,8 @@ It has no gas of its own: each transaction takes what `gas_of` says, whatever th
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, Final
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
 from coincurve import PrivateKey
@@ -38,6 +39,18 @@ BASE_FEE: Final = 10**9
 CREATED: Final = (ModelToken, ModelNames, ModelResolver, ModelFactory, ModelJury)
 
 
+class _Applied(NamedTuple):
+    """A transaction in a block, and what it did."""
+
+    one: ModelTransaction
+    logs: tuple[ModelLog, ...]
+    status: int
+    created: bytes
+    """The address of the contract that it made, if it made one."""
+    gas: int
+    price: int
+
+
 class ModelChain:
     """The chain. Heights are block numbers; amounts are wei."""
 
@@ -58,7 +71,7 @@ class ModelChain:
         self._logs: dict[int, list[dict[str, Any]]] = {}
         accounts = [_address_of(key) for key in funded_keys]
         self._state.apply(0, {(account, "wei"): FUNDS_WEI for account in accounts})
-        self._add_block(None, 0)
+        self._add_block()
 
     def height(self, tag: object) -> int:
         """The block number behind a tag (`latest`, …) or a number. Raises `RpcError` for a missing block."""
@@ -139,7 +152,7 @@ class ModelChain:
     def mine(self, blocks: int) -> None:
         """Mine empty blocks."""
         for _ in range(blocks):
-            self._add_block(None, 0)
+            self._add_block()
 
     def rewind(self, height: int) -> None:
         """Remove all blocks after one."""
@@ -156,8 +169,22 @@ class ModelChain:
     def send(self, raw: bytes) -> bytes:
         """Apply a signed transaction and mine its block; its hash. Raises `RpcError` for one that no block can hold."""
         one = read_transaction(raw)
-        self._check(one)
-        run = self._run(self.head)
+        self._add_block([self._apply(one, follows=False)])
+        return one.hash
+
+    def mine_together(self, raws: Sequence[bytes]) -> set[bytes]:
+        """Mine one block of signed transactions, without those that it can't hold; the hashes of the others."""
+        applied: list[_Applied] = []
+        for raw in raws:
+            with suppress(RpcError):
+                applied.append(self._apply(read_transaction(raw), follows=bool(applied)))
+        self._add_block(applied)
+        return {each.one.hash for each in applied}
+
+    def _apply(self, one: ModelTransaction, *, follows: bool) -> _Applied:
+        """Apply a transaction in the next block. Raises `RpcError`."""
+        self._check(one, self.head + follows)
+        run = ModelRun(self._state, self.head, self.chain_id, follows=follows)
         status, created, gas = 1, b"", gas_of(one.to, one.data)
         try:
             if gas > one.gas:
@@ -168,16 +195,14 @@ class ModelChain:
                 created = self._create(run, one.sender, one.data)
         except ModelRevert:
             status, gas = 0, min(gas, one.gas)
-            run = self._run(self.head)
+            run = ModelRun(self._state, self.head, self.chain_id, follows=follows)
         price = min(one.price, self.base_fee + one.priority)
         run.set(one.sender, "sent", one.nonce + 1)
         run.set(one.sender, "wei", run.get(one.sender, "wei") - gas * price - (one.value if status else 0))
         if status and one.value:
             run.set(one.to, "wei", run.get(one.to, "wei") + one.value)
         self._state.apply(self.head + 1, run.writes)
-        self._add_block(one, gas, run.logs if status else [])
-        self._remember(one, run, status=status, created=created, gas=gas, price=price)
-        return one.hash
+        return _Applied(one, tuple(run.logs) if status else (), status, created, gas, price)
 
     def read(self, raw: bytes) -> ModelTransaction:
         """A signed transaction. Raises `RpcError`."""
@@ -186,16 +211,16 @@ class ModelChain:
     def _run(self, height: int) -> ModelRun:
         return ModelRun(self._state, height, self.chain_id)
 
-    def _check(self, one: ModelTransaction) -> None:
+    def _check(self, one: ModelTransaction, height: int) -> None:
         if one.hash in self._receipts:
             raise RpcError(SERVER_ERROR, "already known")
         if one.gas > GAS_LIMIT:
             raise RpcError(SERVER_ERROR, "exceeds block gas limit")
-        expected = self.nonce(one.sender, self.head)
+        expected = self.nonce(one.sender, height)
         if one.nonce != expected:
             which = "low" if one.nonce < expected else "high"
             raise RpcError(SERVER_ERROR, f"nonce too {which}: next nonce {expected}, tx nonce {one.nonce}")
-        funds, wanted = self.balance(one.sender, self.head), one.gas * one.price + one.value
+        funds, wanted = self.balance(one.sender, height), one.gas * one.price + one.value
         if wanted > funds:
             raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
         if one.price < self.base_fee:
@@ -212,14 +237,16 @@ class ModelChain:
                 return address
         raise ModelRevert
 
-    def _add_block(self, one: ModelTransaction | None, gas: int, logs: Sequence[ModelLog] = ()) -> None:
+    def _add_block(self, applied: Sequence[_Applied] = ()) -> None:
+        hashes, gas = [each.one.hash for each in applied], sum(each.gas for each in applied)
+        logs = [log for each in applied for log in each.logs]
         self.head += 1
         parent = self._blocks[-1] if self._blocks else None
         when = int(time.time())
         if parent is not None:
             when = max(when, int(parent["timestamp"], 16))
         parent_hash = "0x" + bytes(32).hex() if parent is None else str(parent["hash"])
-        seed = f"{parent_hash} {self.head} {when} {one.hash.hex() if one else ''}"
+        seed = f"{parent_hash} {self.head} {when} {b''.join(hashes).hex()}"
         hash_ = "0x" + keccak256(seed.encode()).hex()
         self._blocks.append(
             {
@@ -232,8 +259,8 @@ class ModelChain:
                 "gasUsed": hex(gas),
                 "miner": "0x" + bytes(20).hex(),
                 "logsBloom": f"0x{bloom_of(logs):0512x}",
-                "transactionsRoot": "0x" + (NO_TRANSACTIONS if one is None else keccak256(one.hash)).hex(),
-                "transactions": [] if one is None else ["0x" + one.hash.hex()],
+                "transactionsRoot": "0x" + (keccak256(b"".join(hashes)) if hashes else NO_TRANSACTIONS).hex(),
+                "transactions": ["0x" + hash_.hex() for hash_ in hashes],
             }
         )
         self._by_hash[hash_] = self.head
@@ -241,12 +268,13 @@ class ModelChain:
         change = self.base_fee * abs(gas - target) // target // 8
         self.base_fee += max(change, 1) if gas > target else -change
         self._base_fees.append(self.base_fee)
+        for index, each in enumerate(applied):
+            self._remember(each, index)
 
-    def _remember(
-        self, one: ModelTransaction, run: ModelRun, *, status: int, created: bytes, gas: int, price: int
-    ) -> None:
-        hash_, block = "0x" + one.hash.hex(), self._blocks[-1]
-        where = {"blockNumber": block["number"], "blockHash": block["hash"], "transactionIndex": "0x0"}
+    def _remember(self, applied: _Applied, index: int) -> None:
+        one, block, earlier = applied.one, self._blocks[-1], self._logs.get(self.head, [])
+        hash_ = "0x" + one.hash.hex()
+        where = {"blockNumber": block["number"], "blockHash": block["hash"], "transactionIndex": hex(index)}
         to = "0x" + one.to.hex() if one.to else None
         mined = {"transactionHash": hash_, "removed": False} | where
         logs = [
@@ -257,18 +285,18 @@ class ModelChain:
                 "logIndex": hex(index),
             }
             | mined
-            for index, (address, topics, data) in enumerate(run.logs if status else ())
+            for index, (address, topics, data) in enumerate(applied.logs, len(earlier))
         ]
         sender = "0x" + one.sender.hex()
         self._receipts[one.hash] = where | {
             "transactionHash": hash_,
             "from": sender,
             "to": to,
-            "contractAddress": "0x" + created.hex() if created else None,
-            "status": hex(status),
-            "gasUsed": hex(gas),
-            "cumulativeGasUsed": hex(gas),
-            "effectiveGasPrice": hex(price),
+            "contractAddress": "0x" + applied.created.hex() if applied.created else None,
+            "status": hex(applied.status),
+            "gasUsed": hex(applied.gas),
+            "cumulativeGasUsed": hex(applied.gas),
+            "effectiveGasPrice": hex(applied.price),
             "type": "0x2",
             "logs": logs,
             "logsBloom": block["logsBloom"],
@@ -283,12 +311,12 @@ class ModelChain:
             "gas": hex(one.gas),
             "maxFeePerGas": hex(one.price),
             "maxPriorityFeePerGas": hex(one.priority),
-            "gasPrice": hex(price),
+            "gasPrice": hex(applied.price),
             "type": "0x2",
             "chainId": hex(self.chain_id),
         }
         if logs:
-            self._logs[self.head] = logs
+            self._logs[self.head] = earlier + logs
 
 
 def bloom_of(logs: Sequence[ModelLog]) -> int:

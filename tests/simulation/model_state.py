@@ -51,15 +51,18 @@ class ModelState:
 
 
 class ModelRun:
-    """One transaction or call, in the block after `height`. What it writes counts once it is applied."""
+    """One transaction or call, in the block after `height`. What it writes counts once it is applied.
 
-    def __init__(self, state: ModelState, height: int, chain_id: int) -> None:
+    With `follows`, it sees what earlier transactions of its block have done.
+    """
+
+    def __init__(self, state: ModelState, height: int, chain_id: int, *, follows: bool = False) -> None:
         self.block = height + 1
         self.chain_id = chain_id
         self.writes: dict[Cell, Any] = {}
         self.logs: list[tuple[bytes, list[bytes], bytes]] = []
         self._state = state
-        self._height = height
+        self._height = height + follows
 
     def get(self, *cell: Any, default: Any = 0) -> Any:
         """The value of a cell."""

@@ -393,9 +393,9 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "a nonce that a reorganisation freed is left to others",
-        "mesh.chain.confirmation:Confirmation._unblock",
-        "await self._fill(nonce)",
-        "pass",
+        "mesh.chain.submission:Resubmission._use_nonces",
+        "not await self._fill(nonce, waiting, was_missing=was_missing)",
+        "True",
         REORGANISATIONS + ",crash_every,leave_out",
         seeds=100,
     ),

@@ -28,9 +28,11 @@ if TYPE_CHECKING:
 
     from mesh.agent import Contract
     from mesh.market.book import Match
+    from schemas import Demand
     from tests.simulation.market import Market
 
 
+CENT: Final = XRT // 100
 REFUND_CHECK: Final = 20.0
 """Seconds after which people look again whether they can take a cost back."""
 
@@ -234,7 +236,7 @@ class JurorRole(Role):
 
 
 class PersonRole(Role):
-    """A person who wants some jobs done, one after the other."""
+    """A person who wants some jobs done: one after the other, or some at a time."""
 
     agent: Agent | None = None
 
@@ -245,10 +247,11 @@ class PersonRole(Role):
         self.listed: set[str] = set()
         """The orders (hashes) that the agent of this start has listed."""
         self.has_begun = False
+        self._revoking: asyncio.Future[None] | None = None
 
     def start(self) -> None:
         """Start the process."""
-        self.listed, self.has_begun = set(), False
+        self.listed, self.has_begun, self._revoking = set(), False, None
         super().start()
 
     @property
@@ -259,7 +262,11 @@ class PersonRole(Role):
     @property
     def is_done(self) -> bool:
         """Whether the person wants nothing more."""
-        return len(self.orders) >= self.wanted and self.orders[-1].is_over
+        return len(self.orders) >= self.wanted and all(order.is_over for order in reversed(self.orders))
+
+    def number_of(self, demand: Demand) -> int:
+        """Which of the orders a demand of this person is: of several at a time, the cost tells."""
+        return demand.cost % CENT if self.market.plan.at_once > 1 else len(self.orders) - 1
 
     async def main(self) -> None:
         """Take up what was ordered before a crash, then order the jobs that are left."""
@@ -275,14 +282,27 @@ class PersonRole(Role):
                     taking_back.cancel()
 
     async def _live(self, agent: Agent) -> None:
-        chance = self.market.scheduler.random
-        if self.orders and not self.orders[-1].is_over:
-            await self._finish(agent, self.orders[-1], self._take_up(agent, self.orders[-1]))
+        """Finish what was ordered, and order the jobs that are left, each of some tasks one after the other."""
+        begun = [order for order in self.orders if not order.is_over]
+        missing = self.market.plan.at_once - len(begun)
+        first, *others = (self._order_jobs(agent, order) for order in (*begun, *(missing * [None])))
+        if others:
+            await asyncio.gather(first, *others)
+        else:
+            await first
+
+    async def _order_jobs(self, agent: Agent, begun: Ordered | None) -> None:
+        chance, plan = self.market.scheduler.random, self.market.plan
+        if begun is not None:
+            await self._finish(agent, begun, self._take_up(agent, begun))
         while len(self.orders) < self.wanted:
-            await asyncio.sleep(chance.uniform(0.1, self.market.plan.pause))
-            wanted = Ordered(self.name, len(self.orders), cost=chance.randint(1, 50) * XRT)
-            self.orders.append(wanted)
-            await self._finish(agent, wanted, self._order(agent, wanted))
+            await asyncio.sleep(chance.uniform(0.1, plan.pause))
+            number = len(self.orders)
+            if number < self.wanted:  # another task may have ordered the last one
+                units = chance.randint(1, 50)
+                wanted = Ordered(self.name, number, units * CENT + number if plan.at_once > 1 else units * XRT)
+                self.orders.append(wanted)
+                await self._finish(agent, wanted, self._order(agent, wanted))
         await asyncio.Event().wait()
 
     async def _order(self, agent: Agent, wanted: Ordered) -> Contract:
@@ -300,7 +320,7 @@ class PersonRole(Role):
         )
         wanted.order, wanted.told = order.hash, "ordered"
         wanted.posted, wanted.deadline = self.market.deployed.chain.evm.head, order.message.deadline
-        if draw("allowance-revoked", self.market.revoked):
+        if draw("allowance-revoked", self.market.revoked) and (self._revoking is None or self._revoking.done()):
             self._revoking = asyncio.ensure_future(self._revoke(agent))
         if draw("order-withdrawn", self.market.withdrawn):
             await asyncio.sleep(chance.uniform(0.1, 20))
@@ -311,13 +331,15 @@ class PersonRole(Role):
         return await order.contract()
 
     async def _revoke(self, agent: Agent) -> None:
-        """Take the factory's allowance away for a while: providers then reject the order, which is still valid."""
+        """Take the factory's allowance away for a while: providers then reject orders, which are still valid."""
         chain, chance = agent.parts.chain, self.market.scheduler.random
         with suppress(AiraError):
             allowed = await chain.tokens.allowance(self.account.address, chain.factory)
             await chain.tokens.approve(chain.factory, 0)
             self.market.trace(self.name, "revoked", allowance=allowed)
             await asyncio.sleep(chance.uniform(1, 60))
+            if self.market.plan.at_once > 1:  # the agent may have approved more for other orders
+                allowed = max(allowed, await chain.tokens.allowance(self.account.address, chain.factory))
             await chain.retrying(lambda: chain.tokens.approve(chain.factory, allowed))
 
     async def _take_up(self, agent: Agent, wanted: Ordered) -> Contract:
@@ -326,7 +348,8 @@ class PersonRole(Role):
             return await agent.contract(wanted.contract)
         known = {order.order for order in self.orders if order is not wanted}
         for order in agent.orders(OrderState.OPEN, OrderState.WITHDRAWN):
-            if order.kind == "demand" and order.hash not in known:
+            is_it = self.market.plan.at_once == 1 or order.message.cost == wanted.cost
+            if order.kind == "demand" and order.hash not in known and is_it:
                 wanted.order = order.hash
                 return await order.contract()
         mine = {demand for demand, maker in self.market.steps.demands.items() if maker == (self, wanted.number)}
@@ -360,7 +383,10 @@ class PersonRole(Role):
         while True:
             await asyncio.sleep(REFUND_CHECK)
             with suppress(AiraError):
-                for _, address in await agent.parts.ledger.contracts("demand"):
+                known = [address for _, address in await agent.parts.ledger.contracts("demand")]
+                if self.market.plan.at_once > 1:  # more than the ledger lists
+                    known = self.market.steps.contracts_of(self)
+                for address in known:
                     if self.market.steps.is_ended(address):
                         continue
                     if (await liabilities.refund_state(address)).is_refundable:

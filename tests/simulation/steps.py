@@ -17,6 +17,7 @@ from tests.simulation.scheduler import SECOND
 
 if TYPE_CHECKING:
     from mesh.market.book import Match
+    from tests.simulation.chain import PooledTransaction
     from tests.simulation.market import Market
     from tests.simulation.messages import Sample
     from tests.simulation.roles import PersonRole
@@ -66,6 +67,14 @@ class StepAudit:
         """Whether a liability has ended on the chain."""
         return liability in self._ended
 
+    def contracts_of(self, person: PersonRole) -> list[str]:
+        """The liabilities of a person's demands."""
+        return [
+            liability
+            for liability, demand in self._liabilities.items()
+            if demand in self.demands and self.demands[demand][0] is person
+        ]
+
     def block(self) -> None:
         """A block was mined, or some were replaced."""
         if self._chain.reorganisations != self._reorganisations:
@@ -95,9 +104,11 @@ class StepAudit:
 
     def _mined(self, number: int) -> None:
         """No provider sends a transaction a second time that has had its effect; not checked after reorganisations."""
-        pooled = self._chain.mined.get(number)
-        if pooled is None or self._reorganisations or pooled.sender not in self._providers:
-            return
+        for pooled in self._chain.mined.get(number, ()):
+            if not self._reorganisations and pooled.sender in self._providers:
+                self._sent_by_provider(pooled, number)
+
+    def _sent_by_provider(self, pooled: PooledTransaction, number: int) -> None:
         sent = pooled.sender, self._chain.evm.read(pooled.raw).data
         if sent in self._submitted:
             self._market.violated("submitted-twice", f"by {pooled.sender.hex()} in block {number}")
@@ -124,7 +135,8 @@ class StepAudit:
         is_excused = order.told_ns < self._reorganised_ns + UNSETTLED_NS
         if order.is_dead and (not is_excused or order.told == "nothing-found"):
             self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
-        is_known = bool(order.contract) or demand in person.listed  # accepted before a reorganisation and a restart
+        versions = {one for one, maker in self.demands.items() if maker == (person, number)}
+        is_known = bool(order.contract) or versions & person.listed  # accepted before a reorganisation and a restart
         if person.agent_is_open and not order.is_over and not is_known:
             self._market.violated("unannounced-payment", f"{person.name}'s agent does not list {demand[:12]}")
 
@@ -171,7 +183,7 @@ class StepAudit:
             self.orders.setdefault(message_hash(message).hex(), sample)
         if isinstance(message, Demand):
             person: Any = role
-            self.demands.setdefault(message_hash(message).hex(), (person, len(person.orders) - 1))
+            self.demands.setdefault(message_hash(message).hex(), (person, person.number_of(message)))
 
     def matched(self, provider: str, match: Match) -> None:
         """A provider matched two orders."""
