@@ -63,3 +63,12 @@ def test_a_long_history_ends_too(tmp_path: Path) -> None:
     assert (found["jobs"], found["violations"], found["lost"]) == (10, [], 0), said
     assert found["markets"]["more-people"] == found["markets"]["long-pauses"] == 1
     assert json.loads(summary.read_text()) == found
+
+
+def test_all_jobs_of_a_crowded_market_end() -> None:
+    """People have many orders open at a time, and blocks many transactions."""
+    options = ("--history-jobs", "100", "--only", "drop,reorganise_every", "--chain", "model")
+    found, said = simulate("--seed", "1", "--jobs", "100", *options)
+    assert (found["jobs"], found["violations"], found["lost"]) == (100, [], 0), said
+    assert found["markets"]["crowded"] == 1
+    assert found["paid"] > 50

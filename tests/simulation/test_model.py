@@ -6,13 +6,18 @@ import os
 from typing import Any, Final
 
 import pytest
+from eth_abi.abi import encode
 from eth_bloom.bloom import BloomFilter
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from schemas import keccak256
-from tests.simulation.model import bloom_of
+from mesh.chain import Account
+from mesh.chain.accounts import created_address
+from schemas import address_bytes, keccak256
+from tests.simulation.model import ModelChain, bloom_of
+from tests.simulation.model_abi import artifact
 from tests.simulation.model_history import ModelHistory, twins
+from tests.simulation.model_twins import call_of
 from tests.support.ci import IN_CI, seed_of_part
 
 HISTORIES: Final = int(os.environ.get("AIRA_MODEL_HISTORIES", "30" if IN_CI else "8"))
@@ -53,3 +58,33 @@ def test_a_modelled_block_has_the_bloom_filter_of_its_logs() -> None:
     address, topics = b"\x11" * 20, [keccak256(b"NewLiability(address)"), bytes(32)]
     assert bloom_of([(address, topics, b"")]) == int(BloomFilter.from_iterable([address, *topics]))
     assert bloom_of([]) == 0
+
+
+def test_the_transactions_of_a_block_see_what_those_before_them_did() -> None:
+    chain = ModelChain(twins().evm.funded_keys)
+    maker, friend = (Account.from_key(key) for key in chain.funded_keys[:2])
+    token = created_address(maker.address, 0)
+    fees = {"chainId": chain.chain_id, "maxPriorityFeePerGas": 1, "maxFeePerGas": 2 * chain.base_fee, "value": 0}
+
+    def signed(account: Account, nonce: int, to: str, data: bytes) -> bytes:
+        fields = fees | {"nonce": nonce, "to": to or b"", "data": "0x" + data.hex(), "gas": 5_000_000 // (nonce + 1)}
+        return account.sign_transaction(fields).raw
+
+    deploy = bytes.fromhex(artifact("XRT")["bytecode"][2:]) + encode(["uint256"], [9])
+    give, return_ = (call_of("XRT", "transfer", address_bytes(to.address), 2) for to in (friend, maker))
+    raws = [signed(maker, 0, "", deploy), signed(maker, 1, token, give), signed(maker, 5, token, give)]
+    raws.append(signed(friend, 0, token, return_))
+    mined = [chain.read(raw).hash for raw in raws if raw is not raws[2]]
+    assert chain.mine_together(raws) == set(mined)
+
+    receipts: list[Any] = [chain.receipt(hash_) for hash_ in mined]
+    assert [(one["status"], one["transactionIndex"], one["blockNumber"]) for one in receipts] == [
+        ("0x1", "0x0", "0x1"),
+        ("0x1", "0x1", "0x1"),
+        ("0x1", "0x2", "0x1"),
+    ]
+    assert [log["logIndex"] for log in chain.logs(1, 1)] == ["0x0", "0x1", "0x2"]
+    assert chain.nonce(address_bytes(maker.address), 1) == 2
+    chain.rewind(0)
+    assert [chain.receipt(hash_) for hash_ in mined] == [None] * 3
+    assert chain.nonce(address_bytes(maker.address), 0) == 0
