@@ -9,6 +9,8 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from heapq import heapify, heappop, heappush
+from itertools import count
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from mesh.flood import Rate, RateLimiter
@@ -31,6 +33,8 @@ RESEND: Final = RetryPolicy(initial=0.5, ceiling=300.0)
 """How long to wait for the effect of a message before it is sent again."""
 RESEND_RATE: Final = Rate(per_second=50.0, burst=250)
 """Messages that are sent again, in all: strangers can make a robot offer, and tell it that a provider appeared."""
+COMPACT_AT: Final = 1024
+"""Entries of the schedule that may be out of date, at least."""
 LATER: Final = 0.5
 """Seconds after which a message is due again that exceeded the rate."""
 
@@ -67,10 +71,11 @@ def outgoing(message: SignedMessage) -> Outgoing:
 
 @dataclass
 class _Attempts:
-    """A message, and when it is sent next (in seconds of the clock; 0: at once)."""
+    """A message, and when it is sent next (in seconds of the clock; 0: at once). Messages are numbered by age."""
 
     message: SignedMessage
     backoff: Backoff
+    number: int
     next_at: float = 0.0
 
     def is_open(self, head: int) -> bool:
@@ -109,6 +114,9 @@ class Outbox:
         self._chance = chance
         self._attempts: dict[str, _Attempts] = {}
         """What the ledger held when it was read, without what was settled since; the oldest first."""
+        self._number = count()
+        self._schedule: list[tuple[float, int, str]] = []
+        """When each message is due, its number and identity: a heap. Entries that are out of date are skipped."""
         self._lock = asyncio.Lock()
         """Held while the ledger is read, or loses a message: what is settled must not come back."""
         self._held: set[str] = set()
@@ -155,7 +163,11 @@ class Outbox:
 
     async def release(self, identities: Iterable[str]) -> None:
         """Send messages that were held."""
-        self._held.difference_update(identities)
+        released = self._held.intersection(identities)
+        self._held -= released
+        for identity in released:
+            if (one := self._attempts.get(identity)) is not None:
+                heappush(self._schedule, (one.next_at, one.number, identity))
         await self.send_new()
 
     async def send_new(self) -> None:
@@ -163,6 +175,9 @@ class Outbox:
         async with self._lock:
             known, unsent = self._attempts, await self._ledger.outbox(head=self._head())
             self._attempts = {one.identity: known.get(one.identity) or self._first_attempt(one) for one in unsent}
+            if len(self._schedule) > COMPACT_AT + 2 * len(self._attempts):
+                self._schedule = [(one.next_at, one.number, identity) for identity, one in self._attempts.items()]
+                heapify(self._schedule)
         self.send_due()
 
     async def send_all(self) -> None:
@@ -172,8 +187,11 @@ class Outbox:
 
     def send_due(self) -> None:
         """Send the messages whose time has come."""
-        now = self._clock()
-        due = [(identity, one) for identity, one in self._sendable() if one.next_at <= now]
+        now, found = self._clock(), dict[str, _Attempts]()
+        while (first := self._first()) is not None and first[1].next_at <= now:
+            heappop(self._schedule)
+            found.update([first])
+        due = sorted(found.items(), key=lambda one: one[1].number)
         offers = [(identity, one) for identity, one in due if isinstance(one.message, Offer)]
         others = [(identity, one) for identity, one in due if not isinstance(one.message, Offer)]
         for identity, one in (*others, *reversed(offers)):
@@ -183,6 +201,7 @@ class Outbox:
                 self._channel.publish(one.message)
                 wait = one.backoff.next_delay() or 0.0
             one.next_at = self._clock() + wait
+            heappush(self._schedule, (one.next_at, one.number, identity))
         self._changed.set()
 
     async def expire(self, head: int) -> None:
@@ -205,10 +224,16 @@ class Outbox:
                 await self._wait()
                 self.send_due()
 
-    def _sendable(self) -> list[tuple[str, _Attempts]]:
-        """The messages that are neither held nor expired."""
-        head, held = self._head(), self._held
-        return [(name, one) for name, one in self._attempts.items() if name not in held and one.is_open(head)]
+    def _first(self) -> tuple[str, _Attempts] | None:
+        """The message that is due first, of those that are neither held nor expired."""
+        while self._schedule:
+            at, number, identity = self._schedule[0]
+            one = self._attempts.get(identity)
+            is_current = one is not None and (one.next_at, one.number) == (at, number)
+            if one is not None and is_current and identity not in self._held and one.is_open(self._head()):
+                return identity, one
+            heappop(self._schedule)  # what is released, or open again after a reorganisation, is scheduled again
+        return None
 
     async def _without(self, identity: str, remove: Callable[[], Awaitable[T]]) -> T:
         """Call what removes a message from the ledger."""
@@ -219,14 +244,16 @@ class Outbox:
     def _first_attempt(self, one: Outgoing) -> _Attempts:
         message = decode(one.payload)
         assert isinstance(message, Demand | Offer | Withdrawal | Result)
-        return _Attempts(message, Backoff(self._policy, chance=self._chance))
+        attempts = _Attempts(message, Backoff(self._policy, chance=self._chance), next(self._number))
+        heappush(self._schedule, (attempts.next_at, attempts.number, one.identity))
+        return attempts
 
     async def _wait(self) -> None:
         """Wait until the next attempt is due."""
         while True:
             self._changed.clear()
-            next_at = min((one.next_at for _, one in self._sendable()), default=None)
-            remaining = None if next_at is None else next_at - self._clock()
+            first = self._first()
+            remaining = None if first is None else first[1].next_at - self._clock()
             if remaining is not None and remaining <= 0:
                 return
             with suppress(TimeoutError):
