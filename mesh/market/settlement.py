@@ -138,8 +138,8 @@ class Settlement:
             self._tasks.create_task(self._create(outcome))
         elif isinstance(outcome, Refusal):
             # A withdrawal that is not on the disk is no promise yet.
-            is_forgettable = outcome is Refusal.WITHDRAWN and not self._withdrawals.is_kept(order_id(order))
-            if outcome is not Refusal.DUPLICATE and not is_forgettable:
+            is_unkept = outcome is Refusal.WITHDRAWN and not self._withdrawals.is_kept(order_id(order))
+            if outcome is not Refusal.DUPLICATE and not is_unkept:
                 self.rejections.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
             if outcome not in (Refusal.DUPLICATE, Refusal.WITHDRAWN):
                 self._forget(order, after=self._pause if outcome in (Refusal.FULL, Refusal.REPLACED) else 0.0)
