@@ -40,6 +40,8 @@ class StepAudit:
         holders = [account.address for account in market.deployed.accounts.values()]
         self._providers = {address_bytes(one.account.address) for one in market.providers}
         self._begin = {one: self._balance(one) for one in (*holders, deployment.factory, deployment.lighthouse)}
+        self._liabilities: dict[str, str] = {}
+        """Of each liability the demand's hash."""
         self._reorganisations = 0
         self._reorganised_ns = -UNSETTLED_NS
         """When the last one was."""
@@ -54,14 +56,14 @@ class StepAudit:
         """What each juror has signed of each liability: result and success."""
 
     def _forget(self) -> None:
+        self._before = self._liabilities
         self._read = self._chain.began
         self._expected: Counter[str] = Counter(self._begin)
         self._ended: set[str] = set()
         self._payouts: dict[str, int] = defaultdict(int)
         self._submitted: set[tuple[bytes, bytes]] = set()
         """Senders and data of the providers' transactions that did what they wanted."""
-        self._liabilities: dict[str, str] = {}
-        """Of each liability the demand's hash."""
+        self._liabilities = {}
 
     def is_ended(self, liability: str) -> bool:
         """Whether a liability has ended on the chain."""
@@ -136,7 +138,10 @@ class StepAudit:
         if order.is_dead and (not is_excused or order.told == "nothing-found"):
             self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
         versions = {one for one, maker in self.demands.items() if maker == (person, number)}
-        is_known = bool(order.contract) or versions & person.listed  # accepted before a reorganisation and a restart
+        was_there = (
+            self._before.get(liability) == demand
+        )  # before blocks were replaced; people may have restarted since
+        is_known = was_there or order.contract or versions & person.listed
         if person.agent_is_open and not order.is_over and not is_known:
             self._market.violated("unannounced-payment", f"{person.name}'s agent does not list {demand[:12]}")
 
