@@ -50,7 +50,8 @@ def main(arguments: Sequence[str]) -> None:
     began = REAL_TIME()
     deployed = Deployments(options.chain)
     if options.mutants:
-        found_all = find_mutants(deployed, options.seed, options.mutant)
+        jobs = options.history_jobs if options.history_jobs > JOBS else 0
+        found_all = find_mutants(deployed, options.seed, options.mutant, jobs=jobs)
         sys.stdout.flush()
         os._exit(0 if found_all else 1)
     total = Report(options.seed)

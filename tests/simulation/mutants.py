@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from tests.simulation.deployment import ON_MODEL
@@ -16,9 +17,13 @@ if TYPE_CHECKING:
 ROW = "{:<72} {:>5} {:>5} {:>6}  {}"
 
 
-def find_mutants(deployments: Deployments, seed: int, name: str) -> bool:
-    """Search for each bug with `name` in its name, print a table, and return whether all were found."""
+def find_mutants(deployments: Deployments, seed: int, name: str, *, jobs: int = 0) -> bool:
+    """Search for each bug with `name` in its name, print a table, and return whether all were found.
+
+    In histories of so many `jobs`, or of as many as each bug says.
+    """
     chosen = [one for one in (*MUTATIONS, *(CANDIDATES if name else ())) if name in one.name]
+    chosen = [replace(one, jobs=jobs or one.jobs) for one in chosen]
     for mutation in chosen:
         mutation.source()
     began, missed = REAL_TIME(), 0

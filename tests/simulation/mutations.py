@@ -227,8 +227,8 @@ MUTATIONS: Final = (
     Mutation(
         "the provider ignores withdrawals",
         "mesh.market.settlement:Settlement._refusal",
-        "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
-        "return None",
+        "if order_id(order) in self._withdrawals:",
+        "if False:",
         "repeat_every,replay,drop,duplicate,delay,withdraw",
         seeds=240,
     ),
@@ -288,9 +288,33 @@ MUTATIONS: Final = (
         "continue",
         "late,revoke",
     ),
+    Mutation(
+        "of lost nonces only the first is filled at once",
+        "mesh.chain.submission:Resubmission._use_nonces",
+        "gap = await self._node.transaction_count(self._account.address, pending=True)",
+        "return",
+        REORGANISATIONS + ",crash_every,leave_out",
+        jobs=100,
+    ),
 )
 
 CANDIDATES: Final = (
+    Mutation(
+        "a provider settles older versions of an order",
+        "mesh.market.versions:OrderVersions.is_replaced",
+        "if key is None:",
+        "if True:",
+        REORGANISATIONS + ",repeat_every",
+        jobs=100,
+    ),
+    Mutation(
+        "the contract of an earlier version of an order is not recognized",
+        "mesh.agent.versions:earlier_version",
+        "for order in orders:",
+        "for order in ():",
+        REORGANISATIONS + ",repeat_every",
+        jobs=100,
+    ),
     Mutation(
         "a new agent does not remember the block at which it began",
         "mesh.agent.components:_handled",
