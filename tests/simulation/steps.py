@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from eth_utils.crypto import keccak
 
 from mesh.agent.orders import OrderState
+from mesh.agent.versions import lasting_hash
 from mesh.chain import Finalized, NewLiability, Transfer
 from mesh.market.book import Refusal
 from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, Offer, Result, address_bytes, decode
@@ -50,6 +51,8 @@ class StepAudit:
         """Providers and the orders (hashes) of which they have said that they honour their withdrawal."""
         self.demands: dict[str, tuple[PersonRole, int]] = {}
         """All demands that were sent: by whom, as which of their orders."""
+        self._makers: dict[str, tuple[PersonRole, int]] = {}
+        """The same of all versions of a demand."""
         self.orders: dict[str, Sample] = {}
         """All orders (hashes) that were published."""
         self._verdicts: dict[tuple[str, str], tuple[str, bool]] = {}
@@ -188,7 +191,8 @@ class StepAudit:
             self.orders.setdefault(message_hash(message).hex(), sample)
         if isinstance(message, Demand):
             person: Any = role
-            self.demands.setdefault(message_hash(message).hex(), (person, person.number_of(message)))
+            maker = self._makers.setdefault(lasting_hash(message), (person, person.number_of(message)))
+            self.demands.setdefault(message_hash(message).hex(), maker)
 
     def matched(self, provider: str, match: Match) -> None:
         """A provider matched two orders."""
