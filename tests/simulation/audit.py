@@ -94,8 +94,8 @@ class Audit:
         """What people were told has happened, and nobody paid for an order that they believed dead.
 
         People are told after one confirmation, so a reorganisation may contradict that. A payment that it reverts is
-        made again, unless the robot has left for good (only the robot is sure to keep its result), or the payment came
-        so late that a refund may be mined instead.
+        made again, unless the robot has left for good (only the robot is sure to keep its result), or the payment came,
+        or the faults ended, so late that a refund may be mined instead.
         """
         node = SimulatedNode(self._chain, NodeFaults())
         told = {order.contract: order for person in self._market.people for order in person.orders if order.contract}
@@ -135,7 +135,8 @@ class Audit:
     def _told(self, order: Ordered, record: Liability, *, refundable_from: int) -> None:
         told = order.told
         if told in ("paid", "refunded") and (told == "paid") != record.is_success:
-            is_late = order.told_block + MOST_BLOCKS >= refundable_from
+            done = max(order.told_block + MOST_BLOCKS, self._market.calm_since + DONE_WITHIN)
+            is_late = done >= refundable_from
             if told == "paid" and self._chain.reorganisations and (is_late or self._has_left(record.promisor)):
                 return
             detail = f"{record.address}: told {told!r}, but success is {record.is_success}"
