@@ -288,6 +288,9 @@ MUTATIONS: Final = (
         "continue",
         "late,revoke",
     ),
+)
+
+CANDIDATES: Final = (
     Mutation(
         "of lost nonces only the first is filled at once",
         "mesh.chain.submission:Resubmission._use_nonces",
@@ -296,9 +299,6 @@ MUTATIONS: Final = (
         REORGANISATIONS + ",crash_every,leave_out",
         jobs=100,
     ),
-)
-
-CANDIDATES: Final = (
     Mutation(
         "a provider settles older versions of an order",
         "mesh.market.versions:OrderVersions.is_replaced",
