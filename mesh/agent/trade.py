@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.contract import Contract, WatchedContracts, fail_future
+from mesh.agent.covering import CoveredOrders
 from mesh.agent.demands import current_buyer
 from mesh.agent.offers import OpenOffers
 from mesh.agent.orders import Order, OrderState, TradedOrder
@@ -29,7 +30,7 @@ from mesh.work.phases import Phase
 from schemas import Demand, Offer, Withdrawal, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable
     from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
@@ -58,6 +59,7 @@ class Trader(Lifecycle):
         self._address = parts.signer.address
         self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address)
         self._orders: dict[str, TradedOrder] = {}
+        self._covered = CoveredOrders(parts, self._orders, self._allowances)
         self.writer = TermsWriter(parts, self._orders)
         self._hear_declines: Callable[[], None] = lambda: None
         self._answers = OpenOffers()
@@ -84,8 +86,8 @@ class Trader(Lifecycle):
             facts = log_event("order-resumed", order=order.identity, kind=order.signed.kind, deadline=order.deadline)
             log.info("the %s of an earlier run is open until block %d", order, order.deadline, extra=facts)
         await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
-        self._tasks = await stack.enter_async_context(Background())
-        self._send_when_covered([order for order in resumed if order.is_open])
+        self._tasks = self._covered.tasks = await stack.enter_async_context(Background())
+        self._covered.send([order for order in resumed if order.is_open])
 
     async def _close(self) -> None:
         for order in self._orders.values():
@@ -190,12 +192,12 @@ class Trader(Lifecycle):
             return
         self.contracts.reverted(address, min(order.deadline or 0 for order in orders))
         again = [order for order in await self.load() if order.is_open]
-        self._send_when_covered(again)
+        self._covered.send(again)
         await self._parts.outbox.release({order.identity for order in orders} - {order.identity for order in again})
 
     def reorganised(self) -> None:
         """A reorganisation may have reverted the allowance of open orders, which wait for it, and withdrawals."""
-        self._send_when_covered([order for order in self._orders.values() if order.is_open])
+        self._covered.send([order for order in self._orders.values() if order.is_open])
         if self.is_open:
             self._tasks.start(self._chain_withdrawals.make_again(), "withdraw again on the chain")
 
@@ -208,26 +210,6 @@ class Trader(Lifecycle):
                     order.close(OrderState.EXPIRED)
         self.contracts.expire(block)
         await self.load()
-
-    def _send_when_covered(self, orders: Collection[TradedOrder]) -> None:
-        """Send these orders of the ledger when the factory has the allowance for them, in a task."""
-        self._parts.outbox.hold(order.identity for order in orders)
-        costly = [order for order in orders if any(self._chain.costs.of(order.signed).values())]
-        if free := {order.identity for order in orders} - {order.identity for order in costly}:
-            self._tasks.start(self._parts.outbox.release(free), "resume free orders")
-        for order in costly:
-            self._tasks.start(self._cover_and_send(order), f"resume {order.identity}")
-
-    async def _cover_and_send(self, order: TradedOrder) -> None:
-        ensure = partial(self._allowances.ensure, order, self._chain.costs.of(order.signed))
-        try:
-            await self._chain.retrying(ensure, outages=self._parts.outages)
-        except AiraError as error:
-            facts = log_event("order-not-covered", order=order.identity, code=error.code)
-            log.warning("the %s is open, but no provider can use it now: %s", order, error, extra=facts)
-        if order.identity not in self._orders:
-            self._allowances.release(order)
-        await self._parts.outbox.release([order.identity])
 
     async def load(self) -> list[TradedOrder]:
         """Take up the orders of the ledger that are not known yet, and what other programs have withdrawn."""
@@ -265,7 +247,8 @@ class Trader(Lifecycle):
         if (order := self._orders.get(identity)) is None or not order.is_open:
             return
         if reason == "ERC20InsufficientAllowance" and not order.is_overtaken(used - 1):
-            self._send_when_covered([order])  # a reorganisation took the allowance in a block that was not read here
+            # A reorganisation took the allowance in a block that was not read here.
+            self._covered.send([order])
         if order.nonce is not None and order.nonce > used:
             self._tasks.start(self._chain_withdrawals.use_up_nonces(order), f"use up the nonces before {identity}")
         if order.is_overtaken(used - 1):

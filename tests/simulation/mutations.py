@@ -203,8 +203,8 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "open orders lose their allowance in a reorganisation",
-        "mesh.agent.trade:Trader._cover_and_send",
-        "await self._chain.retrying(ensure, outages=self._parts.outages)",
+        "mesh.agent.covering:CoveredOrders._cover_and_send",
+        "await chain.retrying(ensure, outages=self._parts.outages)",
         "pass",
         "reorganise_after,forget",
         seeds=60,
