@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from mesh.agent.contract import fail_future
 from mesh.agent.errors import OrderClosed, OrderExpired
@@ -14,13 +14,9 @@ from mesh.market.book import Refusal
 from schemas import Demand, Offer, message_hash
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from mesh.agent.contract import Contract
     from mesh.agent.progress import OnProgress
     from schemas.signing import Decline, Rejection
-
-    Terms = Mapping[str, Any]
 
 STATEMENTS_KEPT: Final = 64
 """Most providers whose rejection of an order is remembered, and most agents whose decline is."""

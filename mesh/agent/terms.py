@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec.structs import replace
 
-from mesh.agent.versions import lasting_hash
 from mesh.flood import BoundedDict
+from mesh.market.versions import lasting_hash
 from schemas import ZERO_ADDRESS, Demand, Offer
 
 if TYPE_CHECKING:

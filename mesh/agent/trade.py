@@ -16,7 +16,7 @@ from mesh.agent.orders import Order, OrderState, TradedOrder
 from mesh.agent.progress import Progress, report, seen_offers
 from mesh.agent.statements import received_declines, received_rejections
 from mesh.agent.terms import TermsWriter
-from mesh.agent.versions import earlier_version, lasting_hash
+from mesh.agent.versions import earlier_version
 from mesh.agent.withdrawing import ChainWithdrawals
 from mesh.background import Background
 from mesh.chain import Allowances, OrderAlreadyUsed
@@ -24,6 +24,7 @@ from mesh.errors import AiraError, ClosedError
 from mesh.flood import KnownSenders
 from mesh.log_context import log_event
 from mesh.market.book import Refusal
+from mesh.market.versions import lasting_hash
 from mesh.role import Lifecycle
 from mesh.work.database import LedgerUnusable
 from mesh.work.phases import Phase

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
 
-from schemas import Demand, Offer, message_hash
+from schemas import Demand, message_hash
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,11 +20,6 @@ if TYPE_CHECKING:
 
 EARLIER: Final = 16
 """Nonces before an order's that an earlier version of it may have."""
-
-
-def lasting_hash(order: Demand | Offer) -> str:
-    """What all versions of an order share: in generation 5 its hash without the nonce, otherwise its hash."""
-    return message_hash(order if order.generation == 3 else replace(order, nonce=0)).hex()
 
 
 def earlier_version(orders: Iterable[TradedOrder], liability: Liability, digest: str) -> TradedOrder | None:

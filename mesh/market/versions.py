@@ -13,11 +13,13 @@ from msgspec.structs import replace
 
 from mesh.flood import BoundedDict
 from mesh.market.book import order_id
-from schemas import address_bytes, message_hash
+from schemas import message_hash
 
 if TYPE_CHECKING:
     from mesh.market.book import Order
     from schemas import Verified
+
+    _Key = tuple[str, str]
 
 LIMIT: Final = 32_768
 """Orders that are remembered, at most."""
@@ -28,32 +30,31 @@ class _Newest(NamedTuple):
     identity: bytes
 
 
-def is_counted(order: Order) -> bool:
-    """Whether the nonce of an order counts its maker's orders."""
-    return order.generation == 5
+def lasting_hash(order: Order) -> str:
+    """What all versions of an order share: in generation 5 its hash without the nonce, otherwise its hash."""
+    return message_hash(order if order.generation == 3 else replace(order, nonce=0)).hex()
 
 
 class OrderVersions:
     """The versions of the orders that a provider has seen; the last `limit` of them."""
 
     def __init__(self, *, limit: int = LIMIT) -> None:
-        self._keys: BoundedDict[bytes, bytes] = BoundedDict(limit)
-        """Of each version (identity) what it is a version of."""
-        self._newest: BoundedDict[bytes, _Newest] = BoundedDict(limit)
-        self._used: BoundedDict[bytes, bytes] = BoundedDict(limit)
+        self._keys: BoundedDict[bytes, _Key] = BoundedDict(limit)
+        """Of each version (identity) its lasting hash and signer."""
+        self._newest: BoundedDict[_Key, _Newest] = BoundedDict(limit)
+        self._used: BoundedDict[_Key, bytes] = BoundedDict(limit)
         """The version that has become a contract."""
-        self._contracts: BoundedDict[str, tuple[bytes, ...]] = BoundedDict(limit)
+        self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(limit)
         """What each contract (address) is of."""
 
     def note(self, order: Verified[Order]) -> bytes | None:
         """Remember an order. Returns the identity of the version that it replaces, if that was the newest."""
-        if not is_counted(order.message):
+        if order.message.generation == 3:
             return None
         identity, nonce = order_id(order), int(order.message.nonce)
         key = self._keys.get(identity)
         if key is None:
-            key = message_hash(replace(order.message, nonce=0)) + address_bytes(order.signer)
-            self._keys[identity] = key
+            key = self._keys[identity] = lasting_hash(order.message), order.signer
         before = self._newest.get(key)
         if before is not None and before.nonce >= nonce:
             return None

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 from eth_utils.crypto import keccak
 
 from mesh.agent.orders import OrderState
-from mesh.agent.versions import lasting_hash
 from mesh.chain import Finalized, NewLiability, Transfer
 from mesh.market.book import Refusal
+from mesh.market.versions import lasting_hash
 from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, Offer, Result, address_bytes, decode
 from schemas.signing import Rejection
 from schemas.wire import message_hash
@@ -141,9 +141,8 @@ class StepAudit:
         if order.is_dead and (not is_excused or order.told == "nothing-found"):
             self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
         versions = {one for one, maker in self.demands.items() if maker == (person, number)}
-        was_there = (
-            self._before.get(liability) == demand
-        )  # before blocks were replaced; people may have restarted since
+        # Before blocks were replaced; people may have restarted since.
+        was_there = self._before.get(liability) == demand
         is_known = was_there or order.contract or versions & person.listed
         if person.agent_is_open and not order.is_over and not is_known:
             self._market.violated("unannounced-payment", f"{person.name}'s agent does not list {demand[:12]}")
