@@ -21,15 +21,15 @@ from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
 from mesh.devchain.methods import Methods
 from tests.simulation.chance import FaultDraw
 from tests.simulation.memo import Answer
+from tests.simulation.model import ModelChain
 from tests.simulation.model_transactions import read_transaction
 from tests.simulation.threads import scheduler
 
 if TYPE_CHECKING:
     import random
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from mesh.chain import ChainEvent
-    from tests.simulation.model import ModelChain
     from tests.simulation.model_transactions import ModelTransaction
 
 LATENCY: Final = (0.001, 0.03)
@@ -96,10 +96,6 @@ class EvmChain(Evm):
     def read(self, raw: bytes) -> ModelTransaction:
         """A signed transaction. Raises `RpcError`."""
         return read_transaction(raw)
-
-    def mine_together(self, raws: Sequence[bytes]) -> set[bytes]:
-        """Not here: the embedded EVM has one transaction in a block."""
-        raise NotImplementedError
 
 
 class SimulatedChain:
@@ -251,6 +247,7 @@ class SimulatedChain:
 
     def _mine_block(self, chosen: list[PooledTransaction]) -> None:
         if self.most_in_block > 1:
+            assert isinstance(self.evm, ModelChain), "the embedded EVM has one transaction in a block"
             hashes = self.evm.mine_together([one.raw for one in chosen])
             self.mined[self.evm.head] = [one for one in chosen if one.hash in hashes]
             return

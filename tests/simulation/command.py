@@ -27,7 +27,7 @@ from tests.simulation.scheduler import REAL_TIME, SECOND
 router.install(lambda: history.CURRENT[-1])  # type: ignore[arg-type,return-value]
 
 from mesh.chain.rpc_client import RpcClient  # noqa: E402, F401
-from tests.simulation.deployment import JOBS, ON_EVM, ON_MODEL, Deployments  # noqa: E402
+from tests.simulation.deployment import CROWDED_JOBS, JOBS, ON_EVM, ON_MODEL, Deployments  # noqa: E402
 from tests.simulation.faults import KINDS  # noqa: E402
 from tests.simulation.mutants import find_mutants  # noqa: E402
 from tests.simulation.runs import Run, numbers_in, run_in_children  # noqa: E402
@@ -142,6 +142,8 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
         print(f"seed {options.seed}", file=sys.stderr)
     if min(options.jobs, options.history_jobs) < 1 or options.workers < 0:
         parser.error("--jobs and --history-jobs are at least 1, --workers at least 0")
+    if options.chain == ON_EVM and options.history_jobs >= CROWDED_JOBS:
+        parser.error(f"histories of {CROWDED_JOBS} jobs or more have crowded markets, which need --chain {ON_MODEL}")
     if not options.workers:  # what several print would mix
         options.workers = 1 if options.trace or options.log or options.switches else len(os.sched_getaffinity(0))
     only, without = (frozenset(filter(None, text.split(","))) for text in (options.only, options.without))

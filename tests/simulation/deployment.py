@@ -163,8 +163,10 @@ class Deployments:
         self._only = only
         self._found: dict[tuple[str, int], Deployed] = {}
 
-    def kind(self, seed: int) -> str:
-        """What runs the contracts in the history of a seed."""
+    def kind(self, seed: int, jobs: int = JOBS) -> str:
+        """What runs the contracts in the history of a seed: in crowded markets the model, for blocks of many."""
+        if jobs >= CROWDED_JOBS:
+            return ON_MODEL
         return self._only or (ON_EVM if random.Random(f"chain {seed}").randrange(EVM_EVERY) == 0 else ON_MODEL)
 
     def market(self, kind: str, *, jurors: int = 0) -> Deployed:

@@ -265,7 +265,7 @@ class PersonRole(Role):
         return len(self.orders) >= self.wanted and all(order.is_over for order in reversed(self.orders))
 
     def number_of(self, demand: Demand) -> int:
-        """Which of the orders a demand of this person is: of several at a time, the cost tells."""
+        """Which of this person's orders a demand is. The cost of each says so where several are open at a time."""
         return demand.cost % CENT if self.market.plan.at_once > 1 else len(self.orders) - 1
 
     async def main(self) -> None:
@@ -383,9 +383,10 @@ class PersonRole(Role):
         while True:
             await asyncio.sleep(REFUND_CHECK)
             with suppress(AiraError):
-                known = [address for _, address in await agent.parts.ledger.contracts("demand")]
                 if self.market.plan.at_once > 1:  # more than the ledger lists
                     known = self.market.steps.contracts_of(self)
+                else:
+                    known = [address for _, address in await agent.parts.ledger.contracts("demand")]
                 for address in known:
                     if self.market.steps.is_ended(address):
                         continue

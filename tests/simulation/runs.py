@@ -121,7 +121,7 @@ class Child:
 
     def __init__(self, deployments: Deployments, run: Run, *, trace: bool, switches: str | None) -> None:
         self.run = run
-        self._kind = run.chain or deployments.kind(run.seed)
+        self._kind = run.chain or deployments.kind(run.seed, run.jobs)
         market = deployments.market(self._kind, jurors=market_plan(run.seed, run.jobs).jurors)
         self._pipe, writing = os.pipe()
         self._process = os.fork()

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.simulation.deployment import EVM_EVERY, JURORS, ON_EVM, ON_MODEL, Deployments, MarketPlan, market_plan
+from tests.simulation.deployment import (
+    CROWDED_JOBS,
+    EVM_EVERY,
+    JURORS,
+    ON_EVM,
+    ON_MODEL,
+    Deployments,
+    MarketPlan,
+    market_plan,
+)
 from tests.simulation.test_simulation import simulate
 
 if TYPE_CHECKING:
@@ -45,6 +54,7 @@ def test_the_seed_chooses_the_chain() -> None:
     kinds = [deployments.kind(seed) for seed in range(20 * EVM_EVERY)]
     assert 5 < kinds.count(ON_EVM) < 60
     assert Deployments(ON_MODEL).kind(kinds.index(ON_EVM)) == ON_MODEL
+    assert deployments.kind(kinds.index(ON_EVM), CROWDED_JOBS) == ON_MODEL
 
 
 def test_a_history_is_the_same_alone_and_beside_another() -> None:
