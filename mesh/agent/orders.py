@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from mesh.agent.contract import fail_future
 from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.progress import Progress, nothing, report, stated
-from mesh.market.book import Refusal
+from mesh.market.refusals import Refusal
 from schemas import Demand, Offer, message_hash
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.agent.received import received
 from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
-from mesh.market.book import Refusal
+from mesh.market.refusals import Refusal
 from mesh.network import PresentAgents
 from schemas.signing import Decline, Rejection
 

@@ -23,7 +23,7 @@ from mesh.chain import Allowances, OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
 from mesh.flood import KnownSenders
 from mesh.log_context import log_event
-from mesh.market.book import Refusal
+from mesh.market.refusals import Refusal
 from mesh.market.versions import lasting_hash
 from mesh.role import Lifecycle
 from mesh.work.database import LedgerUnusable

@@ -227,7 +227,8 @@ class TransactionSender:
         self._node.metrics.paid(gas_used=gas_used, wei=wei)
         if not succeeded:
             why = await self._why_failed(entry.fields, receipt)
-            raise Reverted(why.reason, arguments=why.arguments, data=why.data, gas_used=gas_used, wei=wei)
+            cost: dict[str, Any] = {"gas_used": gas_used, "wei": wei, "block": receipt.block_number}
+            raise Reverted(why.reason, arguments=why.arguments, data=why.data, **cost)
         return Receipt(
             tx=signed.hash,
             block_number=receipt.block_number,

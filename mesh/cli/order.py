@@ -159,7 +159,7 @@ async def withdraw_orders(parts: AgentComponents, orders: Sequence[Order], *, on
     """Withdraw orders, and wait a moment for providers to confirm it; returns what is printed of each."""
     from mesh.agent.orders import OrderState
     from mesh.agent.statements import received_rejections
-    from mesh.market.book import Refusal
+    from mesh.market.refusals import Refusal
 
     honoured = defaultdict[str, set[str]](set)
 

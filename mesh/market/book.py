@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
+from mesh.market.refusals import Refusal
 from schemas import Demand, address_bytes
 
 if TYPE_CHECKING:
@@ -28,25 +28,6 @@ T = TypeVar("T")
 LIMIT: Final = 24_576
 """Open orders that a book holds by default: with up to 2 KB each, a provider stays below 200 MB."""
 UNLIMITED: Final = 2**256
-
-
-class Refusal(StrEnum):
-    """Why the book refuses an order, as published to its sender."""
-
-    EXPIRED = "expired"
-    """Its deadline has passed."""
-    DUPLICATE = "duplicate"
-    """It is in the book already."""
-    LIGHTHOUSE = "lighthouse"
-    """It names another lighthouse."""
-    FULL = "full"
-    """The book is full; try again later."""
-    WITHDRAWN = "withdrawn"
-    """Its maker has withdrawn it."""
-    REPLACED = "replaced"
-    """Its maker has signed it again, or another version of it has become a contract."""
-    BLOCKED = "blocked"
-    """Its maker is blocked; this is not published."""
 
 
 class Match(NamedTuple):

@@ -168,6 +168,7 @@ class LiabilityEvents:
 
     def _revert(self, block: Reorganisation) -> list[Verified[Any]]:
         """The messages whose effect a reorganisation reverted. The contracts refuse those that were used again."""
+        self._versions.reorganised(block.block_number, self.head)
         self.head = block.block_number
         created = [event for event in block.reverted_events if isinstance(event, NewLiability)]
         finalized = [event for event in block.reverted_events if isinstance(event, Finalized)]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.chain.errors import Reverted
 from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
-from mesh.market.book import Refusal
+from mesh.market.refusals import Refusal
 from schemas import RejectKey, address_bytes
 from schemas.signing import Rejection
 

@@ -13,13 +13,14 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain import NodeUnreachable, RequestRefused, Reverted, TransactionTimeout
-from mesh.errors import AiraError, ChainError, InputError
+from mesh.errors import AiraError, InputError
 from mesh.flood import UNFUNDED_POLLS
 from mesh.log_context import liability_context, log_event
-from mesh.market.book import Added, Match, Refusal, order_id
+from mesh.market.book import Added, Match, order_id
 from mesh.market.funding import Commitments, UnfundedOrders, creation_stakes
 from mesh.market.judgements import ResultSettlement
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
+from mesh.market.refusals import RETRIED, MatchWithdrawn, Refusal
 from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
 from mesh.market.versions import OrderVersions
 from mesh.market.withdrawals import withdrawn_id
@@ -39,10 +40,6 @@ if TYPE_CHECKING:
     from schemas import Verified, Withdrawal
 
 log = logging.getLogger(__name__)
-
-
-class MatchWithdrawn(ChainError, code="match-withdrawn"):
-    """An order of a match was withdrawn or replaced, or its signer blocked, before a transaction was sent."""
 
 
 class Settlement:
@@ -81,7 +78,7 @@ class Settlement:
         self._withdrawals = withdrawals
         self._drops = drops
         self.rejections: Final = RejectionPublisher(channel, chain.account, earnings, drops)
-        self._versions = OrderVersions()
+        self._versions = OrderVersions(chain.node.timing.reorg_depth)
         self.events: Final = LiabilityEvents(
             chain,
             channel.address,
@@ -137,12 +134,11 @@ class Settlement:
             self.events.unconfirmed.begin(*outcome)
             self._tasks.create_task(self._create(outcome))
         elif isinstance(outcome, Refusal):
-            # A withdrawal that is not on the disk is no promise yet.
-            is_unkept = outcome is Refusal.WITHDRAWN and not self._withdrawals.is_kept(order_id(order))
-            if outcome is not Refusal.DUPLICATE and not is_unkept:
+            is_unsure = outcome is Refusal.WITHDRAWN and not self._may_promise(order_id(order))
+            if outcome is not Refusal.DUPLICATE and not is_unsure:
                 self.rejections.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
             if outcome not in (Refusal.DUPLICATE, Refusal.WITHDRAWN):
-                self._forget(order, after=self._pause if outcome in (Refusal.FULL, Refusal.REPLACED) else 0.0)
+                self._forget(order, after=self._pause if outcome in RETRIED else 0.0)
             return outcome
         return None
 
@@ -172,7 +168,7 @@ class Settlement:
             return Refusal.DUPLICATE
         if order_id(order) in self._withdrawals:
             return Refusal.WITHDRAWN
-        return Refusal.REPLACED if self._versions.is_replaced(order_id(order)) else None
+        return self._versions.refusal(order_id(order), self.events.head)
 
     def withdraw(self, withdrawal: Verified[Withdrawal]) -> None:
         """Honour a withdrawal: its order leaves the book, and is refused until its deadline.
@@ -186,10 +182,14 @@ class Settlement:
             self._forget(withdrawal)
             return
         self._book.remove(identity)
-        if not self._withdrawals.is_kept(identity):
+        if not self._may_promise(identity):
             self._forget(withdrawal, after=self._pause)
         elif self.events.unconfirmed.get(identity) is None:
             self.rejections.honour(withdrawal)
+
+    def _may_promise(self, withdrawn: bytes) -> bool:
+        """Whether a withdrawn order is certainly not used: neither after a restart, nor after a reorganisation."""
+        return self._withdrawals.is_kept(withdrawn) and not self._versions.is_undecided(withdrawn, self.events.head)
 
     def block(self, signers: frozenset[str]) -> None:
         """Take no orders of these signers, and drop those in the book. A transaction that was sent can't be stopped."""
@@ -243,13 +243,16 @@ class Settlement:
             except (NodeUnreachable, TransactionTimeout):
                 may_be_sent = True
                 raise
+            except Reverted as error:
+                self._versions.failed(match, error.block)
+                raise
 
         return attempt
 
     def _is_taken_back(self, order: Verified[Order]) -> bool:
         identity = order_id(order)
-        is_replaced = identity in self._withdrawals or self._versions.is_replaced(identity)
-        return is_replaced or order.signer in self.blocked
+        is_refused = identity in self._withdrawals or self._versions.refusal(identity, self.events.head) is not None
+        return is_refused or order.signer in self.blocked
 
     def _put_back(self, match: Match) -> None:
         """No transaction of a match waits any more: put its orders back into the book unless they were used."""

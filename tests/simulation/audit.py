@@ -34,6 +34,8 @@ INVALID: Final = frozenset(
 """The findings of `aira verify` that no job of an honest robot may have."""
 MATCHED_WITHIN: Final = 40
 """Blocks without faults within which an open order becomes a contract, if there are robots."""
+DEARER_WITHIN: Final = 2
+"""In generation 5: blocks more for each order that costs more, and becomes a contract meanwhile."""
 DONE_WITHIN: Final = 70
 """Blocks without faults within which a robot's result is on the chain. The refund delay is longer."""
 
@@ -174,13 +176,26 @@ class Audit:
         for person in self._market.people:
             for order in person.orders:
                 open_for = order.deadline - max(order.posted, calm)
-                if order.told == "expired" and open_for >= MATCHED_WITHIN:
+                patience = MATCHED_WITHIN + DEARER_WITHIN * self._dearer(order)
+                if order.told == "expired" and open_for >= patience:
                     detail = f"{person.name} waited {open_for} blocks without faults for {order.order[:12]}"
                     self._market.violated("order-starved", detail)
         gone = {address for robot in self._market.robots if robot.has_left for address in self.jobs_of(robot)}
         for address, (created, ended, result) in blocks.items():
             if address not in gone and ended and not result and ended - max(created, calm) >= DONE_WITHIN:
                 self._market.violated("job-abandoned", f"{address}: {ended - max(created, calm)} blocks without faults")
+
+    def _dearer(self, order: Ordered) -> int:
+        """In generation 5, the orders that cost more than this one and became contracts before it expired.
+
+        The nonces of an account count: of its orders, and of a robot's offers, one becomes a contract at a time.
+        """
+        if self._market.plan.generation == 3:
+            return 0
+        others = (one for person in self._market.people for one in person.orders if one.contract)
+        return sum(
+            one.cost > order.cost and order.posted < one.told_block and one.posted < order.deadline for one in others
+        )
 
     def _blocks(self) -> dict[str, tuple[int, int, str]]:
         """Of each liability: in which block it was created, in which it ended (0: in none), and with what result."""

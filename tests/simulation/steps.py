@@ -9,7 +9,7 @@ from eth_utils.crypto import keccak
 
 from mesh.agent.orders import OrderState
 from mesh.chain import Finalized, NewLiability, Transfer
-from mesh.market.book import Refusal
+from mesh.market.refusals import Refusal
 from mesh.market.versions import lasting_hash
 from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, Offer, Result, address_bytes, decode
 from schemas.signing import Rejection

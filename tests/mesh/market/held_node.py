@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Self
 
@@ -23,6 +24,8 @@ class HeldNode:
     def __init__(self, node: str | Transport) -> None:
         self._node = node
         self._released: dict[str, asyncio.Event] = {}
+        self.waiting: Counter[str] = Counter()
+        """Requests that are held back, by method."""
 
     async def __aenter__(self) -> Self:
         self._http = aiohttp.ClientSession()
@@ -43,7 +46,9 @@ class HeldNode:
 
     async def make_request(self, method: str, params: Any) -> Any:
         if method in self._released:
+            self.waiting[method] += 1
             await self._released[method].wait()
+            self.waiting[method] -= 1
         if not isinstance(self._node, str):
             return await self._node.make_request(method, params)
         request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}

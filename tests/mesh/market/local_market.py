@@ -12,7 +12,17 @@ from mesh.chain.events import NewLiability
 from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
 from mesh.retry import RetryPolicy
-from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key, verify_message
+from schemas import (
+    Demand,
+    Offer,
+    RejectKey,
+    Result,
+    Withdrawal,
+    market_selector,
+    message_hash,
+    parse_key,
+    verify_message,
+)
 from schemas.signing import Rejection
 from tests.support.orders import RECORDING, terms
 from tests.support.waiting import until, until_found, until_heard
@@ -147,6 +157,12 @@ class LocalMarket:
     def offer(self, role: str = "robot", **changes: Any) -> Offer:
         """A signed offer that matches a demand with the same changes."""
         return self.accounts[role].signer.sign(Offer(**({"lighthouse_fee": 0} | self._terms(changes))))
+
+    def withdrawal(self, order: Demand | Offer, role: str = "person") -> Withdrawal:
+        """The withdrawal of an order, signed by a trader."""
+        digest = verify_message(order).hash.hex()
+        withdrawal = Withdrawal(order=digest, lighthouse=order.lighthouse, deadline=order.deadline)
+        return self.accounts[role].signer.sign(withdrawal)
 
     def result(self, liability: str, role: str = "robot", **changes: Any) -> Result:
         """A signed result."""

@@ -15,23 +15,16 @@ from tests.support.waiting import until
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from schemas import Demand, Offer
     from tests.mesh.market.local_market import LocalMarket
 
 ESTIMATE = "eth_estimateGas"
-
-
-def withdrawal_of(local: LocalMarket, order: Demand | Offer, role: str = "person") -> Withdrawal:
-    digest = verify_message(order).hash.hex()
-    withdrawal = Withdrawal(order=digest, lighthouse=order.lighthouse, deadline=order.deadline)
-    return local.accounts[role].signer.sign(withdrawal)
 
 
 async def test_a_withdrawn_order_leaves_the_book_and_is_refused(local: LocalMarket) -> None:
     async with local.provider() as provider:
         local.publish(demand := local.demand())
         await until(lambda: len(provider.book) == 1)
-        local.publish(withdrawal_of(local, demand))
+        local.publish(local.withdrawal(demand))
 
         honoured = await local.rejection_of(demand)
         assert (honoured.reason, honoured.provider) == ("withdrawn", provider.address)
@@ -45,7 +38,7 @@ async def test_a_withdrawn_order_leaves_the_book_and_is_refused(local: LocalMark
 async def test_an_order_that_arrives_after_its_withdrawal_is_refused(local: LocalMarket) -> None:
     async with local.provider() as provider:
         demand = local.demand()
-        local.publish(withdrawal_of(local, demand))
+        local.publish(local.withdrawal(demand))
         await local.rejection_of(demand)
         local.publish(demand, local.offer())
 
@@ -58,7 +51,7 @@ async def test_a_withdrawal_by_another_account_changes_nothing(local: LocalMarke
     async with local.provider() as provider:
         local.publish(demand := local.demand())
         await until(lambda: len(provider.book) == 1)
-        local.publish(stranger := withdrawal_of(local, demand, "rival"))
+        local.publish(stranger := local.withdrawal(demand, "rival"))
         await until(lambda: withdrawn_id(verify_message(stranger)) in provider.withdrawals)
 
         local.publish(local.offer())
@@ -71,7 +64,7 @@ async def test_a_match_is_not_made_if_an_order_is_withdrawn_before_its_turn(loca
         demand, offer = local.demand(), local.offer()
         local.publish(demand, offer)
         await until(lambda: len(rival.book) == 0 and rival.queue.waiting == 1 and rival.ledger.turnover().matches == 1)
-        local.publish(withdrawal := withdrawal_of(local, demand))
+        local.publish(withdrawal := local.withdrawal(demand))
         await until(lambda: withdrawn_id(verify_message(withdrawal)) in rival.withdrawals)
         assert local.rejections == []  # a transaction may be on its way
 
@@ -88,7 +81,7 @@ async def test_a_transaction_that_was_sent_is_not_stopped(local: LocalMarket) ->
         with node.back("eth_getTransactionReceipt"):
             local.publish(demand, local.offer())
             await local.liability_of(demand)
-            local.publish(withdrawal := withdrawal_of(local, demand))
+            local.publish(withdrawal := local.withdrawal(demand))
             await until(lambda: withdrawn_id(verify_message(withdrawal)) in provider.withdrawals)
         await until(lambda: provider.earnings().created == 1)
         assert local.rejections == []
@@ -97,7 +90,7 @@ async def test_a_transaction_that_was_sent_is_not_stopped(local: LocalMarket) ->
 async def test_withdrawals_survive_a_restart(local: LocalMarket, tmp_path: Path) -> None:
     path, demand = tmp_path / "withdrawals.sqlite", local.demand()
     async with local.provider(withdrawals=path):
-        local.publish(withdrawal_of(local, demand))
+        local.publish(local.withdrawal(demand))
         await local.rejection_of(demand)
 
     async with local.provider(withdrawals=path) as provider:
@@ -110,7 +103,7 @@ async def test_a_withdrawal_that_is_not_on_the_disk_is_not_promised(local: Local
     path, demand = tmp_path / "withdrawals.sqlite", local.demand()
     path.write_bytes(b"not a database, however you look at it" * 100)
     async with local.provider(withdrawals=path) as provider:
-        local.publish(withdrawal := withdrawal_of(local, demand))
+        local.publish(withdrawal := local.withdrawal(demand))
         await until(lambda: withdrawn_id(verify_message(withdrawal)) in provider.withdrawals)
         assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
         local.publish(known := local.demand(cost=2**200))
@@ -121,7 +114,7 @@ async def test_a_withdrawal_that_is_not_on_the_disk_is_not_promised(local: Local
 async def test_a_provider_that_starts_later_learns_withdrawals_from_others(local: LocalMarket) -> None:
     async with local.provider():
         demand = local.demand()
-        local.publish(withdrawal := withdrawal_of(local, demand))
+        local.publish(withdrawal := local.withdrawal(demand))
         await local.rejection_of(demand)
 
         async with local.provider("rival") as second:
@@ -136,7 +129,7 @@ async def test_withdrawals_are_known_until_no_reorganisation_reaches_their_deadl
 ) -> None:
     path, demand = tmp_path / "withdrawals.sqlite", local.demand(deadline=await local.chain.block_number() + 3)
     async with local.provider(withdrawals=path) as provider:
-        local.publish(withdrawal_of(local, demand))
+        local.publish(local.withdrawal(demand))
         await local.rejection_of(demand)
         await local.mine(3)
         await until_read(local, provider)

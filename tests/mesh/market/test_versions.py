@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from mesh.chain import Timing
 from mesh.market import Refusal, order_id
 from mesh.market.versions import OrderVersions
+from mesh.market.withdrawals import withdrawn_id
 from schemas import Demand, verify_message
+from tests.mesh.market.held_node import HeldNode
 from tests.mesh.market.observation import until_read
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from mesh.market.provider import Provider
     from tests.mesh.market.local_market import LocalMarket
+
+DEPTH = Timing().reorg_depth
 
 
 async def versions_of(local: LocalMarket, count: int, **terms: Any) -> list[Demand]:
@@ -43,9 +49,9 @@ async def test_orders_with_other_terms_or_of_others_are_no_versions(local: Local
         verify_message(local.demand("robot", nonce=nonce + 1, sender=local.address("robot"))),
         verify_message(local.demand()),
     ]
-    versions = OrderVersions()
+    versions = OrderVersions(DEPTH)
     assert [versions.note(order) for order in (first, *others)] == [None] * 5
-    assert not any(versions.is_replaced(order_id(order)) for order in (first, *others))
+    assert not any(versions.refusal(order_id(order), head=1) for order in (first, *others))
 
 
 async def test_no_version_is_settled_once_another_has_become_a_contract(local: LocalMarket) -> None:
@@ -68,3 +74,60 @@ async def test_no_version_is_settled_once_another_has_become_a_contract(local: L
         await local.mine(3)
         await until(lambda: provider.settlement.add(verify_message(newer)) is not Refusal.REPLACED)
         await until(lambda: list(provider.book.orders()) == [verify_message(newer)])
+
+
+async def fail_when_mined(local: LocalMarket, provider: Provider, node: HeldNode, demand: Demand) -> None:
+    """Have the provider's transaction of a demand mined after the nonce of its offer was used up."""
+    robot = local.address("robot")
+    offer = local.offer(sender=robot, nonce=await local.chain.liabilities.next_nonce(robot), cost=demand.cost)
+    with node.back("eth_sendRawTransaction"):
+        local.publish(demand, offer)
+        await until(lambda: order_id(verify_message(demand)) not in provider.book)
+        await until(lambda: node.waiting["eth_sendRawTransaction"])
+        async with local.chain_of("robot") as chain:
+            await chain.liabilities.withdraw(offer)
+    await until(lambda: provider.earnings().gas_used, what="it has failed when it was mined")
+
+
+async def test_no_other_version_is_settled_until_a_failed_transaction_is_deep(local: LocalMarket) -> None:
+    """A reorganisation might let the transaction succeed."""
+    older, newer = await versions_of(local, 2)
+    async with HeldNode(local.node) as node, local.provider(endpoint=node) as provider:
+        await fail_when_mined(local, provider, node, older)
+        await until(lambda: list(provider.book.orders()) == [verify_message(older)], what="the same version is")
+        assert provider.settlement.add(verify_message(newer)) is Refusal.UNDECIDED
+        assert (await local.rejection_of(newer)).reason == "undecided"
+        await local.mine(DEPTH - 1)
+        await until_read(local, provider)
+        assert provider.settlement.add(verify_message(newer)) is Refusal.UNDECIDED
+        await local.mine(1)
+        await until_read(local, provider)
+        assert provider.settlement.add(verify_message(newer)) is None
+        assert list(provider.book.orders()) == [verify_message(newer)]
+
+
+async def test_no_withdrawal_is_honoured_until_a_failed_transaction_is_deep(local: LocalMarket) -> None:
+    (order,) = await versions_of(local, 1)
+    async with HeldNode(local.node) as node, local.provider(endpoint=node) as provider:
+        await fail_when_mined(local, provider, node, order)
+        local.publish(withdrawal := local.withdrawal(order))
+        await until(lambda: withdrawn_id(verify_message(withdrawal)) in provider.withdrawals)
+        assert provider.settlement.add(verify_message(order)) is Refusal.WITHDRAWN
+        await local.mine(DEPTH)
+        await until_read(local, provider)
+        provider.settlement.withdraw(verify_message(withdrawal))
+        await local.rejection_of(order)
+        assert [rejection.reason for rejection in local.rejections] == ["WrongSigner", "withdrawn"]
+
+
+async def test_a_failed_transaction_in_a_replaced_block_is_mined_again_later(local: LocalMarket) -> None:
+    older, newer = map(verify_message, await versions_of(local, 2))
+    versions = OrderVersions(DEPTH)
+    versions.note(older)
+    versions.failed([older], block=10)
+    versions.note(newer)
+    versions.reorganised(10, head=14)
+    assert versions.refusal(order_id(newer), head=10 + DEPTH) is None
+    versions.reorganised(9, head=14)
+    assert versions.refusal(order_id(newer), head=14 + DEPTH) is Refusal.UNDECIDED
+    assert versions.refusal(order_id(newer), head=15 + DEPTH) is None
