@@ -6,9 +6,15 @@ An offer is sent again until its deadline, so what strangers make an agent offer
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from mesh.errors import AiraError
+from mesh.flood import BoundedDict
+from mesh.market.versions import lasting_hash
+
+if TYPE_CHECKING:
+    from mesh.agent.orders import TradedOrder
+    from schemas import Demand
 
 PER_MAKER: Final = 256
 """Open offers that answer demands of one maker."""
@@ -25,24 +31,26 @@ class TooManyOffers(AiraError, code="too-many-offers"):
 
 
 class OpenOffers:
-    """The open offers that answer demands, by their hashes, oldest first."""
+    """The open offers that answer demands, oldest first."""
 
     def __init__(self, *, per_maker: int = PER_MAKER, total: int = TOTAL) -> None:
         self._per_maker = per_maker
         self._total = total
-        self._offers: OrderedDict[str, tuple[str, bool]] = OrderedDict()
+        self._offers: OrderedDict[TradedOrder, tuple[str, bool]] = OrderedDict()
         self._makers: Counter[str] = Counter()
+        self._answers: BoundedDict[str, TradedOrder] = BoundedDict(total)
+        """The latest offer for each demand, by what the demand's versions share."""
 
     def __len__(self) -> int:
         return len(self._offers)
 
-    def add(self, offer: str, maker: str, *, pays: bool) -> str:
-        """Count an offer for a demand of `maker`; returns one to give up for it, or an empty text.
+    def add(self, offer: TradedOrder, maker: str, *, pays: bool) -> TradedOrder | None:
+        """Count an offer for a demand of `maker`; returns one to give up for it, or None.
 
         Given up is the newest offer for the maker with the most (those of earlier runs count as one maker's), or the
         oldest for a demand that pays nothing. Raises `TooManyOffers`.
         """
-        given_up = ""
+        given_up = None
         if self._makers[maker] >= self._per_maker and maker:
             raise TooManyOffers(maker)
         if len(self._offers) >= self._total:
@@ -52,7 +60,17 @@ class OpenOffers:
         self._makers[maker] += 1
         return given_up
 
-    def discard(self, offer: str) -> None:
+    def answer(self, demand: Demand | None, offer: TradedOrder) -> None:
+        """Remember which offer answers a demand, if it answers one."""
+        if demand is not None:
+            self._answers[lasting_hash(demand)] = offer
+
+    def answer_to(self, demand: Demand) -> TradedOrder | None:
+        """The open offer that answers an earlier version of a demand; it matches this one as well."""
+        offer = self._answers.get(lasting_hash(demand)) if demand.generation == 5 else None
+        return offer if offer is not None and offer.is_open else None
+
+    def discard(self, offer: TradedOrder) -> None:
         """Stop counting an offer. Unknown ones are ignored."""
         maker, _ = self._offers.pop(offer, (None, False))
         if maker is not None:
@@ -60,7 +78,7 @@ class OpenOffers:
             if not self._makers[maker]:
                 del self._makers[maker]
 
-    def _least(self, maker: str) -> str:
+    def _least(self, maker: str) -> TradedOrder:
         (heaviest, most), *_ = self._makers.most_common(1)
         if most > max(self._makers[maker], 1):
             return next(offer for offer in reversed(self._offers) if self._offers[offer][0] == heaviest)

@@ -63,7 +63,7 @@ class Trader(Lifecycle):
         self._covered = CoveredOrders(parts, self._orders, self._allowances)
         self.writer = TermsWriter(parts, self._orders)
         self._hear_declines: Callable[[], None] = lambda: None
-        self._answers = OpenOffers()
+        self.answers = OpenOffers()
         self._changing = asyncio.Lock()
         self._chain_withdrawals = ChainWithdrawals(parts, self._orders)
         self.contracts = WatchedContracts(parts, reports)
@@ -83,7 +83,7 @@ class Trader(Lifecycle):
         resumed = [order for order in await self.load() if order.is_open]
         for order in resumed:
             if isinstance(order.signed, Offer):
-                await self._give_up(self._answers.add(order.identity, "", pays=False))
+                await self._give_up(self.answers.add(order, "", pays=False))
             facts = log_event("order-resumed", order=order.identity, kind=order.signed.kind, deadline=order.deadline)
             log.info("the %s of an earlier run is open until block %d", order, order.deadline, extra=facts)
         await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
@@ -95,14 +95,14 @@ class Trader(Lifecycle):
             fail_future(order.created, ENDED())
         self.contracts.fail(ENDED())
 
-    async def post(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Order:
-        """Sign an order, ensure its allowance, and post it. Cancelling withdraws it.
+    async def post(self, kind: type[Demand | Offer], terms: Terms, answers: Demand | None = None, **fee: Any) -> Order:
+        """Sign an order, which perhaps answers a demand, ensure its allowance, and post it. Cancelling withdraws it.
 
         Raises `InsufficientTokens`, and `TooManyOffers` for an offer that answers a demand.
         """
         order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time())
         if kind is Offer and (buyer := current_buyer()) is not None:
-            await self._give_up(self._answers.add(order.identity, buyer.maker, pays=buyer.pays))
+            await self._give_up(self.answers.add(order, buyer.maker, pays=buyer.pays))
         self._orders[order.identity] = order
         if kind is Demand:
             self._hear_declines()
@@ -120,6 +120,7 @@ class Trader(Lifecycle):
         except LedgerUnusable:
             self._forget(order)
             raise
+        self.answers.answer(answers, order)
         return order.shown(self)
 
     async def contract_of(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
@@ -267,6 +268,7 @@ class Trader(Lifecycle):
                 self._forget(order)
                 await self._parts.outbox.settle(order.identity)
                 fail_future(order.created, error)
+                order.close(OrderState.WITHDRAWN)
                 facts = log_event("order-abandoned", order=order.identity, code=error.code)
                 log.warning("the %s can't be signed again: %s", order, error, extra=facts)
 
@@ -284,14 +286,14 @@ class Trader(Lifecycle):
         facts = log_event("order-renewed", order=identity, renewed=order.identity)
         log.info("the order %s is signed again as %s", identity, order.identity, extra=facts)
 
-    async def _give_up(self, identity: str) -> None:
+    async def _give_up(self, offer: TradedOrder | None) -> None:
         """Stop sending an offer. Providers that have it may still create its contract."""
-        if (order := self._orders.get(identity)) is not None:
-            self._forget(order)
-            order.close(OrderState.WITHDRAWN)
-            await self._parts.outbox.settle(identity)
+        if offer is not None and offer.is_open:
+            self._forget(offer)
+            offer.close(OrderState.WITHDRAWN)
+            await self._parts.outbox.settle(offer.identity)
 
     def _forget(self, order: TradedOrder) -> None:
         self._orders.pop(order.identity, None)
-        self._answers.discard(order.identity)
+        self.answers.discard(order)
         self._allowances.release(order)

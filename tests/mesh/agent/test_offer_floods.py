@@ -4,43 +4,57 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from mesh.agent.offers import OpenOffers, TooManyOffers
+from mesh.agent.orders import TradedOrder
 from mesh.network import Endpoints, Network
 from mesh.work.outbox import RESEND_RATE, outgoing
-from schemas import market_selector
+from schemas import cid_of_file, market_selector
 from tests.mesh.agent.test_demand_floods import dead_demand, stranger
 from tests.mesh.agent.trades import waiting
 from tests.support import orders
 from tests.support.market import Place, offering_unseen
+from tests.support.objectives import objective
 from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from schemas import Demand, Verified
 
 FAR = 10**9
 """A deadline that a stranger chose."""
 
 
-def test_the_maker_with_the_most_offers_loses_its_newest() -> None:
+@pytest.fixture
+def made() -> Callable[[], TradedOrder]:
+    """Makes offers."""
+    return lambda: TradedOrder(orders.offer(), posted=0.0)
+
+
+def test_the_maker_with_the_most_offers_loses_its_newest(made: Callable[[], TradedOrder]) -> None:
     offers = OpenOffers(per_maker=3, total=4)
-    assert [offers.add(f"f{n}", "flood", pays=True) for n in range(3)] == [""] * 3
+    flood, others = [made() for _ in range(3)], {maker: made() for maker in ("alice", "bob", "carol", "dave", "erin")}
+    assert [offers.add(offer, "flood", pays=True) for offer in flood] == [None] * 3
     with pytest.raises(TooManyOffers):
-        offers.add("f3", "flood", pays=True)
-    assert offers.add("a0", "alice", pays=False) == ""
-    assert offers.add("b0", "bob", pays=False) == "f2"
-    assert offers.add("c0", "carol", pays=False) == "f1"
-    assert offers.add("d0", "dave", pays=True) == "a0"
-    assert offers.add("e0", "erin", pays=True) == "b0"
-    offers.discard("e0")
-    assert offers.add("g0", "gina", pays=True) == ""
+        offers.add(made(), "flood", pays=True)
+    assert offers.add(others["alice"], "alice", pays=False) is None
+    assert offers.add(others["bob"], "bob", pays=False) is flood[2]
+    assert offers.add(others["carol"], "carol", pays=False) is flood[1]
+    assert offers.add(others["dave"], "dave", pays=True) is others["alice"]
+    assert offers.add(others["erin"], "erin", pays=True) is others["bob"]
+    offers.discard(others["erin"])
+    assert offers.add(made(), "gina", pays=True) is None
     assert len(offers) == 4
 
 
-def test_offers_of_earlier_runs_count_as_one_makers() -> None:
-    offers = OpenOffers(per_maker=2, total=3)
-    assert [offers.add(f"old{n}", "", pays=False) for n in range(3)] == [""] * 3
-    assert offers.add("new", "alice", pays=False) == "old2"
+def test_offers_of_earlier_runs_count_as_one_makers(made: Callable[[], TradedOrder]) -> None:
+    offers, old = OpenOffers(per_maker=2, total=3), [made() for _ in range(3)]
+    assert [offers.add(offer, "", pays=False) for offer in old] == [None] * 3
+    assert offers.add(made(), "alice", pays=False) is old[2]
 
 
 async def test_a_strangers_deadline_is_not_copied_into_an_offer(place: Place) -> None:
@@ -50,6 +64,28 @@ async def test_a_strangers_deadline_is_not_copied_into_an_offer(place: Place) ->
         await until(robot.orders)
         head = await place.chains["robot"].block_number()
         assert head < robot.orders()[0].deadline <= head + 50
+
+
+async def test_a_demand_of_generation_5_that_is_signed_again_is_not_offered_again(place: Place) -> None:
+    """The offer for its earlier version matches the new one, too."""
+    robot = place.agent("robot")
+    answers: list[str] = []
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        answers.append(await robot.offer(demand))
+
+    path, signer = place.save(objective(("/go", "there"))), place.market.accounts["person"].signer
+    terms: dict[str, Any] = {"cost": 0, "deadline": await place.chains["robot"].block_number() + 50}
+    terms |= {"sender": signer.address, "objective": cid_of_file(path)}
+    async with robot, stranger(place) as channel:
+        await robot.add(path)
+        for nonce, deadline in ((0, 0), (1, 0), (1, 1)):
+            changes = terms | {"nonce": nonce, "deadline": terms["deadline"] - deadline}
+            channel.publish(dead_demand(place, signer, **changes))
+            await until(lambda: len(answers) > nonce + deadline)  # noqa: B023
+        assert answers[0] == answers[1] != answers[2]
+        assert sorted(order.hash for order in robot.orders()) == sorted(answers[1:])
 
 
 async def test_three_thousand_offers_are_not_sent_at_once_after_a_restart(place: Place) -> None:

@@ -75,6 +75,7 @@ async def test_overtaken_offers_of_generation_5_are_signed_again(place: Place) -
         async with place.provider():
             contracts = [await demand for demand in demands]
             assert [(await contract.outcome()).success for contract in contracts] == [True, True]
+        await until(lambda: len(robot.runtime.trader.answers) == 0)
 
 
 async def test_an_overtaken_demand_of_generation_5_is_signed_again_without_a_rejection(place: Place) -> None:

@@ -11,7 +11,6 @@ from mesh.flood import Drops, KnownSenders
 from mesh.market import Added, OrderBook, Refusal
 from mesh.market.arrivals import CHECKED, Arrivals
 from schemas import Demand, Signer, verify_message
-from tests.mesh.market.test_provider_withdrawals import withdrawal_of
 from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand, verified_offer
 from tests.support.waiting import until, until_found
 
@@ -153,7 +152,7 @@ async def test_an_evicted_order_is_accepted_again_when_there_is_room(local: Loca
         local.publish(other)
         await until(lambda: set(provider.book.orders()) == {verify_message(first), verify_message(other)})
         assert provider.drops.totals() == {"book-full": 1}
-        local.publish(withdrawal_of(local, first))
+        local.publish(local.withdrawal(first))
         await until(lambda: len(provider.book) == 1)
 
         async def is_back() -> bool:
