@@ -14,7 +14,7 @@ from bridges.web.views import result_json
 from mesh.background import Background
 from mesh.errors import AiraError
 from mesh.flood import BoundedDict
-from mesh.market.book import Refusal
+from mesh.market.refusals import Refusal
 from mesh.role import Lifecycle
 from mesh.watching import JobEvent, MarketWatch
 from schemas import Demand, Offer, Result, Verified

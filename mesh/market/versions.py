@@ -41,7 +41,7 @@ def lasting_hash(order: Order) -> str:
     return message_hash(order if order.generation == 3 else replace(order, nonce=0)).hex()
 
 
-class _Failure(NamedTuple):
+class _FailedVersion(NamedTuple):
     identity: bytes
     block: int
 
@@ -61,7 +61,7 @@ class OrderVersions:
         """The version that has become a contract."""
         self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(limit)
         """What each contract (address) is of."""
-        self._failures: BoundedDict[_Key, _Failure] = BoundedDict(limit)
+        self._failures: BoundedDict[_Key, _FailedVersion] = BoundedDict(limit)
         """Of which version the latest transaction failed that was mined, and in which block."""
 
     def note(self, order: Verified[Order]) -> bytes | None:
@@ -104,7 +104,7 @@ class OrderVersions:
     def failed(self, orders: Iterable[Verified[Order]], block: int) -> None:
         """A transaction with these orders failed in a block; in none if it was not mined."""
         for order in orders if block else ():
-            self._failures[self._key(order)] = _Failure(order_id(order), block)
+            self._failures[self._key(order)] = _FailedVersion(order_id(order), block)
 
     def reorganised(self, last: int, head: int) -> None:
         """The blocks after `last`, up to `head`, were replaced: what failed in them is mined again in a later one."""

@@ -301,10 +301,18 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "a provider settles older versions of an order",
-        "mesh.market.versions:OrderVersions.is_replaced",
+        "mesh.market.versions:OrderVersions.refusal",
         "if key is None:",
         "if True:",
         REORGANISATIONS + ",repeat_every",
+        jobs=100,
+    ),
+    Mutation(
+        "another version of an order is settled although a failed transaction may succeed",
+        "mesh.market.versions:OrderVersions.is_undecided",
+        "return failure is not None",
+        "return False",
+        REORGANISATIONS + ",revoke",
         jobs=100,
     ),
     Mutation(
