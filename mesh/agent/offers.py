@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.errors import AiraError
 from mesh.flood import BoundedDict
 from mesh.market.versions import lasting_hash
+from schemas import Offer
 
 if TYPE_CHECKING:
     from mesh.agent.orders import TradedOrder
@@ -39,7 +40,7 @@ class OpenOffers:
         self._offers: OrderedDict[TradedOrder, tuple[str, bool]] = OrderedDict()
         self._makers: Counter[str] = Counter()
         self._answers: BoundedDict[str, TradedOrder] = BoundedDict(total)
-        """The latest offer for each demand, by what the demand's versions share."""
+        """The latest offer for each demand of generation 5, by what the demand's versions share."""
 
     def __len__(self) -> int:
         return len(self._offers)
@@ -61,14 +62,16 @@ class OpenOffers:
         return given_up
 
     def answer(self, demand: Demand | None, offer: TradedOrder) -> None:
-        """Remember which offer answers a demand, if it answers one."""
-        if demand is not None:
+        """Remember which offer answers a demand, if it answers one of generation 5."""
+        if demand is not None and demand.generation == 5:
             self._answers[lasting_hash(demand)] = offer
 
-    def answer_to(self, demand: Demand) -> TradedOrder | None:
-        """The open offer that answers an earlier version of a demand; it matches this one as well."""
+    def answer_to(self, demand: Demand, *, lighthouse_fee: int) -> TradedOrder | None:
+        """The open offer, with this fee, that answers another version of a demand; it matches this one as well."""
         offer = self._answers.get(lasting_hash(demand)) if demand.generation == 5 else None
-        return offer if offer is not None and offer.is_open else None
+        if offer is None or not offer.is_open or not isinstance(offer.signed, Offer):
+            return None
+        return offer if offer.signed.lighthouse_fee == lighthouse_fee else None
 
     def discard(self, offer: TradedOrder) -> None:
         """Stop counting an offer. Unknown ones are ignored."""

@@ -114,28 +114,28 @@ class TradingAgent(Lifecycle):
     ) -> str:
         """Offer to do a job; returns the order's hash (hex). The offer is resent until it is matched or expires.
 
-        With a `demand` the offer agrees to its terms, once its objective was examined; an offer that is open for an
-        earlier version of it (generation 5) is enough. Else `objective` (CID), `cost` (`"5 XRT"`, or a number of the
-        token's smallest unit), `token` and `validator` (names or addresses) are the terms, valid for `lifetime` blocks,
-        by default about ten minutes. `lighthouse_fee` (`"0.1 XRT"`, or wn) is paid to the provider.
+        With a `demand` the offer agrees to its terms, once its objective was examined; in generation 5, an open offer
+        with the same fee for another version of it is enough. Else `objective` (CID), `cost` (`"5 XRT"`, or a number of
+        the token's smallest unit), `token` and `validator` (names or addresses) are the terms, valid for `lifetime`
+        blocks, by default about ten minutes. `lighthouse_fee` (`"0.1 XRT"`, or wn) is paid to the provider.
 
         Raises `InsufficientTokens`, `InvalidAmount`, for an objective that can't be played `ObjectiveUnfit` or a
         `ContentError`, and `Declined` for a demand whose validator wants a higher fee, or is not one of the setting
         `accepted_validators`.
         """
-        trader = self.runtime.trader
+        trader, fee = self.runtime.trader, XRT.amount(lighthouse_fee)
         wanted = demand.message if isinstance(demand, Verified) else demand
         if wanted is not None:
-            if (answer := trader.answers.answer_to(wanted)) is not None:
-                return answer.identity
             await self.runtime.validators.require_accepted(wanted, self.settings.accepted_validators)
             await self.examine(wanted.objective)
+            if (answer := trader.answers.answer_to(wanted, lighthouse_fee=fee)) is not None:
+                return answer.identity
             terms = trader.writer.terms_of(wanted)
         else:
             terms = await trader.writer.terms(
                 model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
             )
-        return (await trader.post(Offer, terms, answers=wanted, lighthouse_fee=XRT.amount(lighthouse_fee))).hash
+        return (await trader.post(Offer, terms, answers=wanted, lighthouse_fee=fee)).hash
 
     async def examine(self, cid: str) -> Objective:
         """The objective with that CID, fetched if needed, after it was checked as before a job.

@@ -129,14 +129,23 @@ class Resubmission:
             nonce, sent = gap, self._pending.sent(gap)
             if sent is not None and sent.is_watched:
                 await self.send_again(sent)
-            elif sent is not None and await self._pending.take_over(sent):
-                try:
-                    await (self.replace(sent) if nonce == first else self.send_again(sent))
-                finally:
-                    self._pending.abandon(sent)
+            elif await self._resubmit(nonce, is_first=nonce == first):
+                pass
             elif nonce in self._pending.taken or not await self._fill(nonce, waiting, was_missing=was_missing):
                 return
             gap = await self._node.transaction_count(self._account.address, pending=True)
+
+    async def _resubmit(self, nonce: int, *, is_first: bool) -> bool:
+        """Send a transaction again that nothing waits for; False if there is none, or another process waits for it."""
+        async with self._pending.lock:  # what sends the same meanwhile must find it
+            sent = self._pending.sent(nonce)
+            if sent is None or sent.is_watched or not await self._pending.take_over(sent):
+                return sent is not None and sent.is_watched
+            try:
+                await (self.replace(sent) if is_first else self.send_again(sent))
+            finally:
+                self._pending.abandon(sent)
+        return True
 
     async def _fill(self, nonce: int, waiting: PendingTransaction, *, was_missing: bool) -> bool:
         """Use a nonce that the node knows no transaction of, so that later ones can be mined; whether it was done.

@@ -247,6 +247,8 @@ class TransactionSender:
             return why
         except RequestRefused as refused:
             return Reverted(refused.detail)
+        except NodeUnreachable:
+            return Reverted("")
         return Reverted("OutOfGas" if receipt.gas_used >= fields["gas"] else "")
 
     async def _raise_if_poor(self, fields: dict[str, Any], refused: RequestRefused) -> None:

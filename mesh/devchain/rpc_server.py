@@ -30,6 +30,8 @@ HEARTBEAT: Final = 30.0
 MAX_UNSENT: Final = 10_000
 """Messages that wait for a client to read them; a client that falls further behind is disconnected."""
 MAX_UNSENT_BYTES: Final = 64_000_000
+ACCEPTED_WITHIN: Final = 0.02
+"""Seconds after which connections that were accepted before the end are made, and can be closed."""
 MAX_CONNECTIONS: Final = 200
 """WebSockets that are open at once; more are refused with HTTP 503."""
 MAX_SUBSCRIPTIONS: Final = 100
@@ -91,17 +93,23 @@ class JsonRpcServer:
         app.on_shutdown.append(self._close_sockets)
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0)
         await self._runner.setup()
+        factory = self._runner.server
+        assert factory is not None
         try:
-            await web.TCPSite(self._runner, self._host, self._port).start()
+            self._listener = await asyncio.get_running_loop().create_server(factory, self._host, self._port)
         except OSError as error:
             await self._runner.cleanup()
             why = os.strerror(error.errno) if error.errno else str(error)
             raise PortUnavailable(self._host, self._port, why) from None
-        self._port = self._runner.addresses[0][1]
+        self._port = self._listener.sockets[0].getsockname()[1]
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
         if self._runner is not None:
+            for listening in self._listener.sockets:
+                asyncio.get_running_loop().remove_reader(listening)
+            await asyncio.sleep(ACCEPTED_WITHIN)  # a connection that is made after `close` would never be closed
+            self._listener.close()
             await self._runner.cleanup()
             self._runner = None
 

@@ -168,8 +168,8 @@ class LiabilityEvents:
 
     def _revert(self, block: Reorganisation) -> list[Verified[Any]]:
         """The messages whose effect a reorganisation reverted. The contracts refuse those that were used again."""
-        self._versions.reorganised(block.block_number, self.head)
-        self.head = block.block_number
+        before, self.head = self.head, block.block_number
+        self._versions.reorganised(self.head, before)
         created = [event for event in block.reverted_events if isinstance(event, NewLiability)]
         finalized = [event for event in block.reverted_events if isinstance(event, Finalized)]
         facts = log_event("chain-reorganised", head=self.head, created=len(created), finalized=len(finalized))
@@ -178,7 +178,7 @@ class LiabilityEvents:
         for creation in created:
             self._earnings.creation_reverted(creation.liability, creation.tx)
             self.open.pop(creation.liability, None)
-            self._versions.free(creation.liability)
+            self._versions.free(creation.liability, before)
             again += self.unconfirmed.reverted(creation.liability, Demand, Offer)
         for end in finalized:
             self._earnings.reverted(end.tx)

@@ -24,7 +24,7 @@ class Refusal(StrEnum):
     REPLACED = "replaced"
     """Its maker has signed it again, or another version of it has become a contract."""
     UNDECIDED = "undecided"
-    """A failed transaction with another version of it may still succeed, after a reorganisation; try again later."""
+    """A transaction with another version of it may still succeed, after a reorganisation; try again later."""
     BLOCKED = "blocked"
     """Its maker is blocked; this is not published."""
 

@@ -90,6 +90,7 @@ class Settlement:
             forget=forget,
             open_limit=open_limit,
         )
+        self._ask = partial(chain.retrying, outages=self.events.lookups)
         self._commitments = Commitments(self._funding, waiting=queue.counted)
         self.results: Final = ResultSettlement(
             chain,
@@ -134,8 +135,8 @@ class Settlement:
             self.events.unconfirmed.begin(*outcome)
             self._tasks.create_task(self._create(outcome))
         elif isinstance(outcome, Refusal):
-            is_unsure = outcome is Refusal.WITHDRAWN and not self._may_promise(order_id(order))
-            if outcome is not Refusal.DUPLICATE and not is_unsure:
+            is_no_promise = outcome is Refusal.WITHDRAWN and not self._may_promise(order_id(order))
+            if outcome is not Refusal.DUPLICATE and not is_no_promise:
                 self.rejections.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
             if outcome not in (Refusal.DUPLICATE, Refusal.WITHDRAWN):
                 self._forget(order, after=self._pause if outcome in RETRIED else 0.0)
@@ -182,13 +183,13 @@ class Settlement:
             self._forget(withdrawal)
             return
         self._book.remove(identity)
-        if not self._may_promise(identity):
-            self._forget(withdrawal, after=self._pause)
-        elif self.events.unconfirmed.get(identity) is None:
+        if self._may_promise(identity) and self.events.unconfirmed.get(identity) is None:
             self.rejections.honour(withdrawal)
+        else:
+            self._forget(withdrawal, after=self._pause)
 
     def _may_promise(self, withdrawn: bytes) -> bool:
-        """Whether a withdrawn order is certainly not used: neither after a restart, nor after a reorganisation."""
+        """Whether a withdrawal is known after a restart, and no transaction with its order may still succeed."""
         return self._withdrawals.is_kept(withdrawn) and not self._versions.is_undecided(withdrawn, self.events.head)
 
     def block(self, signers: frozenset[str]) -> None:
@@ -225,6 +226,7 @@ class Settlement:
                 log.info("created, gas %(gas)d", facts, extra=log_event("contract-created", **facts))
             if not await self.events.is_confirmed(match, created.tx):
                 self._earnings.creation_reverted(created.liability, created.tx)
+                self._versions.failed(match, self.events.head, head=self.events.head)
             self._put_back(match)
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
@@ -244,7 +246,7 @@ class Settlement:
                 may_be_sent = True
                 raise
             except Reverted as error:
-                self._versions.failed(match, error.block)
+                self._versions.failed(match, error.block, head=self.events.head)
                 raise
 
         return attempt
@@ -277,12 +279,10 @@ class Settlement:
 
     async def shortages(self, orders: Sequence[Verified[Order]], *, fresh: bool = False) -> list[str]:
         """What makers of orders lack to pay for them: see `OrderCosts.shortages`. Asked until the node answers."""
-        question = partial(self._chain.costs.shortages, orders, fresh=fresh)
-        return await self._chain.retrying(question, outages=self.events.lookups)
+        return await self._ask(partial(self._chain.costs.shortages, orders, fresh=fresh))
 
     async def _funding(self, holdings: Sequence[Holding]) -> Mapping[Holding, Funding | None]:
-        question = partial(self._chain.funds.of, holdings, fresh=True)
-        return await self._chain.retrying(question, outages=self.events.lookups)
+        return await self._ask(partial(self._chain.funds.of, holdings, fresh=True))
 
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""

@@ -4,8 +4,9 @@ When another order of an account has used a nonce, the account signs its open or
 reorganisation may free the nonce: then the older version would be valid again, and after it the newer one. A provider
 settles the newest version only, and none once another version has become a contract.
 
-A transaction that failed when it was mined costs its order nothing, but a reorganisation may have it mined again, with
-success. Until its block is deep, a provider settles no other version of the order, and does not say that it is dead.
+A transaction that failed when it was mined may succeed after all, if a reorganisation has it mined again; so may one
+whose contract a reorganisation reverted. Until its block is deep, the order is undecided: a provider settles no other
+version of it, and honours no withdrawal.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ def lasting_hash(order: Order) -> str:
     return message_hash(order if order.generation == 3 else replace(order, nonce=0)).hex()
 
 
-class _FailedVersion(NamedTuple):
+class _Undecided(NamedTuple):
+    """A version with which a transaction may still succeed, and the block that decides once it is deep."""
+
     identity: bytes
     block: int
 
@@ -49,7 +52,7 @@ class _FailedVersion(NamedTuple):
 class OrderVersions:
     """The versions of the orders that a provider has seen; the last `limit` of them.
 
-    A reorganisation replaces blocks that are up to `reorg_depth` blocks behind the head.
+    In generation 3 there is one of each. A reorganisation replaces up to `reorg_depth` blocks.
     """
 
     def __init__(self, reorg_depth: int, *, limit: int = LIMIT) -> None:
@@ -61,14 +64,13 @@ class OrderVersions:
         """The version that has become a contract."""
         self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(limit)
         """What each contract (address) is of."""
-        self._failures: BoundedDict[_Key, _FailedVersion] = BoundedDict(limit)
-        """Of which version the latest transaction failed that was mined, and in which block."""
+        self._undecided: BoundedDict[_Key, _Undecided] = BoundedDict(limit)
 
     def note(self, order: Verified[Order]) -> bytes | None:
         """Remember an order. Returns the identity of the version that it replaces, if that was the newest."""
         if order.message.generation == 3:
             return None
-        identity, nonce, key = order_id(order), int(order.message.nonce), self._key(order)
+        identity, nonce, key = order_id(order), int(order.message.nonce), self._key_of(order)
         before = self._newest.get(key)
         if before is not None and before.nonce >= nonce:
             return None
@@ -77,48 +79,50 @@ class OrderVersions:
 
     def refusal(self, identity: bytes, head: int) -> Refusal | None:
         """Why a version of an order is not settled, at block `head`: for the sake of another one."""
-        key = self._keys.get(identity)
-        if key is None:
+        if (key := self._keys.get(identity)) is None:
             return None
-        newest, failure = self._newest.get(key), self._failures.get(key)
+        newest, undecided = self._newest.get(key), self._undecided.get(key)
         if self._used.get(key, identity) != identity or (newest is not None and newest.identity != identity):
             return Refusal.REPLACED
-        is_other = failure is not None and failure.identity != identity
+        is_other = undecided is not None and undecided.identity != identity
         return Refusal.UNDECIDED if is_other and self.is_undecided(identity, head) else None
 
     def is_undecided(self, identity: bytes, head: int) -> bool:
-        """Whether, at block `head`, a failed transaction with a version of this order may still succeed."""
-        failure = self._failures.get(self._keys.get(identity, ("", "")))
-        return failure is not None and failure.block + self._depth > head
+        """Whether, at block `head`, a transaction with a version of this order may still succeed."""
+        undecided = self._undecided.get(self._key(identity))
+        return undecided is not None and undecided.block + self._depth > head
 
     def use(self, identity: bytes, liability: str) -> bytes | None:
         """A version became the contract at an address. Returns the identity of the newest one, if that is another."""
-        key = self._keys.get(identity)
-        if key is None:
-            return None
+        key = self._key(identity)
         self._used[key] = identity
         self._contracts[liability] = (*self._contracts.get(liability, ()), key)
         newest = self._newest.get(key)
         return None if newest is None or newest.identity == identity else newest.identity
 
-    def failed(self, orders: Iterable[Verified[Order]], block: int) -> None:
-        """A transaction with these orders failed in a block; in none if it was not mined."""
+    def failed(self, orders: Iterable[Verified[Order]], block: int, *, head: int) -> None:
+        """A transaction with these orders failed, or vanished, in a block (0: it was not mined); `head` is known."""
         for order in orders if block else ():
-            self._failures[self._key(order)] = _FailedVersion(order_id(order), block)
+            self._undecided[self._key_of(order)] = _Undecided(order_id(order), max(block, head))
 
     def reorganised(self, last: int, head: int) -> None:
-        """The blocks after `last`, up to `head`, were replaced: what failed in them is mined again in a later one."""
-        for key, failure in self._failures.items():
-            if failure.block > last:
-                dict.__setitem__(self._failures, key, failure._replace(block=max(failure.block, head + 1)))
+        """The blocks after `last`, up to `head`, were replaced: their transactions are mined again in later ones."""
+        for key, undecided in list(self._undecided.items()):
+            if undecided.block > last:
+                self._undecided[key] = undecided._replace(block=max(undecided.block, head + 1))
 
-    def free(self, liability: str) -> None:
-        """A reorganisation reverted the contract at an address."""
+    def free(self, liability: str, head: int) -> None:
+        """A reorganisation of the blocks up to `head` reverted the contract at an address."""
         for key in self._contracts.pop(liability, ()):
-            self._used.pop(key, None)
+            if (identity := self._used.pop(key, None)) is not None:
+                self._undecided[key] = _Undecided(identity, head + 1)
 
-    def _key(self, order: Verified[Order]) -> _Key:
-        key = self._keys.get(identity := order_id(order))
-        if key is None:
-            key = self._keys[identity] = lasting_hash(order.message), order.signer
-        return key
+    def _key_of(self, order: Verified[Order]) -> _Key:
+        identity = order_id(order)
+        if order.message.generation == 5:
+            key = self._keys.get(identity) or (lasting_hash(order.message), order.signer)
+            self._keys[identity] = key
+        return self._key(identity)
+
+    def _key(self, identity: bytes) -> _Key:
+        return self._keys.get(identity) or (identity.hex(), "")

@@ -302,7 +302,7 @@ CANDIDATES: Final = (
     Mutation(
         "a provider settles older versions of an order",
         "mesh.market.versions:OrderVersions.refusal",
-        "if key is None:",
+        "if (key := self._keys.get(identity)) is None:",
         "if True:",
         REORGANISATIONS + ",repeat_every",
         jobs=100,
@@ -310,7 +310,7 @@ CANDIDATES: Final = (
     Mutation(
         "another version of an order is settled although a failed transaction may succeed",
         "mesh.market.versions:OrderVersions.is_undecided",
-        "return failure is not None",
+        "return undecided is not None",
         "return False",
         REORGANISATIONS + ",revoke",
         jobs=100,

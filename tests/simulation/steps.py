@@ -115,6 +115,8 @@ class StepAudit:
 
     def _sent_by_provider(self, pooled: PooledTransaction, number: int) -> None:
         sent = pooled.sender, self._chain.evm.read(pooled.raw).data
+        if not sent[1]:  # it only uses a lost nonce up
+            return
         if sent in self._submitted:
             self._market.violated("submitted-twice", f"by {pooled.sender.hex()} in block {number}")
         receipt = self._chain.evm.receipt(pooled.hash)
@@ -140,12 +142,23 @@ class StepAudit:
         is_excused = order.told_ns < self._reorganised_ns + UNSETTLED_NS
         if order.is_dead and (not is_excused or order.told == "nothing-found"):
             self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
+        self._check_withdrawn(liability, demand)
         versions = {one for one, maker in self.demands.items() if maker == (person, number)}
         # Before blocks were replaced; people may have restarted since.
         was_there = self._before.get(liability) == demand
         is_known = was_there or order.contract or versions & person.listed
         if person.agent_is_open and not order.is_over and not is_known:
             self._market.violated("unannounced-payment", f"{person.name}'s agent does not list {demand[:12]}")
+
+    def _check_withdrawn(self, liability: str, demand: str) -> None:
+        """The only provider, if it was never restarted, makes no contract of an order whose withdrawal it honours.
+
+        A restarted one does not know what it has sent before.
+        """
+        is_promised = any((one.name, demand) in self.honoured for one in self._market.providers)
+        is_settled = len(self._market.providers) == self._market.providers[0].starts == 1
+        if is_promised and is_settled and liability not in self._before:
+            self._market.violated("contract-after-withdrawal", f"{liability} is of the withdrawn {demand[:12]}")
 
     def told(self, person: PersonRole, number: int) -> None:
         """A person was told something of an order."""

@@ -13,7 +13,9 @@ from mesh.chain import GWEI, Account, Node, TransactionSender, TransactionTimeou
 from mesh.chain.errors import TransactionsNotKept
 from tests.mesh.chain.conftest import QUICK, raises_with
 from tests.mesh.chain.senders import NO_MINING, SHORT, anvil, open_sender, pending_hashes, until_pending, unused_address
+from tests.mesh.market.held_node import HeldNode
 from tests.support.nodes import Anvil
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -134,6 +136,29 @@ async def test_a_stuck_transaction_of_an_earlier_process_is_replaced(anvil: Anvi
         await node.request("evm_mine")
         await sending
         assert await node.eth_balance(friend) == 3
+
+
+async def test_a_transaction_that_is_being_replaced_is_not_sent_a_second_time(anvil: Anvil, tmp_path: Path) -> None:
+    """Another one waits for its nonce, and gives it higher fees just when it is sent again."""
+    friend, timing = unused_address(), replace(QUICK, replace_after=0.1)
+    async with open_sender(anvil, SHORT, transactions=tmp_path) as (_, sender):
+        with pytest.raises(TransactionTimeout):
+            await sender.send(to=friend, data=b"", value=1)
+    async with HeldNode(anvil.url) as held, Node(held, timing=timing, transactions=tmp_path) as node:
+        sender = TransactionSender(node, sender.account)
+        later = asyncio.create_task(sender.send(to=friend, data=b"", value=2))
+        await until_pending(node, 2)
+        with held.back("eth_sendRawTransaction"):
+            await until(lambda: held.waiting["eth_sendRawTransaction"])
+            again = asyncio.create_task(sender.send(to=friend, data=b"", value=1))
+            await asyncio.sleep(0.3)
+        async with asyncio.timeout(30):
+            while not (later.done() and again.done()):
+                await node.request("evm_mine")
+                await asyncio.sleep(0.05)
+        assert (await later).tx != (await again).tx
+        assert await node.eth_balance(friend) == 3
+        assert await node.transaction_count(sender.account.address) == 2
 
 
 async def test_a_transaction_folder_belongs_to_one_chain(tmp_path: Path) -> None:
