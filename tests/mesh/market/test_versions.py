@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -134,7 +135,10 @@ async def test_no_withdrawal_is_honoured_until_a_failed_transaction_is_deep(
         assert provider.settlement.add(verify_message(order)) is Refusal.WITHDRAWN
         await local.mine(DEPTH)
         await until_read(local, provider)
-        await until(lambda: local.publish(withdrawal) or "withdrawn" in reasons(local), pause=0.05)
+        async with asyncio.timeout(60):
+            while "withdrawn" not in reasons(local):
+                local.publish(withdrawal)
+                await asyncio.sleep(0.05)
         assert reasons(local).count("withdrawn") == 1
 
 
