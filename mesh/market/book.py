@@ -7,23 +7,21 @@ the same time at a thousand open orders and at a million; an order takes little 
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from mesh.flood import KnownSenders
+from mesh.market.queues import QueueNode, Queues, Share
 from mesh.market.refusals import Refusal
 from schemas import Demand, address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
 
     from schemas import Offer, Verified
 
     Order = Demand | Offer
     Terms = tuple[str, str, str, int, str, int]
-
-K = TypeVar("K", bound="Hashable")
-T = TypeVar("T")
 
 LIMIT: Final = 24_576
 """Open orders that a book holds by default: with up to 2 KB each, a provider stays below 200 MB."""
@@ -50,68 +48,13 @@ def order_id(order: Verified[Any]) -> bytes:
     return order.hash + address_bytes(order.signer)
 
 
-class QueueNode(Generic[T]):
-    """An item in a queue. A queue is a ring: the last node's `after` is the first.
-
-    Outside a queue a node has no neighbours, not even itself: a cycle would keep the item until the next garbage
-    collection.
-    """
-
-    __slots__ = ("after", "before", "item")
-
-    def __init__(self, item: T) -> None:
-        self.item = item
-        self.before: QueueNode[T]
-        self.after: QueueNode[T]
-
-
-class Queues(Generic[K, T]):
-    """A first-in-first-out queue for each key, with removal from the middle in constant time.
-
-    An empty queue takes no memory.
-    """
-
-    def __init__(self) -> None:
-        self._first: dict[K, QueueNode[T]] = {}
-
-    def first(self, key: K) -> QueueNode[T] | None:
-        """The node that has waited longest at `key`."""
-        return self._first.get(key)
-
-    def items(self, key: K) -> Iterator[T]:
-        """The items of the queue at `key`, the one that has waited longest first; it must not change meanwhile."""
-        first = node = self._first.get(key)
-        while node is not None:
-            yield node.item
-            node = None if node.after is first else node.after
-
-    def append(self, key: K, node: QueueNode[T]) -> None:
-        """Append a node, which is in no queue, to the queue at `key`."""
-        first = self._first.get(key)
-        if first is None:
-            self._first[key] = node.before = node.after = node
-        else:
-            last = first.before
-            last.after = first.before = node
-            node.before, node.after = last, first
-
-    def remove(self, key: K, node: QueueNode[T]) -> None:
-        """Remove a node from the queue at `key`, which it must be in."""
-        if node.after is node:
-            del self._first[key]
-        else:
-            node.before.after, node.after.before = node.after, node.before
-            if self._first[key] is node:
-                self._first[key] = node.after
-        del node.before, node.after
-
-
 class OrderBook:
     """The open orders of the lighthouse at `lighthouse` (EIP-55 address), `limit` of them at most.
 
-    An order stays for `deadline_limit` blocks at most, even if its deadline is later. A full book makes room: the
-    signer with the most orders loses its newest; if none has more than one, the oldest order that is not matched, or
-    that pays nothing, leaves.
+    An order stays for `deadline_limit` blocks at most, even if its deadline is later. A full book makes room: first
+    those orders leave that are not matched, or that pay nothing and whose signer is not `known`. Of these the signer
+    with the most loses its newest; if none has more than one, the oldest leaves. If all others pay or are of known
+    signers, only a signer with more orders than the new one's loses its newest.
 
     Not thread-safe. Methods are O(1) in the number of open orders, unless they say otherwise.
     """
@@ -122,14 +65,10 @@ class OrderBook:
         self._deadline_limit = deadline_limit
         self._head = 0
         self._nodes: dict[bytes, _BookNode] = {}
-        self._signers: Queues[str, bytes] = Queues()
-        """The identities of each signer's orders, oldest first."""
-        self._numbers: Counter[str] = Counter()
-        """How many orders each signer has."""
-        self._heaviest = ""
-        """The signer that had the most orders when it added one."""
-        self._unpaid: OrderedDict[bytes, None] = OrderedDict()
-        """The identities of orders that are not matched or pay nothing, oldest first."""
+        self.known: Final = KnownSenders()
+        """The signers whose orders leave last."""
+        self._first, self._last = Share(), Share()
+        """The orders that leave a full book first, and the others."""
         self._demands: Queues[Terms, Verified[Order]] = Queues()
         self._offers: Queues[Terms, Verified[Order]] = Queues()
         self._aside: set[bytes] = set()
@@ -178,16 +117,12 @@ class OrderBook:
         if node is None:
             return None
         self._due.remove(node.due, node.of_due)
-        message, signer = node.item.message, node.item.signer
-        self._signers.remove(signer, node.of_signer)
-        self._numbers[signer] -= 1
-        if not self._numbers[signer]:
-            del self._numbers[signer]
-        self._unpaid.pop(identity, None)
+        share = self._first if identity in self._first else self._last
+        share.remove(identity, node.item.signer, node.of_signer)
         if identity in self._aside:
             self._aside.remove(identity)
         else:
-            self._side(message).remove(_terms(message), node)
+            self._side(node.item.message).remove(_terms(node.item.message), node)
         return node.item
 
     def expire(self, head: int) -> list[Verified[Order]]:
@@ -211,7 +146,7 @@ class OrderBook:
 
     def of(self, signer: str) -> list[Verified[Order]]:
         """The open orders of a signer. O(those orders)."""
-        return [self._nodes[identity].item for identity in self._signers.items(signer)]
+        return [self._nodes[identity].item for share in (self._first, self._last) for identity in share.of(signer)]
 
     def _refusal(self, order: Verified[Order]) -> Refusal | None:
         message = order.message
@@ -226,29 +161,24 @@ class OrderBook:
         node = self._nodes[identity] = _BookNode(order, due, identity)
         if identity not in self._aside:
             self._side(message).append(_terms(message), node)
-        if identity in self._aside or not _pays(message):
-            self._unpaid[identity] = None
         self._due.append(node.due, node.of_due)
-        self._signers.append(order.signer, node.of_signer)
-        self._numbers[order.signer] += 1
-        if self._numbers[order.signer] >= self._numbers.get(self._heaviest, 0):
-            self._heaviest = order.signer
+        self._share_of(order).add(identity, order.signer, node.of_signer)
+
+    def _share_of(self, order: Verified[Order]) -> Share:
+        stays = order_id(order) not in self._aside and (_pays(order.message) or order.signer in self.known)
+        return self._last if stays else self._first
 
     def _make_room(self, order: Verified[Order]) -> tuple[Verified[Order], ...] | None:
         """Evict an order if the book is full, and return it; None if the new one has no better right to a place."""
         if len(self._nodes) < self._limit:
             return ()
-        most = self._numbers.get(self._heaviest, 0)
-        if self._numbers.get(order.signer, 0) >= max(most, 1):
+        share, own = self._first if self._first else self._last, self._share_of(order)
+        if own is not share and own is self._first:
             return None
-        if most > 1:
-            last = self._signers.first(self._heaviest)
-            assert last is not None
-            evicted = self.remove(last.before.item)
-        elif self._unpaid:
-            evicted = self.remove(next(iter(self._unpaid)))
-        else:
+        victim = share.victim(order.signer if own is share else "", or_oldest=share is self._first)
+        if victim is None:
             return None
+        evicted = self.remove(victim)
         assert evicted is not None
         return (evicted,)
 

@@ -19,7 +19,7 @@ from mesh.chain import (
     Reorganisation,
     RequestRefused,
 )
-from mesh.flood import BoundedDict, KnownSenders
+from mesh.flood import BoundedDict
 from mesh.log_context import log_event
 from mesh.market.unconfirmed import Unconfirmed
 from mesh.outage_log import OutageLog
@@ -75,7 +75,7 @@ class LiabilityEvents:
         self._withdrawals = withdrawals
         self._earnings = earnings
         self._forget = forget
-        self.parties: Final = KnownSenders()
+        self.parties: Final = book.known
         """Accounts that a liability was created for."""
         self._history = History(chain.node.timing.reorg_depth)
 

@@ -126,7 +126,7 @@ class Settlement:
         outcome = self._refusal(order) or self._book.add(order)
         for evicted in outcome.evicted if isinstance(outcome, Added) else ():
             self._drops.count("book-full", evicted.signer)
-            self._forget(evicted, after=self._pause)
+            self._forget(evicted, after=2 * self._pause)  # in a flood, such copies cost the most
         if isinstance(outcome, Match):
             facts = {"demand": outcome.demand.hash.hex(), "offer": outcome.offer.hash.hex()}
             log.info("matched demand %(demand)s and offer %(offer)s", facts, extra=log_event("orders-matched", **facts))

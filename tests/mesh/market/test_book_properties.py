@@ -96,12 +96,18 @@ class BookAgainstNaiveBook(RuleBasedStateMachine):
             assert outcome == naive
 
     def has_evicted(self, order: Verified[Any], outcome: Added) -> None:
-        """A full book has made room: for a signer with fewer orders than the one that lost its newest, or with none."""
+        """A full book has made room: by an order that pays nothing, while there is one.
+
+        It was for one that pays, or of a signer with fewer orders of this sort, and the loser's newest or the oldest.
+        """
         (evicted,) = outcome.evicted
-        signers = Counter(one.signer for one in self.naive.open)
+        free = [one for one in self.naive.open if isinstance(one.message, Offer)]
+        share = free or self.naive.open
+        numbers = Counter(one.signer for one in share)
         assert len(self.naive.open) == self.naive.limit
-        assert signers[order.signer] < signers[evicted.signer]
-        assert evicted == [one for one in self.naive.open if one.signer == evicted.signer][-1]
+        pays_more = bool(free) and isinstance(order.message, Demand)
+        assert pays_more or numbers[order.signer] < numbers[evicted.signer]
+        assert evicted == [one for one in share if one.signer == evicted.signer][-1] or evicted == free[0]
         self.naive.open.remove(evicted)
         self.naive.open.append(order)
 

@@ -11,7 +11,8 @@ from mesh.flood import Drops, KnownSenders
 from mesh.market import Added, OrderBook, Refusal
 from mesh.market.arrivals import CHECKED, Arrivals
 from schemas import Demand, Signer, verify_message
-from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand, verified_offer
+from tests.mesh.market.observation import until_read
+from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -60,6 +61,21 @@ def test_in_a_full_book_of_fresh_keys_the_oldest_that_pays_nothing_leaves() -> N
     assert book.add(newest[1]) == Added(newest[1], evicted=(free[1],))
     assert book.add(newest[2]) is Refusal.FULL
     assert set(book.orders()) == {paid, *newest[:2]}
+
+
+def test_in_a_full_book_of_fresh_keys_the_orders_of_known_signers_stay() -> None:
+    """Although these have several, and those only one each."""
+    book = OrderBook(LIGHTHOUSE, limit=6)
+    book.known.add(PERSON.address)
+    book.known.add(ROBOT.address)
+    honest: list[Verified[Order]] = [verified_demand(signer=PERSON, cost=cost) for cost in (4, 5)]
+    honest += [verified_offer(signer=ROBOT, cost=cost) for cost in (7, 8)]
+    flood = [verified_offer(signer=stranger(), cost=9) for _ in range(20)]
+    for order in (flood[0], *honest, *flood[1:]):
+        assert isinstance(book.add(order), Added)
+    assert set(book.orders()) == {*honest, *flood[-2:]}
+    later = verified_offer(signer=ROBOT, cost=10)
+    assert book.add(later) == Added(later, evicted=(flood[-2],))
 
 
 def test_an_order_leaves_the_book_at_its_limit_of_blocks() -> None:
@@ -135,6 +151,7 @@ async def test_unfunded_demands_with_the_same_terms_take_no_offer(local: LocalMa
 
 async def test_a_far_deadline_holds_a_place_for_some_blocks_only(local: LocalMarket) -> None:
     async with local.provider(deadline_limit=5) as provider:
+        await until_read(local, provider)  # it begins some blocks before the latest
         demand = local.demand(deadline=10**9)
         local.publish(demand)
         await until(lambda: len(provider.book) == 1)

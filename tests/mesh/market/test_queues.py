@@ -7,7 +7,7 @@ import weakref
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.market.book import QueueNode, Queues
+from mesh.market.queues import QueueNode, Queues
 
 
 class Item:
