@@ -250,14 +250,6 @@ MUTATIONS: Final = (
         seeds=60,
     ),
     Mutation(
-        "a count that a node states is believed, whatever it is",
-        "mesh.chain.answers:_decode_value",
-        "if kind is Count and number >> 63:",
-        "if False:",
-        "spoilt",
-        seeds=160,
-    ),
-    Mutation(
         "messages are recorded with the time of day",
         "mesh.recording.recorder:Recorder.record",
         "self._epoch + self._clock.monotonic_ns()",
@@ -291,6 +283,14 @@ MUTATIONS: Final = (
 )
 
 CANDIDATES: Final = (
+    Mutation(
+        "a count that a node states is believed, whatever it is",
+        "mesh.chain.answers:_decode_value",
+        "if kind is Count and number >> 63:",
+        "if False:",
+        "spoilt",
+        seeds=400,
+    ),
     Mutation(
         "of lost nonces only the first is filled at once",
         "mesh.chain.submission:Resubmission._use_nonces",
