@@ -126,21 +126,22 @@ class Resubmission:
         was_missing, self._pending.missing = self._pending.missing == first, None
         nonce, gap = first - 1, first
         while nonce < gap < waiting.nonce:
-            nonce, sent = gap, self._pending.sent(gap)
-            if sent is not None and sent.is_watched:
-                await self.send_again(sent)
-            elif await self._resubmit(nonce, is_first=nonce == first):
-                pass
-            elif nonce in self._pending.taken or not await self._fill(nonce, waiting, was_missing=was_missing):
+            nonce = gap
+            if not await self._resubmit(nonce, is_first=nonce == first) and (
+                nonce in self._pending.taken or not await self._fill(nonce, waiting, was_missing=was_missing)
+            ):
                 return
             gap = await self._node.transaction_count(self._account.address, pending=True)
 
     async def _resubmit(self, nonce: int, *, is_first: bool) -> bool:
-        """Send a transaction again that nothing waits for; False if there is none, or another process waits for it."""
+        """Send the transaction with a nonce again; False if there is none, or another process waits for it."""
         async with self._pending.lock:  # what sends the same meanwhile must find it
             sent = self._pending.sent(nonce)
-            if sent is None or sent.is_watched or not await self._pending.take_over(sent):
-                return sent is not None and sent.is_watched
+            if sent is not None and sent.is_watched:
+                await self.send_again(sent)
+                return True
+            if sent is None or not await self._pending.take_over(sent):
+                return False
             try:
                 await (self.replace(sent) if is_first else self.send_again(sent))
             finally:

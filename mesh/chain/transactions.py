@@ -227,8 +227,14 @@ class TransactionSender:
         self._node.metrics.paid(gas_used=gas_used, wei=wei)
         if not succeeded:
             why = await self._why_failed(entry.fields, receipt)
-            cost: dict[str, Any] = {"gas_used": gas_used, "wei": wei, "block": receipt.block_number}
-            raise Reverted(why.reason, arguments=why.arguments, data=why.data, **cost)
+            raise Reverted(
+                why.reason,
+                arguments=why.arguments,
+                data=why.data,
+                gas_used=gas_used,
+                wei=wei,
+                block=receipt.block_number,
+            )
         return Receipt(
             tx=signed.hash,
             block_number=receipt.block_number,
@@ -247,8 +253,8 @@ class TransactionSender:
             return why
         except RequestRefused as refused:
             return Reverted(refused.detail)
-        except NodeUnreachable:
-            return Reverted("")
+        except NodeUnreachable as lost:  # it has failed, whatever the reason
+            log.debug("%s", lost)
         return Reverted("OutOfGas" if receipt.gas_used >= fields["gas"] else "")
 
     async def _raise_if_poor(self, fields: dict[str, Any], refused: RequestRefused) -> None:

@@ -66,7 +66,7 @@ class OrderBook:
         self._head = 0
         self._nodes: dict[bytes, _BookNode] = {}
         self.known: Final = KnownSenders()
-        """The signers whose orders leave last."""
+        """The accounts that a liability was created for: their orders leave last."""
         self._first, self._last = Share(), Share()
         """The orders that leave a full book first, and the others."""
         self._demands: Queues[Terms, Verified[Order]] = Queues()

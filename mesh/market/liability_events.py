@@ -75,8 +75,6 @@ class LiabilityEvents:
         self._withdrawals = withdrawals
         self._earnings = earnings
         self._forget = forget
-        self.parties: Final = book.known
-        """Accounts that a liability was created for."""
         self._history = History(chain.node.timing.reorg_depth)
 
     async def follow(self, reverted: Callable[[Verified[Any]], None]) -> None:
@@ -156,7 +154,7 @@ class LiabilityEvents:
         if liability.lighthouse != self._lighthouse:
             return
         for digest, signer in zip(order_hashes, (liability.promisee, liability.promisor), strict=True):
-            self.parties.add(signer)
+            self._book.known.add(signer)
             identity = digest + address_bytes(signer)
             if (newest := self._versions.use(identity, liability.address)) is not None:
                 self._book.remove(newest)

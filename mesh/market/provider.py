@@ -178,7 +178,7 @@ class Provider(Role):
                 tasks.create_task(self._take_withdrawals(), name="provider withdrawals")
                 arrivals = Arrivals(
                     self.settlement,
-                    known=self.settlement.events.parties,
+                    known=self.book.known,
                     has_room=self.queue.has_room,
                     drops=self.drops,
                 )

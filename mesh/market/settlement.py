@@ -66,9 +66,8 @@ class Settlement:
         drops: Drops,
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
-        assert chain.account is not None
+        assert chain.account is not None and channel.address is not None
         self._chain = chain
-        assert channel.address is not None
         self._lighthouse = channel.address
         self._book = book
         self._queue = queue
@@ -226,7 +225,7 @@ class Settlement:
                 log.info("created, gas %(gas)d", facts, extra=log_event("contract-created", **facts))
             if not await self.events.is_confirmed(match, created.tx):
                 self._earnings.creation_reverted(created.liability, created.tx)
-                self._versions.failed(match, self.events.head, head=self.events.head)
+                self._versions.failed(match, self.events.head)
             self._put_back(match)
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
@@ -246,7 +245,8 @@ class Settlement:
                 may_be_sent = True
                 raise
             except Reverted as error:
-                self._versions.failed(match, error.block, head=self.events.head)
+                if error.block:
+                    self._versions.failed(match, max(error.block, self.events.head))
                 raise
 
         return attempt

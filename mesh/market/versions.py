@@ -100,10 +100,10 @@ class OrderVersions:
         newest = self._newest.get(key)
         return None if newest is None or newest.identity == identity else newest.identity
 
-    def failed(self, orders: Iterable[Verified[Order]], block: int, *, head: int) -> None:
-        """A transaction with these orders failed, or vanished, in a block (0: it was not mined); `head` is known."""
-        for order in orders if block else ():
-            self._undecided[self._key_of(order)] = _Undecided(order_id(order), max(block, head))
+    def failed(self, orders: Iterable[Verified[Order]], block: int) -> None:
+        """A transaction with these orders failed or vanished, in a block or before it."""
+        for order in orders:
+            self._undecided[self._key_of(order)] = _Undecided(order_id(order), block)
 
     def reorganised(self, last: int, head: int) -> None:
         """The blocks after `last`, up to `head`, were replaced: their transactions are mined again in later ones."""

@@ -10,9 +10,10 @@ from bridges.ipfs.validation import legacy_json
 from mesh.market import OrderBook
 from mesh.market.services import OrderBookService
 from mesh.market.withdrawals import Withdrawals
-from schemas import Demand, Offer, Signer, Withdrawal, encode, message_hash, verify_message
+from schemas import encode, verify_message
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
-from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, demand, offer
+from tests.support import orders
+from tests.support.orders import LIGHTHOUSE, STRANGER, demand, offer
 from tests.support.ports import free_port
 from tests.support.waiting import until, until_answered, until_found
 
@@ -26,11 +27,6 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 SECONDS = 60.0
-
-
-def withdrawal_of(order: Demand | Offer, signer: Signer = PERSON) -> Withdrawal:
-    digest = message_hash(order).hex()
-    return signer.sign(Withdrawal(order=digest, lighthouse=order.lighthouse, deadline=order.deadline))
 
 
 @pytest.fixture
@@ -48,7 +44,7 @@ async def test_a_withdrawn_order_is_not_relayed(
         await until_found(lambda: bob.peers(topic), what="the bridge's daemon", seconds=SECONDS)
         await until_seen(mesh, bridge.address)
         one, two, kept = demand(), demand(), demand()
-        withdrawals = withdrawal_of(one), withdrawal_of(two), withdrawal_of(kept, STRANGER)
+        withdrawals = orders.withdrawal(one), orders.withdrawal(two), orders.withdrawal(kept, signer=STRANGER)
         for withdrawal in withdrawals:
             mesh.channel.publish(withdrawal)
         await until(lambda: len(bridge.withdrawals) == 3, seconds=SECONDS)
@@ -74,8 +70,8 @@ async def test_an_order_that_waits_is_dropped_when_it_is_withdrawn(
         mesh.channel.publish(one)
         mesh.channel.publish(two)
         await until(lambda: bridge.status().to_ipfs.waiting == 2, seconds=SECONDS)
-        mesh.channel.publish(withdrawal_of(one, STRANGER))
-        mesh.channel.publish(withdrawal_of(two))
+        mesh.channel.publish(orders.withdrawal(one, signer=STRANGER))
+        mesh.channel.publish(orders.withdrawal(two))
         await until(lambda: bridge.status().to_ipfs.waiting == 1, seconds=SECONDS)
         assert bridge.status().to_ipfs.invalid == {"withdrawn": 1}
     async with bridging(router.endpoint, nowhere, topic, journal) as bridge:
@@ -86,7 +82,7 @@ async def test_a_bridge_that_starts_later_learns_withdrawals_from_a_provider(
     mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:
     known = Withdrawals()
-    known.add(verify_message(withdrawal_of(demand())))
+    known.add(verify_message(orders.withdrawal(demand())))
     nowhere = f"http://127.0.0.1:{free_port()}"
     async with OrderBookService(mesh.network.session, topic, OrderBook(LIGHTHOUSE), known):
         await until_answered(mesh.network.session, f"aira/{topic}/withdrawal")
@@ -98,7 +94,7 @@ async def test_a_bridge_keeps_withdrawals_across_restarts(
     mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:
     nowhere, path = f"http://127.0.0.1:{free_port()}", tmp_path / "withdrawals"
-    withdrawal = verify_message(withdrawal_of(demand()))
+    withdrawal = verify_message(orders.withdrawal(demand()))
     with Withdrawals(path) as known:
         async with bridging(router.endpoint, nowhere, topic, tmp_path / "journal", withdrawals=known) as bridge:
             await until_seen(mesh, bridge.address)

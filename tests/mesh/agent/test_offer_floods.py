@@ -21,21 +21,18 @@ from tests.support.objectives import objective
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from schemas import Demand, Verified
 
 FAR = 10**9
 """A deadline that a stranger chose."""
 
 
-@pytest.fixture
-def made() -> Callable[[], TradedOrder]:
-    """Makes offers."""
-    return lambda: TradedOrder(orders.offer(), posted=0.0)
+def made() -> TradedOrder:
+    """An offer."""
+    return TradedOrder(orders.offer(), posted=0.0)
 
 
-def test_the_maker_with_the_most_offers_loses_its_newest(made: Callable[[], TradedOrder]) -> None:
+def test_the_maker_with_the_most_offers_loses_its_newest() -> None:
     offers = OpenOffers(per_maker=3, total=4)
     flood, others = [made() for _ in range(3)], {maker: made() for maker in ("alice", "bob", "carol", "dave", "erin")}
     assert [offers.add(offer, "flood", pays=True) for offer in flood] == [None] * 3
@@ -51,7 +48,7 @@ def test_the_maker_with_the_most_offers_loses_its_newest(made: Callable[[], Trad
     assert len(offers) == 4
 
 
-def test_offers_of_earlier_runs_count_as_one_makers(made: Callable[[], TradedOrder]) -> None:
+def test_offers_of_earlier_runs_count_as_one_makers() -> None:
     offers, old = OpenOffers(per_maker=2, total=3), [made() for _ in range(3)]
     assert [offers.add(offer, "", pays=False) for offer in old] == [None] * 3
     assert offers.add(made(), "alice", pays=False) is old[2]

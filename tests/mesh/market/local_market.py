@@ -12,19 +12,9 @@ from mesh.chain.events import NewLiability
 from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
 from mesh.retry import RetryPolicy
-from schemas import (
-    Demand,
-    Offer,
-    RejectKey,
-    Result,
-    Withdrawal,
-    market_selector,
-    message_hash,
-    parse_key,
-    verify_message,
-)
+from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key, verify_message
 from schemas.signing import Rejection
-from tests.support.orders import RECORDING, terms
+from tests.support.orders import RECORDING, terms, withdrawal
 from tests.support.waiting import until, until_found, until_heard
 
 if TYPE_CHECKING:
@@ -34,7 +24,7 @@ if TYPE_CHECKING:
 
     from mesh.chain.transports import Transport
     from mesh.devchain.development import DevelopmentMarket
-    from schemas import Liability, SignedMessage
+    from schemas import Liability, SignedMessage, Withdrawal
 
 QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01)
 QUICK_RETRY = RetryPolicy(initial=0.01, ceiling=0.1, attempts=8)
@@ -160,9 +150,7 @@ class LocalMarket:
 
     def withdrawal(self, order: Demand | Offer, role: str = "person") -> Withdrawal:
         """The withdrawal of an order, signed by a trader."""
-        digest = verify_message(order).hash.hex()
-        withdrawal = Withdrawal(order=digest, lighthouse=order.lighthouse, deadline=order.deadline)
-        return self.accounts[role].signer.sign(withdrawal)
+        return withdrawal(order, signer=self.accounts[role].signer)
 
     def result(self, liability: str, role: str = "robot", **changes: Any) -> Result:
         """A signed result."""

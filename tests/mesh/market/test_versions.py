@@ -172,7 +172,7 @@ async def test_a_failed_transaction_in_a_replaced_block_is_mined_again_later(loc
     older, newer = map(verify_message, await versions_of(local, 2))
     versions = OrderVersions(DEPTH)
     versions.note(older)
-    versions.failed([older], 10, head=9)
+    versions.failed([older], 10)
     versions.note(newer)
     versions.reorganised(10, head=14)
     assert versions.refusal(order_id(newer), head=10 + DEPTH) is None
