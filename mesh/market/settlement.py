@@ -66,8 +66,9 @@ class Settlement:
         drops: Drops,
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
-        assert chain.account is not None and channel.address is not None
+        assert chain.account is not None
         self._chain = chain
+        assert channel.address is not None
         self._lighthouse = channel.address
         self._book = book
         self._queue = queue
@@ -166,9 +167,7 @@ class Settlement:
             return Refusal.DUPLICATE
         if order in self.events.unconfirmed:
             return Refusal.DUPLICATE
-        if order_id(order) in self._withdrawals:
-            return Refusal.WITHDRAWN
-        return self._versions.refusal(order_id(order), self.events.head)
+        return self._taken_back(order)
 
     def withdraw(self, withdrawal: Verified[Withdrawal]) -> None:
         """Honour a withdrawal: its order leaves the book, and is refused until its deadline.
@@ -237,7 +236,7 @@ class Settlement:
 
         async def attempt() -> Created:
             nonlocal may_be_sent
-            if not may_be_sent and (self._is_taken_back(match.demand) or self._is_taken_back(match.offer)):
+            if not may_be_sent and any(self._taken_back(one) or one.signer in self.blocked for one in match):
                 raise MatchWithdrawn("an order was withdrawn or replaced before its contract was created")
             try:
                 return await self._chain.liabilities.create(self._lighthouse, match.demand.message, match.offer.message)
@@ -251,10 +250,10 @@ class Settlement:
 
         return attempt
 
-    def _is_taken_back(self, order: Verified[Order]) -> bool:
-        identity = order_id(order)
-        is_refused = identity in self._withdrawals or self._versions.refusal(identity, self.events.head) is not None
-        return is_refused or order.signer in self.blocked
+    def _taken_back(self, order: Verified[Order]) -> Refusal | None:
+        if order_id(order) in self._withdrawals:
+            return Refusal.WITHDRAWN
+        return self._versions.refusal(order_id(order), self.events.head)
 
     def _put_back(self, match: Match) -> None:
         """No transaction of a match waits any more: put its orders back into the book unless they were used."""
