@@ -226,7 +226,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the provider ignores withdrawals",
-        "mesh.market.settlement:Settlement._refusal",
+        "mesh.market.settlement:Settlement._taken_back",
         "if order_id(order) in self._withdrawals:",
         "if False:",
         "repeat_every,replay,drop,duplicate,delay,withdraw",
