@@ -30,7 +30,7 @@ from mesh.chain.rpc_client import RpcClient  # noqa: E402, F401
 from tests.simulation.deployment import CROWDED_JOBS, JOBS, ON_EVM, ON_MODEL, Deployments  # noqa: E402
 from tests.simulation.faults import KINDS  # noqa: E402
 from tests.simulation.mutants import find_mutants  # noqa: E402
-from tests.simulation.runs import Run, numbers_in, run_in_children  # noqa: E402
+from tests.simulation.runs import Child, Run, Stopped, numbers_in, run_in_children  # noqa: E402
 from tests.simulation.shrinking import Shrinking  # noqa: E402
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> None:
         os._exit(0 if found_all else 1)
     total = Report(options.seed)
     with suppress(Stopped):
-        signal.signal(signal.SIGTERM, _stop)
+        signal.signal(signal.SIGTERM, lambda number, frame: Child.stop_all())
         _run(deployed, options, total, began)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     total.real_s = round(REAL_TIME() - began, 3)
@@ -67,14 +67,6 @@ def main(arguments: Sequence[str]) -> None:
         _print_total(total)
     sys.stdout.flush()
     os._exit(1 if total.violations else 0)
-
-
-class Stopped(BaseException):
-    """SIGTERM: no more histories."""
-
-
-def _stop(number: int, frame: object) -> None:
-    raise Stopped
 
 
 def _run(deployed: Deployments, options: argparse.Namespace, total: Report, began: float) -> None:

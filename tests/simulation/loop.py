@@ -27,12 +27,14 @@ class Future(asyncio.Future[Any]):
 
 
 class Task(asyncio.Task[Any]):
-    """The same for tasks."""
+    """The same for tasks. A task has its number before asyncio puts it into its set of all tasks."""
+
+    def __init__(self, coro: Any, *, loop: Any, context: Any, number: int) -> None:
+        self.number = number
+        super().__init__(coro, loop=loop, context=context)
 
     def __hash__(self) -> int:
         return self.number
-
-    number = 0
 
 
 class SimulatedLoop(asyncio.BaseEventLoop):
@@ -61,8 +63,7 @@ class SimulatedLoop(asyncio.BaseEventLoop):
         return future
 
     def _make_task(self, loop: Any, coro: Any, context: Any = None) -> Task:
-        task = Task(coro, loop=loop, context=context)
-        task.number = self._scheduler.count()
+        task = Task(coro, loop=loop, context=context, number=self._scheduler.count())
         self._tasks.append(task)
         if len(self._tasks) > self._prune_at:
             self._tasks = [one for one in self._tasks if not one.done()]

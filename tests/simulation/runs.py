@@ -13,7 +13,7 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, ClassVar, Final, NoReturn
 
 from tests.simulation import history
 from tests.simulation.deployment import JOBS, market_plan
@@ -113,11 +113,18 @@ def run_in_children(
             yield child.run, child.report()
     finally:
         for child in started:
-            child.stop()
+            child.end()
+
+
+class Stopped(Exception):
+    """`Child.stop_all` was called: no more histories."""
 
 
 class Child:
-    """The process of a history."""
+    """The process of a history. Raises `Stopped` from when all were stopped."""
+
+    running: ClassVar[set[Child]] = set()
+    are_stopped: ClassVar[bool] = False
 
     def __init__(self, deployments: Deployments, run: Run, *, trace: bool, switches: str | None) -> None:
         self.run = run
@@ -129,12 +136,24 @@ class Child:
             os.close(self._pipe)
             _play(market, run, writing, trace=trace, switches=switches)
         os.close(writing)
+        self.running.add(self)
+        if self.are_stopped:
+            self._kill()
+
+    @classmethod
+    def stop_all(cls) -> None:
+        """End all at once. A signal handler may call it: it raises nothing, wherever the signal came."""
+        Child.are_stopped = True
+        for child in tuple(cls.running):
+            child._kill()
 
     def report(self) -> Report:
         """Wait for its end; what happened."""
         with os.fdopen(self._pipe) as pipe:
             said = pipe.read()
-        os.waitpid(self._process, 0)
+        self._reap()
+        if self.are_stopped:
+            raise Stopped
         if not said:
             ended = "history-failed: its process ended, or computed too long: something in it never ends"
             return Report(self.run.seed, violations=[ended])
@@ -142,9 +161,16 @@ class Child:
         report.chains = {self._kind: 1}
         return report
 
-    def stop(self) -> None:
+    def end(self) -> None:
         """End it at once."""
+        self._kill()
+        self._reap()
+
+    def _kill(self) -> None:
         os.kill(self._process, signal.SIGKILL)
+
+    def _reap(self) -> None:
+        self.running.discard(self)  # first: its number may be that of another process soon
         os.waitpid(self._process, 0)
         shutil.rmtree(history.FOLDER / str(self._process), ignore_errors=True)
 

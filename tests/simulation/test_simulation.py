@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import signal
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -58,6 +60,26 @@ def test_no_invariant_is_violated() -> None:
     assert found["violations"] == [], said
     assert found["lost"] == found["paid_twice"] == 0
     assert found["faults"]
+
+
+def test_sigterm_ends_a_run_with_what_has_happened_so_far() -> None:
+    command = [sys.executable, "-m", "tests.simulation", "--seed", "1", "--jobs", "100000", "--workers", "2"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        first = running.stdout.readline()
+        histories = children_of(running.pid)
+        running.send_signal(signal.SIGTERM)
+        said, _ = running.communicate(timeout=60)
+    assert first.startswith("seed 1: 6 jobs")
+    assert " jobs, " in said.splitlines()[-1]
+    assert running.returncode == 0
+    assert histories
+    assert not any(Path(f"/proc/{history}").exists() for history in histories)
+
+
+def children_of(process: int) -> list[int]:
+    """The numbers of a process's children."""
+    return [int(number) for number in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
 
 
 def test_planted_bugs_fit_the_sources() -> None:
