@@ -27,8 +27,8 @@ from schemas import Demand, encode, keccak256, message_hash
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-WINDOW: Final = 4096
-"""Most messages in flight; the ring holds twice as many."""
+WINDOW: Final = 1024
+"""Most messages in flight; Zenoh's queue holds twice as many."""
 BAR: Final = 0.70
 """The least ratio; the exit status is 1 below it."""
 PROGRESS_KEY: Final = "aira/bench/progress"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     Order = Demand | Offer
     Terms = tuple[str, str, str, int, str, int]
 
-LIMIT: Final = 24_576
+LIMIT: Final = 20_480
 """Open orders that a book holds by default: with up to 2 KB each, a provider stays below 200 MB."""
 UNLIMITED: Final = 2**256
 

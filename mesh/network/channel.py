@@ -203,8 +203,8 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
     def __init__(
         self, session: zenoh.Session, selector: str, validator: MessageValidator[M], drops: Drops, answer_timeout: float
     ) -> None:
-        copy, check, limit = self._copy, validator.check_all, MAX_MESSAGE_SIZE
-        super().__init__(session, selector, copy=copy, convert_all=check, payload_limit=limit, drops=drops)
+        copy, check, most = self._copy, validator.check_all, MAX_MESSAGE_SIZE
+        super().__init__(session, selector, copy=copy, convert_all=check, resent=True, payload_limit=most, drops=drops)
         self._validator: MessageValidator[M] = validator
         self._answer_timeout = answer_timeout
         self.kind: Final = validator.kind.kind

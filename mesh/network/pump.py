@@ -3,7 +3,7 @@
 One thread copies samples from Zenoh's queue into a ring (a sample keeps its receive buffer alive), converts them
 (signature checks run here, off the event loop) and passes them to the loop in batches, at most two at a time. When more
 arrives than is converted or consumed, the ring drops the *oldest* samples and counts them. The thread keeps emptying
-Zenoh's queue, so the session never stalls.
+Zenoh's queue, so the session does not stall.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ BATCHES_IN_FLIGHT: Final = 2
 """Batches between the pump's thread and the consumer, at most."""
 ZENOH_QUEUE: Final = 512
 """Samples in Zenoh's own queue; each may keep 64 KiB alive. While it is full, Zenoh stops reading from the router."""
+RESENT_QUEUE: Final = 2048
+"""The same for what is sent again; while it is full, Zenoh drops the oldest."""
 SLOT_WAIT: Final = 0.002
 """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
 
@@ -51,9 +53,11 @@ class Pump(Generic[T]):
     `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, pass two functions
     instead: `copy` takes what is needed out of a sample, and `convert_all` makes items of up to `BATCH` copies and
     yields some of them every few milliseconds, so that the thread can empty Zenoh's queue in between. They run on the
-    pump's thread; the iterator raises what they raise. Items arrive in order, except copies. `capacity` and
-    `capacity_bytes` bound the ring. Samples of more than `payload_limit` bytes are refused. `drops` counts what is
-    dropped or refused. `declare` declares another subscriber than a plain one, of a selector and a handler. Leaving
+    pump's thread; the iterator raises what they raise. Items arrive in order, except copies, and what `ReceiveRing`
+    takes out of order in a flood. `capacity` and `capacity_bytes` bound the ring. Samples of more than `payload_limit`
+    bytes are refused. `drops` counts what is dropped or refused. `declare` declares another subscriber than a plain
+    one, of a selector and a handler. With `resent` (senders repeat what has no effect) a flood never stops the
+    session for samples on other keys: Zenoh's queue drops the oldest instead, which are not counted. Leaving
     `async with` ends the subscription, the thread and the iteration; undelivered samples are lost. There is one
     consumer. Raises `ClosedError` before it is entered.
     """
@@ -71,8 +75,10 @@ class Pump(Generic[T]):
         payload_limit: int | None = None,
         drops: Drops | None = None,
         declare: Callable[..., Any] | None = None,
+        resent: bool = False,
     ) -> None:
         self._session = session
+        self._resent = resent
         self._declare = session.declare_subscriber if declare is None else declare
         self.selector: Final = selector
         """The key expression that is subscribed to."""
@@ -98,7 +104,10 @@ class Pump(Generic[T]):
     async def __aenter__(self) -> Self:
         if self._loop is not None:
             raise ClosedError("a subscription can be entered only once", hint="subscribe again")
-        self._subscriber: Any = self._declare(self.selector, zenoh.handlers.FifoChannel(ZENOH_QUEUE))
+        channel: Any = zenoh.handlers.FifoChannel(ZENOH_QUEUE)
+        if self._resent:
+            channel = zenoh.handlers.RingChannel(RESENT_QUEUE)
+        self._subscriber: Any = self._declare(self.selector, channel)
         self._loop = asyncio.get_running_loop()
         self._thread = threading.Thread(
             target=self._run, args=(self._loop, self._subscriber.handler), name=f"pump {self.selector}", daemon=True

@@ -148,6 +148,28 @@ async def test_expensive_conversions_get_copies_in_batches(here: zenoh.Session, 
         assert max(sizes) <= pump.BATCH
 
 
+async def test_a_flood_of_what_is_sent_again_does_not_hold_up_other_keys(
+    here: zenoh.Session, there: zenoh.Session
+) -> None:
+    is_over = threading.Event()
+
+    def convert_all(copies: list[int]) -> Iterator[list[int]]:
+        is_over.wait()
+        yield copies
+
+    flooded = Pump(here, KEY, copy=number, convert_all=convert_all, resent=True)
+    async with flooded, Pump(here, "test/elsewhere", number) as others:
+        await until_heard(there, KEY)
+        await until_heard(there, "test/elsewhere")
+        for value in range(2 * pump.RESENT_QUEUE):
+            there.put(KEY, str(value).encode())
+        there.put("test/elsewhere", b"1")
+        try:
+            assert await take(others, 1) == [1]
+        finally:
+            is_over.set()
+
+
 async def test_a_cancelled_consumer_loses_nothing(here: zenoh.Session, there: zenoh.Session) -> None:
     async with Pump(here, KEY, number) as numbers:
         await until_heard(there, KEY)

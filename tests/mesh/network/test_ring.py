@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.network.ring import REMEMBERED, ReceiveRing
+from mesh.network.ring import IN_ORDER, REMEMBERED, ReceiveRing
 
 
 def ring(capacity: int = 4, capacity_bytes: int = 1000, *, second_chance: bool = True) -> ReceiveRing:
@@ -70,6 +70,22 @@ def test_an_honest_message_passes_a_flood_of_second_copies_with_its_third() -> N
         passed += waiting.take(20)
 
     assert passed.count("honest") == 1
+
+
+def test_what_a_flood_of_new_messages_has_left_behind_delays_nobody() -> None:
+    waiting = ring(2 * IN_ORDER, 4 * IN_ORDER)
+    fill(waiting, *range(IN_ORDER))
+    fill(waiting, "honest")
+
+    assert waiting.take(1) == ["honest"]
+    assert waiting.take(2) == [0, 1], "in order again"
+
+
+def test_what_nobody_sends_again_arrives_in_order() -> None:
+    waiting = ring(2 * IN_ORDER, 4 * IN_ORDER, second_chance=False)
+    fill(waiting, *range(2 * IN_ORDER))
+
+    assert waiting.take(2) == [0, 1]
 
 
 def test_dropped_items_are_forgotten_after_a_while() -> None:
