@@ -125,6 +125,10 @@ class OrderBook:
             self._side(node.item.message).remove(_terms(node.item.message), node)
         return node.item
 
+    def stays(self, identity: bytes) -> bool:
+        """Whether the order with this identity is in the book, and leaves it last when it is full."""
+        return identity in self._last
+
     def expire(self, head: int) -> list[Verified[Order]]:
         """Remove and return every order whose deadline, or time in the book, is not after block `head`.
 

@@ -175,7 +175,8 @@ class Settlement:
         A transaction that was sent already can't be stopped. The maker is told when it is on disk.
         """
         identity = withdrawn_id(withdrawal)
-        if not self._withdrawals.add(withdrawal, is_open=identity in self._book):
+        is_open = self._book.stays(identity) or self.events.unconfirmed.get(identity) is not None
+        if not self._withdrawals.add(withdrawal, is_open=is_open):
             self._drops.count("withdrawals", withdrawal.signer)
             self.rejections.reject(withdrawal, Refusal.FULL.value, "too many withdrawals")
             self._forget(withdrawal)
@@ -187,7 +188,7 @@ class Settlement:
             self._forget(withdrawal, after=self._pause)
 
     def _may_promise(self, withdrawn: bytes) -> bool:
-        """Whether a withdrawal is known after a restart, and no transaction with its order may still succeed."""
+        """Whether a withdrawal is known to the end, and no transaction with its order may still succeed."""
         return self._withdrawals.is_kept(withdrawn) and not self._versions.is_undecided(withdrawn, self.events.head)
 
     def block(self, signers: frozenset[str]) -> None:

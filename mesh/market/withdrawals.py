@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-from bisect import bisect_right, insort
+from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from typing import TYPE_CHECKING, Final, Self
 
@@ -31,6 +31,9 @@ _TABLE: Final = """
     PRAGMA journal_mode=WAL; PRAGMA synchronous=NORMAL;
     CREATE TABLE IF NOT EXISTS withdrawals (identity BLOB PRIMARY KEY, signer TEXT, payload BLOB) WITHOUT ROWID;
 """
+_LASTING: Final = """
+    BEGIN; ALTER TABLE withdrawals ADD COLUMN lasting INTEGER NOT NULL DEFAULT 1; PRAGMA user_version = 1; COMMIT;
+"""
 
 
 class WithdrawalsNotKept(AiraError, code="withdrawals-not-kept"):
@@ -53,9 +56,10 @@ def withdrawn_id(withdrawal: Verified[Withdrawal]) -> bytes:
 class Withdrawals:
     """The known withdrawals: `with Withdrawals(path) as withdrawals`; in memory only if `path` is None.
 
-    At most `limit` are kept. When there are more, those with the latest deadline are forgotten first: strangers can
-    sign any number, but honest orders end soon. Writes take tens of microseconds and run on the event loop; a failing
-    disk is logged as an outage.
+    At most `limit` are known. Those of open orders are never forgotten before their deadline, nor are others while that
+    leaves half of the places: these may be promised. Strangers can sign any number, so of the rest those with the
+    latest deadline are forgotten when there are too many: honest orders end soon. Writes take tens of microseconds and
+    run on the event loop; a failing disk is logged as an outage.
     """
 
     def __init__(
@@ -73,6 +77,8 @@ class Withdrawals:
         self._known: dict[bytes, Verified[Withdrawal]] = {}
         self._due: list[tuple[int, bytes]] = []
         """Deadline and order of each, the earliest first."""
+        self._brief: list[tuple[int, bytes]] = []
+        """The same of those that may be forgotten."""
         self._by_signer: Counter[str] = Counter()
         self._unwritten: set[bytes] = set()
         """Orders whose withdrawal could not be written."""
@@ -86,6 +92,8 @@ class Withdrawals:
                 self._database = sqlite3.connect(self._path, timeout=0.1, isolation_level=None, check_same_thread=False)
                 self._path.chmod(0o600)
                 self._database.executescript(_TABLE)
+                if not self._database.execute("PRAGMA user_version").fetchone()[0]:
+                    self._database.executescript(_LASTING)
             except (OSError, sqlite3.Error) as error:
                 self._failed(error)
             self._load()
@@ -108,8 +116,8 @@ class Withdrawals:
     def add(self, withdrawal: Verified[Withdrawal], *, is_open: bool = False) -> bool:
         """Know a withdrawal until its deadline; False if there is no room for it, or it is one too many for now.
 
-        The latter not if its order `is_open`. One per order is kept. One that could not be written is written when it
-        is added again.
+        The latter not if its order `is_open`: one that a stranger can't have made up. One per order is kept. One that
+        could not be written is written when it is added again.
         """
         identity = withdrawn_id(withdrawal)
         is_known = identity in self._known
@@ -117,35 +125,44 @@ class Withdrawals:
             return True
         if not is_known and not (is_open or self._rate.allow(withdrawal.signer)):
             return False
-        if not is_known and not self._take(identity, withdrawal):
+        is_lasting = is_open or len(self._known) - len(self._brief) < self._limit // 2
+        if not is_known and not self._take(identity, withdrawal, is_lasting=is_lasting):
             return False
-        row = identity, withdrawal.signer, encode(withdrawal.message)
-        if self._write("INSERT OR REPLACE INTO withdrawals VALUES (?, ?, ?)", [row]):
+        row = identity, withdrawal.signer, encode(withdrawal.message), not self._is_brief(identity)
+        if self._write("INSERT OR REPLACE INTO withdrawals VALUES (?, ?, ?, ?)", [row]):
             self._unwritten.discard(identity)
         else:
             self._unwritten.add(identity)
         if len(self._known) > self._limit:
-            self._forget([self._due.pop()])
+            latest = self._brief.pop() if self._brief else (withdrawal.message.deadline, identity)
+            del self._due[bisect_left(self._due, latest)]
+            self._forget([latest])
         return identity in self._known
 
     def is_kept(self, order: bytes) -> bool:
-        """Whether the withdrawal of the order with this identity is known, and still will be after a restart."""
-        return order in self._known and order not in self._unwritten
+        """Whether the withdrawal of the order with this identity is known until its deadline, also after a restart."""
+        return order in self._known and order not in self._unwritten and not self._is_brief(order)
 
     def expire(self, head: int) -> None:
         """Forget the withdrawals whose deadline is not after block `head`: their orders have expired, too."""
-        count = bisect_right(self._due, head, key=lambda due: due[0])
+        count, brief = (bisect_right(due, head, key=lambda one: one[0]) for due in (self._due, self._brief))
         if count:
-            expired, self._due = self._due[:count], self._due[count:]
+            expired, self._due, self._brief = self._due[:count], self._due[count:], self._brief[brief:]
             self._forget(expired)
 
-    def _take(self, identity: bytes, withdrawal: Verified[Withdrawal]) -> bool:
+    def _take(self, identity: bytes, withdrawal: Verified[Withdrawal], *, is_lasting: bool) -> bool:
         if self._by_signer[withdrawal.signer] >= self._limit_per_signer:
             return False
         self._known[identity] = withdrawal
         self._by_signer[withdrawal.signer] += 1
-        insort(self._due, (withdrawal.message.deadline, identity))
+        for due in (self._due,) if is_lasting else (self._due, self._brief):
+            insort(due, (withdrawal.message.deadline, identity))
         return True
+
+    def _is_brief(self, order: bytes) -> bool:
+        due = self._known[order].message.deadline, order
+        place = bisect_left(self._brief, due)
+        return self._brief[place : place + 1] == [due]
 
     def _forget(self, due: list[tuple[int, bytes]]) -> None:
         for _, identity in due:
@@ -160,11 +177,12 @@ class Withdrawals:
         if self._database is None:
             return
         try:
-            rows = self._database.execute("SELECT identity, signer, payload FROM withdrawals").fetchall()
-            for identity, signer, payload in rows:
+            rows = self._database.execute("SELECT identity, signer, payload, lasting FROM withdrawals").fetchall()
+            for identity, signer, payload, lasting in rows:
                 message = decode(payload)
                 if isinstance(message, Withdrawal):
-                    self._take(identity, Verified(message, message_hash(message), signer))
+                    verified = Verified(message, message_hash(message), signer)
+                    self._take(identity, verified, is_lasting=bool(lasting))
         except (sqlite3.Error, InvalidMessage) as error:
             self._failed(error)
 

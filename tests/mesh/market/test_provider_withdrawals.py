@@ -99,6 +99,23 @@ async def test_withdrawals_survive_a_restart(local: LocalMarket, tmp_path: Path)
         assert await local.liabilities_of(demand) == []
 
 
+async def test_a_flood_of_strangers_withdrawals_makes_no_other_forgotten(local: LocalMarket) -> None:
+    async with local.provider() as provider:
+        provider.withdrawals._limit = 4
+        demand = local.demand()
+        provider.book.known.add(verify_message(demand).signer)
+        local.publish(demand)
+        await until(lambda: provider.book.stays(order_id(verify_message(demand))))
+        local.publish(local.withdrawal(demand))
+        assert (await local.rejection_of(demand)).reason == "withdrawn"
+
+        for _ in range(8):
+            local.publish(local.withdrawal(local.demand("rival", deadline=demand.deadline - 1), "rival"))
+        await until(lambda: len(provider.withdrawals) == 4)
+        await until(lambda: provider.drops.totals().get("withdrawals", 0) > 0)
+        assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
+
+
 async def test_a_withdrawal_that_is_not_on_the_disk_is_not_promised(local: LocalMarket, tmp_path: Path) -> None:
     path, demand = tmp_path / "withdrawals.sqlite", local.demand()
     path.write_bytes(b"not a database, however you look at it" * 100)

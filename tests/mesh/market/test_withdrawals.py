@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mesh.flood import Rate
 from mesh.market import order_id
 from mesh.market.withdrawals import Withdrawals, withdrawn_id
-from schemas import Signer, Withdrawal, verify_message
+from schemas import Signer, Withdrawal, encode, verify_message
 from tests.support.log_events import logged_facts
 from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand
 
@@ -76,11 +76,44 @@ def test_a_flood_of_withdrawals_is_refused_but_for_open_orders() -> None:
 
 def test_when_there_are_too_many_those_with_the_latest_deadline_are_forgotten() -> None:
     with Withdrawals(limit=2) as withdrawals:
-        never, soon, sooner = (withdrawal(deadline=deadline) for deadline in (FAR, 20, 10))
-        assert [withdrawals.add(one) for one in (never, soon, sooner)] == [True, True, True]
-        assert set(withdrawals) == {soon, sooner}
+        first, never, soon = (withdrawal(deadline=deadline) for deadline in (FAR, FAR, 20))
+        assert [withdrawals.add(one) for one in (first, never, soon)] == [True, True, True]
+        assert set(withdrawals) == {first, soon}
         assert not withdrawals.add(never)
-        assert [withdrawn_id(one) in withdrawals for one in (never, soon, sooner)] == [False, True, True]
+        assert [withdrawn_id(one) in withdrawals for one in (first, never, soon)] == [True, False, True]
+
+
+def test_a_flood_of_withdrawals_that_end_sooner_makes_no_other_forgotten_that_was_promised(tmp_path: Path) -> None:
+    path, flood = tmp_path / "withdrawals.sqlite", [withdrawal(deadline=9) for _ in range(9)]
+    with Withdrawals(path, limit=4) as withdrawals:
+        assert sum(withdrawals.add(one) for one in flood) >= 4
+        kept = [withdrawals.is_kept(withdrawn_id(one)) for one in flood]
+        assert kept == [True] * 2 + [False] * 7, "half of the places"
+        assert len(withdrawals) == 4
+        assert withdrawals.add(honest := withdrawal(deadline=20), is_open=True)
+        assert withdrawals.add(withdrawal(deadline=20), is_open=True)
+        assert withdrawals.is_kept(withdrawn_id(honest))
+
+        assert not any(withdrawals.add(withdrawal(deadline=8)) for _ in range(9))
+        assert not withdrawals.add(withdrawal(deadline=7), is_open=True), "refused, for all others were promised"
+        assert honest in set(withdrawals)
+        assert len(withdrawals) == 4
+    with Withdrawals(path, limit=4) as withdrawals:
+        assert not withdrawals.add(withdrawal(deadline=7))
+        assert withdrawals.is_kept(withdrawn_id(honest))
+        withdrawals.expire(9)
+        assert len(withdrawals) == 2
+        assert withdrawals.add(withdrawal(deadline=7), is_open=True)
+
+
+def test_withdrawals_of_an_earlier_version_are_promised(tmp_path: Path) -> None:
+    path, before = tmp_path / "withdrawals.sqlite", withdrawal()
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE withdrawals (identity BLOB PRIMARY KEY, signer TEXT, payload BLOB)")
+        row = withdrawn_id(before), before.signer, encode(before.message)
+        database.execute("INSERT INTO withdrawals VALUES (?, ?, ?)", row)
+    with Withdrawals(path) as withdrawals:
+        assert withdrawals.is_kept(withdrawn_id(before))
 
 
 def test_withdrawals_are_known_without_a_disk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
