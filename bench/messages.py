@@ -1,6 +1,6 @@
 """Verified messages per second through a channel, compared with bare coincurve recoveries in the same run.
 
-Another process publishes signed demands through a router, never more at a time than the channel's ring holds, so that
+Another process publishes signed demands through a router, never more at a time than Zenoh's queue holds, so that
 none is lost. The receiving process runs on one core. Now and then it rests, and recovers some signatures alone, because
 the speed of a busy machine changes from second to second. Both rates are per second of its processor time (of all its
 threads, including Zenoh's). The ratio is the share of that time that recoveries take; the bar is `BAR`. Recovery,

@@ -175,14 +175,14 @@ class Settlement:
         A transaction that was sent already can't be stopped. The maker is told when it is on disk.
         """
         identity = withdrawn_id(withdrawal)
-        is_open = self._book.stays(identity) or self.events.unconfirmed.get(identity) is not None
-        if not self._withdrawals.add(withdrawal, is_open=is_open):
+        is_settled = self.events.unconfirmed.get(identity) is not None
+        if not self._withdrawals.add(withdrawal, is_open=is_settled or self._book.stays(identity)):
             self._drops.count("withdrawals", withdrawal.signer)
             self.rejections.reject(withdrawal, Refusal.FULL.value, "too many withdrawals")
             self._forget(withdrawal)
             return
         self._book.remove(identity)
-        if self._may_promise(identity) and self.events.unconfirmed.get(identity) is None:
+        if self._may_promise(identity) and not is_settled:
             self.rejections.honour(withdrawal)
         else:
             self._forget(withdrawal, after=self._pause)

@@ -75,10 +75,10 @@ class Withdrawals:
         self._limit_per_signer = limit_per_signer
         self._rate = RateLimiter(per_sender=PER_SIGNER, total=rate)
         self._known: dict[bytes, Verified[Withdrawal]] = {}
-        self._due: list[tuple[int, bytes]] = []
-        """Deadline and order of each, the earliest first."""
+        self._lasting: list[tuple[int, bytes]] = []
+        """Deadline and order of those that are not forgotten before, the earliest first."""
         self._brief: list[tuple[int, bytes]] = []
-        """The same of those that may be forgotten."""
+        """The same of the others."""
         self._by_signer: Counter[str] = Counter()
         self._unwritten: set[bytes] = set()
         """Orders whose withdrawal could not be written."""
@@ -125,7 +125,7 @@ class Withdrawals:
             return True
         if not is_known and not (is_open or self._rate.allow(withdrawal.signer)):
             return False
-        is_lasting = is_open or len(self._known) - len(self._brief) < self._limit // 2
+        is_lasting = is_open or len(self._lasting) < self._limit // 2
         if not is_known and not self._take(identity, withdrawal, is_lasting=is_lasting):
             return False
         row = identity, withdrawal.signer, encode(withdrawal.message), not self._is_brief(identity)
@@ -134,9 +134,8 @@ class Withdrawals:
         else:
             self._unwritten.add(identity)
         if len(self._known) > self._limit:
-            latest = self._brief.pop() if self._brief else (withdrawal.message.deadline, identity)
-            del self._due[bisect_left(self._due, latest)]
-            self._forget([latest])
+            own = withdrawal.message.deadline, identity
+            self._forget([self._brief.pop() if self._brief else self._lasting.pop(bisect_left(self._lasting, own))])
         return identity in self._known
 
     def is_kept(self, order: bytes) -> bool:
@@ -145,18 +144,17 @@ class Withdrawals:
 
     def expire(self, head: int) -> None:
         """Forget the withdrawals whose deadline is not after block `head`: their orders have expired, too."""
-        count, brief = (bisect_right(due, head, key=lambda one: one[0]) for due in (self._due, self._brief))
-        if count:
-            expired, self._due, self._brief = self._due[:count], self._due[count:], self._brief[brief:]
-            self._forget(expired)
+        for due in (self._lasting, self._brief):
+            if count := bisect_right(due, head, key=lambda one: one[0]):
+                self._forget(due[:count])
+                del due[:count]
 
     def _take(self, identity: bytes, withdrawal: Verified[Withdrawal], *, is_lasting: bool) -> bool:
         if self._by_signer[withdrawal.signer] >= self._limit_per_signer:
             return False
         self._known[identity] = withdrawal
         self._by_signer[withdrawal.signer] += 1
-        for due in (self._due,) if is_lasting else (self._due, self._brief):
-            insort(due, (withdrawal.message.deadline, identity))
+        insort(self._lasting if is_lasting else self._brief, (withdrawal.message.deadline, identity))
         return True
 
     def _is_brief(self, order: bytes) -> bool:
