@@ -14,9 +14,6 @@ import threading
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeAlias, TypeVar
 
-from coincurve import PrivateKey
-from coincurve._libsecp256k1 import ffi, lib  # type: ignore[import-not-found]
-from coincurve.context import GLOBAL_CONTEXT
 from msgspec import Struct
 from msgspec.structs import replace
 
@@ -25,6 +22,7 @@ from schemas.errors import InputError, InvalidMessage, InvalidRecord
 from schemas.message_fields import SIGNATURE_SIZE, hex_digits
 from schemas.messages import Demand, Offer, OrderFeedback, SignedMessage, TransactionFeedback
 from schemas.records import Record
+from schemas.secp256k1 import CONTEXT, ORDER, ffi, is_private_key, lib, public_key, sign_recoverable
 from schemas.wire import decode, message_hash
 
 if TYPE_CHECKING:
@@ -34,11 +32,9 @@ _M = TypeVar("_M", bound=SignedMessage)
 _M_co = TypeVar("_M_co", bound=SignedMessage, covariant=True)
 
 _PREFIX: Final = b"\x19Ethereum Signed Message:\n32"
-_CURVE_ORDER: Final = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD0364141
-_HIGHEST_S: Final = (_CURVE_ORDER // 2).to_bytes(32, "big")
+_HIGHEST_S: Final = (ORDER // 2).to_bytes(32, "big")
 _V_OFFSET: Final = 27
 _RECOVERY_IDS: Final = {27: 0, 28: 1}
-_CONTEXT: Final = GLOBAL_CONTEXT.ctx
 _CACHED: Final = 8192
 LONGEST_DETAIL: Final = 500
 """Characters of a decline's detail."""
@@ -63,13 +59,16 @@ class Signer:
     __slots__ = ("__key", "address")
 
     def __init__(self, private_key: bytes) -> None:
-        if len(private_key) != 32 or not 0 < int.from_bytes(private_key, "big") < _CURVE_ORDER:
+        if not is_private_key(private_key):
             raise InputError("a private key is 32 bytes, neither zero nor beyond the order of secp256k1")
-        self.__key = PrivateKey(private_key)
-        self.address: Final = signer_of(ffi.buffer(self.__key.public_key.public_key)[:])
+        self.__key = bytes(private_key)
+        self.address: Final = signer_of(public_key(self.__key))
 
     def __repr__(self) -> str:
         return f"Signer({self.address})"
+
+    def __reduce__(self) -> Any:
+        raise TypeError("a signer is not pickled: it would carry its key along")
 
     def sign(self, message: _M) -> _M:
         """The same message with this key's signature on it; deterministic (RFC 6979).
@@ -88,7 +87,7 @@ class Signer:
         """
         if len(digest) != 32:
             raise InputError(f"a message hash has 32 bytes, not {len(digest)}")
-        signature = self.__key.sign_recoverable(keccak256(_PREFIX + digest), hasher=None)
+        signature = sign_recoverable(keccak256(_PREFIX + digest), self.__key)
         return signature[:64] + bytes((signature[64] + _V_OFFSET,))
 
 
@@ -131,7 +130,7 @@ def recover_keys(signed: Iterable[SignedDigest]) -> list[bytes]:
     # Zero means that r or s is out of range, or that r belongs to no point of the curve.
     return [
         key_bytes[:]
-        if _parse(_CONTEXT, signature, compact, recovery_id) and _recover(_CONTEXT, key, signature, digest)
+        if _parse(CONTEXT, signature, compact, recovery_id) and _recover(CONTEXT, key, signature, digest)
         else b""
         for digest, compact, recovery_id in signed
     ]
@@ -146,7 +145,7 @@ class _Buffers(threading.local):
         self.key_bytes: Any = ffi.buffer(self.key)
 
 
-# Coincurve's `PublicKey.from_signature_and_message` makes these calls, too, but allocates three objects for each.
+# The bindings' own function for this makes these calls, too, but allocates three objects for each.
 _buffers: Final = _Buffers()
 _parse: Final = lib.secp256k1_ecdsa_recoverable_signature_parse_compact
 _recover: Final = lib.secp256k1_ecdsa_recover
@@ -280,7 +279,7 @@ def signer_of(key: bytes) -> str:
         raise InvalidMessage("signature", "no key could have made it")
     source, text, size = ffi.new("secp256k1_pubkey *"), ffi.new("unsigned char[65]"), ffi.new("size_t *", 65)
     ffi.memmove(source, key, len(key))
-    lib.secp256k1_ec_pubkey_serialize(_CONTEXT, text, size, source, lib.SECP256K1_EC_UNCOMPRESSED)
+    lib.secp256k1_ec_pubkey_serialize(CONTEXT, text, size, source, lib.SECP256K1_EC_UNCOMPRESSED)
     address = checksum_address(keccak256(ffi.buffer(text)[1:])[12:])
     if address == ZERO_ADDRESS:
         raise InvalidMessage("signature", "the signer is the zero address")

@@ -27,7 +27,7 @@ def test_a_name_that_is_not_there_is_told_as_python_tells_it(package: str) -> No
 @pytest.mark.parametrize(
     ("statement", "absent"),
     [
-        ("from schemas import DeviceTopicKey", "coincurve"),
+        ("from schemas import DeviceTopicKey", "schemas.secp256k1"),
         ("from mesh.network import Endpoints", "asyncio"),
         ("from mesh import Settings", "zenoh"),
         ("from bridges.serial import CallFailed", "zenoh"),

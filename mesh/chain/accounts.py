@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
-
-from coincurve import PrivateKey
 
 from mesh.errors import ConfigurationError, InputError
 from mesh.extras import needs_extra
 from schemas.address import address_bytes, checksum_address, keccak256, parse_address
+from schemas.secp256k1 import is_private_key, sign_recoverable
 from schemas.signing import Signer
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class Account:
 
     def __init__(self, private_key: bytes) -> None:
         self.signer = Signer(private_key)
-        self.__key = PrivateKey(private_key)
+        self.__key = bytes(private_key)
         self.address: str = self.signer.address
         """EIP-55."""
 
@@ -105,7 +105,7 @@ class Account:
 
     def _sign(self, digest: bytes) -> tuple[int, int, int]:
         """The signature of a transaction's hash: r, s, and the parity of the point."""
-        signature = self.__key.sign_recoverable(digest, hasher=None)
+        signature = sign_recoverable(digest, self.__key)
         return int.from_bytes(signature[:32]), int.from_bytes(signature[32:64]), signature[64]
 
     def __repr__(self) -> str:
@@ -137,7 +137,9 @@ def _data(given: str | bytes) -> bytes:
 
 def new_private_key() -> bytes:
     """A new private key from the system's random source."""
-    return bytes(PrivateKey().secret)
+    while not is_private_key(key := secrets.token_bytes(32)):
+        pass  # as good as never: one in 2 ** 128
+    return key
 
 
 def write_keyfile(path: Path | str, private_key: bytes, password: str, *, iterations: int = ITERATIONS) -> str:

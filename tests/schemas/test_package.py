@@ -25,7 +25,7 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 
 def test_keys_and_payloads_load_no_signatures() -> None:
     keys = "from schemas import DeviceTopicKey, Empty, String; import schemas.keys, schemas.payloads"
-    assert loaded_by(keys, ("coincurve", "schemas.signing", "schemas.messages")) == "[]"
+    assert loaded_by(keys, ("schemas.secp256k1", "schemas.signing", "schemas.messages")) == "[]"
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

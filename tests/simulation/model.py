@@ -10,14 +10,14 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
-from coincurve import PrivateKey
 
 from mesh.chain.answers import NO_TRANSACTIONS
 from mesh.chain.multicall import decode_calls, encode_answers
 from mesh.chain.reverts import REVERTED
 from mesh.devchain.evm import FUNDS_WEI
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
-from schemas import keccak256
+from schemas import Signer, keccak256
+from schemas.address import address_bytes
 from tests.simulation.model_abi import ModelRevert, artifact
 from tests.simulation.model_contracts import ModelJury, ModelNames, ModelResolver, ModelToken
 from tests.simulation.model_factory import ModelFactory
@@ -337,4 +337,4 @@ def gas_of(to: bytes, data: bytes) -> int:
 
 
 def _address_of(key: bytes) -> bytes:
-    return keccak256(PrivateKey(key).public_key.format(compressed=False)[1:])[12:]
+    return address_bytes(Signer(key).address)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from coincurve import PublicKey
-
-from schemas import keccak256
+from schemas import InvalidMessage, keccak256
+from schemas.address import address_bytes
+from schemas.signing import recover_keys, signer_of
 from tests.simulation.model_abi import refused, word
 from tests.simulation.model_contracts import NOBODY, stand_in
 
@@ -160,10 +160,9 @@ def _signer_of(digest: bytes, signature: bytes) -> bytes | None:
         return None
     prefixed = keccak256(b"\x19Ethereum Signed Message:\n32" + digest)
     try:
-        key = PublicKey.from_signature_and_message(signature[:64] + bytes([signature[64] - 27]), prefixed, hasher=None)
-    except ValueError:
+        return address_bytes(signer_of(recover_keys([(prefixed, signature, signature[64] - 27)])[0]))
+    except InvalidMessage:
         return None
-    return keccak256(key.format(compressed=False)[1:])[12:]
 
 
 def _number(value: int) -> bytes:

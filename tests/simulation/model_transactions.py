@@ -6,10 +6,11 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
-from coincurve import PublicKey
 
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError
 from schemas import keccak256
+from schemas.address import address_bytes
+from schemas.signing import recover_keys, signer_of
 
 TYPE_2: Final = 2
 
@@ -39,11 +40,12 @@ def read_transaction(raw: bytes) -> ModelTransaction:
         fields = rlp.decode(raw[1:])
         numbers = [int.from_bytes(field, "big") for field in fields[:5]]
         value, parity = int.from_bytes(fields[6], "big"), int.from_bytes(fields[9], "big")
-        signature = fields[10].rjust(32, b"\0") + fields[11].rjust(32, b"\0") + bytes([parity])
+        signature = fields[10].rjust(32, b"\0") + fields[11].rjust(32, b"\0")
+        if len(signature) != 64 or parity > 3:
+            raise ValueError("no signature")
         unsigned = keccak256(bytes([TYPE_2]) + rlp.encode(fields[:9]))
-        key = PublicKey.from_signature_and_message(signature, unsigned, hasher=None)
+        sender = address_bytes(signer_of(recover_keys([(unsigned, signature, parity)])[0]))
     except Exception as error:
         raise RpcError(SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
-    sender = keccak256(key.format(compressed=False)[1:])[12:]
     _, nonce, priority, price, gas = numbers
     return ModelTransaction(raw, keccak256(raw), sender, nonce, priority, price, gas, fields[5], value, fields[7])

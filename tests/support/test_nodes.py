@@ -4,7 +4,7 @@ import json
 import urllib.request
 from typing import TYPE_CHECKING, Any
 
-import coincurve
+from schemas import Signer
 
 if TYPE_CHECKING:
     from tests.support.nodes import Anvil
@@ -23,7 +23,7 @@ def test_anvil_answers_with_the_number_of_its_first_block(anvil: Anvil) -> None:
 
 
 def test_anvil_gives_ten_funded_keys(anvil: Anvil) -> None:
-    assert len({coincurve.PrivateKey(key).public_key.format() for key in anvil.private_keys}) == 10
+    assert len({Signer(key).address for key in anvil.private_keys}) == 10
     accounts = call(anvil.url, "eth_accounts")
     assert [call(anvil.url, "eth_getBalance", account, "latest") for account in accounts] == [hex(10**22)] * 10
 
