@@ -28,6 +28,10 @@ ORDER: Final = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD036414
 """The number of points of the curve. Private keys are smaller, and at least 1."""
 
 
+_UNCOMPRESSED: Final = 2
+"""`SECP256K1_EC_UNCOMPRESSED`, which one of the bindings lacks."""
+
+
 def is_private_key(secret: bytes) -> bool:
     """Whether these are 32 bytes of a number from 1 to `ORDER` less one."""
     return len(secret) == 32 and 0 < int.from_bytes(secret, "big") < ORDER
@@ -39,6 +43,14 @@ def public_key(secret: bytes) -> bytes:
     if not lib.secp256k1_ec_pubkey_create(CONTEXT, key, secret):
         raise ValueError("not a private key")
     return bytes(ffi.buffer(key))
+
+
+def point_of(key: bytes) -> bytes:
+    """The 64 bytes of x and y of a public key, which is given as libsecp256k1 holds it."""
+    source, text, size = ffi.new("secp256k1_pubkey *"), ffi.new("unsigned char[65]"), ffi.new("size_t *", 65)
+    ffi.memmove(source, key, len(key))
+    lib.secp256k1_ec_pubkey_serialize(CONTEXT, text, size, source, _UNCOMPRESSED)
+    return bytes(ffi.buffer(text)[1:])
 
 
 def sign_recoverable(digest: bytes, secret: bytes) -> bytes:

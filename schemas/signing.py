@@ -22,7 +22,7 @@ from schemas.errors import InputError, InvalidMessage, InvalidRecord
 from schemas.message_fields import SIGNATURE_SIZE, hex_digits
 from schemas.messages import Demand, Offer, OrderFeedback, SignedMessage, TransactionFeedback
 from schemas.records import Record
-from schemas.secp256k1 import CONTEXT, ORDER, ffi, is_private_key, lib, public_key, sign_recoverable
+from schemas.secp256k1 import CONTEXT, ORDER, ffi, is_private_key, lib, point_of, public_key, sign_recoverable
 from schemas.wire import decode, message_hash
 
 if TYPE_CHECKING:
@@ -277,10 +277,7 @@ def signer_of(key: bytes) -> str:
     """
     if not key:
         raise InvalidMessage("signature", "no key could have made it")
-    source, text, size = ffi.new("secp256k1_pubkey *"), ffi.new("unsigned char[65]"), ffi.new("size_t *", 65)
-    ffi.memmove(source, key, len(key))
-    lib.secp256k1_ec_pubkey_serialize(CONTEXT, text, size, source, lib.SECP256K1_EC_UNCOMPRESSED)
-    address = checksum_address(keccak256(ffi.buffer(text)[1:])[12:])
+    address = checksum_address(keccak256(point_of(key))[12:])
     if address == ZERO_ADDRESS:
         raise InvalidMessage("signature", "the signer is the zero address")
     return address
