@@ -27,7 +27,6 @@ else:
 ORDER: Final = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD0364141
 """The number of points of the curve. Private keys are smaller, and at least 1."""
 
-
 _UNCOMPRESSED: Final = 2
 """`SECP256K1_EC_UNCOMPRESSED`, which one of the bindings lacks."""
 
