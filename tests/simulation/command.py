@@ -148,17 +148,16 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _print_logs() -> None:
-    class SimulatedHandler(logging.StreamHandler[Any]):
-        def createLock(self) -> None:  # noqa: N802
-            self.lock = None  # where a simulated lock is taken, threads may switch
-
-        def format(self, record: logging.LogRecord) -> str:
+    class SimulatedHandler(logging.Handler):
+        def handle(self, record: logging.LogRecord) -> bool:
+            """Without the handler's lock: where a simulated lock is taken, threads may switch."""
             scheduler = threads.scheduler()
-            process = scheduler.process.name if scheduler.process else "-"
-            return f"{scheduler.now_ns / SECOND:.3f} {process} {record.levelname} {record.name}: {record.getMessage()}"
+            now, process = scheduler.now_ns / SECOND, scheduler.process.name if scheduler.process else "-"
+            print(f"{now:.3f} {process} {record.levelname} {record.name}: {record.getMessage()}", flush=True)
+            return True
 
     logging.getLogger("mesh").setLevel(logging.INFO)
-    logging.getLogger("mesh").addHandler(SimulatedHandler(sys.stdout))
+    logging.getLogger("mesh").addHandler(SimulatedHandler())
 
 
 def _histories(options: argparse.Namespace) -> Iterator[Run]:

@@ -29,9 +29,9 @@ class Future(asyncio.Future[Any]):
 class Task(asyncio.Task[Any]):
     """The same for tasks. A task has its number before asyncio puts it into its set of all tasks."""
 
-    def __init__(self, coro: Any, *, loop: Any, context: Any, number: int) -> None:
+    def __init__(self, coro: Any, *, loop: Any, number: int, **options: Any) -> None:
         self.number = number
-        super().__init__(coro, loop=loop, context=context)
+        super().__init__(coro, loop=loop, **options)
 
     def __hash__(self) -> int:
         return self.number
@@ -62,8 +62,8 @@ class SimulatedLoop(asyncio.BaseEventLoop):
         future.number = self._scheduler.count()
         return future
 
-    def _make_task(self, loop: Any, coro: Any, context: Any = None) -> Task:
-        task = Task(coro, loop=loop, context=context, number=self._scheduler.count())
+    def _make_task(self, loop: Any, coro: Any, **options: Any) -> Task:
+        task = Task(coro, loop=loop, number=self._scheduler.count(), **options)
         self._tasks.append(task)
         if len(self._tasks) > self._prune_at:
             self._tasks = [one for one in self._tasks if not one.done()]

@@ -184,7 +184,10 @@ class CurrentThread:
     daemon = True
 
     def _reset_internal_locks(self, is_alive: bool) -> None:
-        """Called after a fork."""
+        """Called after a fork, by Python 3.11 and 3.12."""
+
+    def _after_fork(self, new_ident: int | None = None) -> None:
+        """Called after a fork, from Python 3.13 on."""
 
 
 _CURRENT: Any = CurrentThread()
