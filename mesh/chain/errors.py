@@ -196,7 +196,7 @@ class Reverted(ChainError, code="reverted"):
 
     `reason` is the name of its custom error (`CostMismatch`), or the text of a plain revert, `Panic`, `OutOfGas`, or
     empty when it gave none; `arguments` are the custom error's; `data` is what it reverted with. `gas_used` and `wei`
-    are what that has cost, and `block` is where: all 0, unless the transaction was mined.
+    are what that has cost, `block` is where, and `nonce` the transaction's number: all 0, unless it was mined.
     """
 
     def __init__(
@@ -208,6 +208,7 @@ class Reverted(ChainError, code="reverted"):
         gas_used: int = 0,
         wei: int = 0,
         block: int = 0,
+        nonce: int = 0,
     ) -> None:
         shown = ", ".join(_show(argument) for argument in arguments)
         said = f"the contract refused: {reason or 'no reason given'}" + (f" ({shown})" if shown else "")
@@ -218,6 +219,7 @@ class Reverted(ChainError, code="reverted"):
         self.gas_used = gas_used
         self.wei = wei
         self.block = block
+        self.nonce = nonce
 
 
 class TransactionTimeout(ChainError, code="transaction-timeout"):

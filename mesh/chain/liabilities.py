@@ -33,10 +33,11 @@ READ_AT_ONCE: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class Created:
-    """A liability that a transaction created, the gas that it used, and what that cost in wei."""
+    """A liability that a transaction created, its number in the account, its gas, and what that cost in wei."""
 
     liability: str
     tx: str
+    nonce: int
     gas_used: int
     wei: int
 
@@ -158,9 +159,8 @@ class Liabilities:
         functions = await self._contracts.lighthouse_contract(lighthouse)
         receipt = await self._contracts.send(functions.createLiability(order_abi(demand), order_abi(offer)))
         made = liability_created(receipt.logs, factory=self._contracts.factory)
-        created = Created(made.liability, receipt.tx, receipt.gas_used, receipt.wei)
-        self._contracts.version.recognise(created.liability)
-        return created
+        self._contracts.version.recognise(made.liability)
+        return Created(made.liability, receipt.tx, receipt.nonce, receipt.gas_used, receipt.wei)
 
     async def withdraw(self, order: Order) -> Receipt:
         """Make a signed order of one's own unusable on the chain, for every provider.

@@ -151,9 +151,9 @@ class Node:
         """Wei of an account."""
         return int(await self._ask("eth_getBalance", address, "latest"))
 
-    async def transaction_count(self, address: str, *, pending: bool = False) -> int:
-        """How many transactions an account has on the chain; with `pending`, also those that wait to be mined."""
-        return int(await self._ask("eth_getTransactionCount", address, "pending" if pending else "latest"))
+    async def transaction_count(self, address: str, *, block: int | str = "latest") -> int:
+        """How many transactions an account has up to a block; for "pending" also those that wait to be mined."""
+        return int(await self._ask("eth_getTransactionCount", address, _block(block)))
 
     async def code(self, address: str, *, block: int | str = "latest") -> bytes:
         """The code of the contract at an address, in the state after a block; empty if there is none."""

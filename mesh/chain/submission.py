@@ -131,7 +131,7 @@ class Resubmission:
                 nonce in self._pending.taken or not await self._fill(nonce, waiting, was_missing=was_missing)
             ):
                 return
-            gap = await self._node.transaction_count(self._account.address, pending=True)
+            gap = await self._node.transaction_count(self._account.address, block="pending")
 
     async def _resubmit(self, nonce: int, *, is_first: bool) -> bool:
         """Send the transaction with a nonce again; False if there is none, or another process waits for it."""
@@ -155,7 +155,7 @@ class Resubmission:
         it: nothing is filled before the first nonce was missing twice.
         """
         address = self._account.address
-        if not was_missing or await self._node.transaction_count(address, pending=True) != nonce:
+        if not was_missing or await self._node.transaction_count(address, block="pending") != nonce:
             self._pending.missing = nonce
             facts = {"tx": waiting.newest.hash, "nonce": nonce}
             waits = "%(tx)s waits for nonce %(nonce)d of its account, which no transaction of this program has"

@@ -44,10 +44,11 @@ NONCE_RETRY: Final = RetryPolicy(initial=0.0, ceiling=0.0, attempts=25)
 class Receipt:
     """A mined transaction that succeeded. `contract` is what it deployed, if anything.
 
-    `wei` is what its gas cost.
+    `wei` is what its gas cost, `nonce` its number among the account's transactions.
     """
 
     tx: str
+    nonce: int
     block_number: int
     gas_used: int
     wei: int
@@ -175,7 +176,7 @@ class TransactionSender:
         await pending.refresh()
         counted = pending.counted(self._node.heads.latest)
         if counted is None or pending.abandoned:
-            counted = await self._node.transaction_count(self.account.address, pending=True)
+            counted = await self._node.transaction_count(self.account.address, block="pending")
         # A node behind a load balancer may not know what was just sent through another.
         waiting = [
             entry.nonce
@@ -234,9 +235,11 @@ class TransactionSender:
                 gas_used=gas_used,
                 wei=wei,
                 block=receipt.block_number,
+                nonce=entry.nonce,
             )
         return Receipt(
             tx=signed.hash,
+            nonce=entry.nonce,
             block_number=receipt.block_number,
             gas_used=gas_used,
             wei=wei,

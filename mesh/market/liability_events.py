@@ -141,6 +141,7 @@ class LiabilityEvents:
             elif isinstance(event, Finalized):
                 self.open.pop(event.liability, None)
                 self.unconfirmed.finalized(event.liability, block.block_number)
+        await self._count_transactions(block.block_number)
         self.head, self.read_at = block.block_number, time.monotonic()
         self.unconfirmed.confirm(self.head)
         self._withdrawals.expire(self.head - self._chain.node.timing.reorg_depth)
@@ -148,6 +149,19 @@ class LiabilityEvents:
             self._forget(order)  # its deadline may be later than the book's limit
             facts = {"order": order.hash.hex(), "signer": order.signer}
             log.info("expired order %(order)s of %(signer)s", facts, extra=log_event("order-expired", **facts))
+
+    async def _count_transactions(self, head: int) -> None:
+        """Note which transactions of the account are not mined at a block, if an order waits for one."""
+        account = self._chain.account
+        if account is None or not self._versions.need_count():
+            return
+        count = partial(self._chain.node.transaction_count, account.address)
+        try:
+            mined, pending = await asyncio.gather(count(block=head), count(block="pending"))
+        except RequestRefused as error:  # a node that is behind, or met a reorganisation
+            log.debug("the account's transactions can't be counted: %s", error)
+            mined, pending = 0, -1
+        self._versions.counted(mined, pending, head)
 
     def _take_created(self, liability: Liability, order_hashes: tuple[bytes, bytes], block: int) -> None:
         """Take the orders of a new liability, created in that block, out of the book."""

@@ -219,13 +219,14 @@ class Settlement:
         except (NodeUnreachable, RequestRefused, InputError) as error:
             await self._not_created(match, match, error)
         else:
+            self._versions.sent(match, created.nonce)
             self._earnings.created(created, fee=offer.message.lighthouse_fee)
             facts = {"gas": created.gas_used, "demand": demand.hash.hex(), "offer": offer.hash.hex()}
             with liability_context(created.liability):
                 log.info("created, gas %(gas)d", facts, extra=log_event("contract-created", **facts))
             if not await self.events.is_confirmed(match, created.tx):
                 self._earnings.creation_reverted(created.liability, created.tx)
-                self._versions.failed(match, self.events.head)
+                self._versions.failed(match, created.nonce, self.events.head)
             self._put_back(match)
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
@@ -246,7 +247,7 @@ class Settlement:
                 raise
             except Reverted as error:
                 if error.block:
-                    self._versions.failed(match, max(error.block, self.events.head))
+                    self._versions.failed(match, error.nonce, max(error.block, self.events.head))
                 raise
 
         return attempt

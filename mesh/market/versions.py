@@ -5,8 +5,9 @@ reorganisation may free the nonce: then the older version would be valid again, 
 settles the newest version only, and none once another version has become a contract.
 
 A transaction that failed when it was mined may succeed after all, if a reorganisation has it mined again; so may one
-whose contract a reorganisation reverted. Until its block is deep, the order is undecided: a provider settles no other
-version of it, and honours no withdrawal.
+whose contract a reorganisation reverted. The order is undecided until its nonce was used in a deep block, or until the
+node has lost the transaction: a provider settles no other version of it, and honours no withdrawal. (Of another
+provider's transaction only the block is known, and that it is mined again soon.)
 """
 
 from __future__ import annotations
@@ -43,10 +44,15 @@ def lasting_hash(order: Order) -> str:
 
 
 class _Undecided(NamedTuple):
-    """A version with which a transaction may still succeed, and the block that decides once it is deep."""
+    """A version with which a transaction may still succeed.
+
+    `block` decides once it is deep: the transaction's, or a later one, up to which it was not mined. `nonce` is the
+    transaction's; None if it is another account's.
+    """
 
     identity: bytes
     block: int
+    nonce: int | None
 
 
 class OrderVersions:
@@ -65,6 +71,8 @@ class OrderVersions:
         self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(limit)
         """What each contract (address) is of."""
         self._undecided: BoundedDict[_Key, _Undecided] = BoundedDict(limit)
+        self._nonces: BoundedDict[bytes, int] = BoundedDict(limit)
+        """Of this account's last transaction with each version (identity)."""
 
     def note(self, order: Verified[Order]) -> bytes | None:
         """Remember an order. Returns the identity of the version that it replaces, if that was the newest."""
@@ -90,7 +98,7 @@ class OrderVersions:
     def is_undecided(self, identity: bytes, head: int) -> bool:
         """Whether, at block `head`, a transaction with a version of this order may still succeed."""
         undecided = self._undecided.get(self._key(identity))
-        return undecided is not None and undecided.block + self._depth > head
+        return undecided is not None and self._is_open(undecided, head)
 
     def use(self, identity: bytes, liability: str) -> bytes | None:
         """A version became the contract at an address. Returns the identity of the newest one, if that is another."""
@@ -100,10 +108,30 @@ class OrderVersions:
         newest = self._newest.get(key)
         return None if newest is None or newest.identity == identity else newest.identity
 
-    def failed(self, orders: Iterable[Verified[Order]], block: int) -> None:
-        """A transaction with these orders failed or vanished, in a block or before it."""
+    def sent(self, orders: Iterable[Verified[Order]], nonce: int) -> None:
+        """The account's transaction with this nonce had these orders, and was mined."""
+        self._nonces.update((order_id(order), nonce) for order in orders)
+
+    def failed(self, orders: Iterable[Verified[Order]], nonce: int, block: int) -> None:
+        """The account's transaction with this nonce, and these orders, failed or vanished, in a block or before it."""
         for order in orders:
-            self._undecided[self._key_of(order)] = _Undecided(order_id(order), block)
+            self._undecided[self._key_of(order)] = _Undecided(order_id(order), block, nonce)
+
+    def need_count(self) -> bool:
+        """Whether `counted` must be called at the next block."""
+        return any(one.nonce is not None for one in self._undecided.values())
+
+    def counted(self, mined: int, pending: int, head: int) -> None:
+        """The account has `mined` transactions up to block `head`, and `pending` with those that wait in a row.
+
+        What may still be mined is decided later than this block. A transaction whose nonce is the next one is lost, as
+        the node does not have it.
+        """
+        for key, one in list(self._undecided.items()):
+            if one.nonce is not None and one.nonce >= mined and one.nonce != pending:
+                self._undecided[key] = one._replace(block=head + 1)
+            elif not self._is_open(one, head):
+                del self._undecided[key]
 
     def reorganised(self, last: int, head: int) -> None:
         """The blocks after `last`, up to `head`, were replaced: their transactions are mined again in later ones."""
@@ -115,7 +143,10 @@ class OrderVersions:
         """A reorganisation of the blocks up to `head` reverted the contract at an address."""
         for key in self._contracts.pop(liability, ()):
             if (identity := self._used.pop(key, None)) is not None:
-                self._undecided[key] = _Undecided(identity, head + 1)
+                self._undecided[key] = _Undecided(identity, head + 1, self._nonces.get(identity))
+
+    def _is_open(self, undecided: _Undecided, head: int) -> bool:
+        return undecided.block + self._depth > head
 
     def _key_of(self, order: Verified[Order]) -> _Key:
         identity = order_id(order)

@@ -294,7 +294,7 @@ CANDIDATES: Final = (
     Mutation(
         "of lost nonces only the first is filled at once",
         "mesh.chain.submission:Resubmission._use_nonces",
-        "gap = await self._node.transaction_count(self._account.address, pending=True)",
+        'gap = await self._node.transaction_count(self._account.address, block="pending")',
         "return",
         REORGANISATIONS + ",crash_every,leave_out",
         jobs=100,

@@ -43,7 +43,7 @@ async def test_above_the_ceiling_nothing_is_sent(anvil: Anvil) -> None:
             await sender.send(to=friend, data=b"", value=1)
         assert (caught.value.price, caught.value.ceiling) == (31 * GWEI, 20 * GWEI)
         assert caught.value.hint
-        assert await node.transaction_count(sender.account.address, pending=True) == 0
+        assert await node.transaction_count(sender.account.address, block="pending") == 0
 
 
 async def test_with_patience_a_transaction_waits_for_a_lower_price(anvil: Anvil) -> None:

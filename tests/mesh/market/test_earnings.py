@@ -12,7 +12,7 @@ NOTHING = Earnings(created=0, finalized=0, rejected={}, gas_used=0, spent=0, fee
 
 
 def created(tx: str = CREATION) -> Created:
-    return Created(ADDRESS, tx, gas_used=150_000, wei=3 * 10**14)
+    return Created(ADDRESS, tx, nonce=0, gas_used=150_000, wei=3 * 10**14)
 
 
 def settled() -> Settled:

@@ -117,6 +117,29 @@ async def test_no_other_version_is_settled_until_a_failed_transaction_is_deep(lo
         assert list(provider.book.orders()) == [verify_message(newer)]
 
 
+async def test_no_other_version_is_settled_before_the_nonce_of_a_vanished_transaction_is_used(
+    local: LocalMarket,
+) -> None:
+    """However long that takes: an earlier transaction of the account may be stuck."""
+    older, newer = await versions_of(local, 2)
+    before = await local.request("evm_snapshot")
+    async with local.chain_of("provider") as chain, HeldNode(local.node) as node:
+        await chain.tokens.approve(local.address("robot"), 1)
+        async with local.provider(endpoint=node) as provider:
+            await fail_when_mined(local, provider, node, older)
+            await local.request("evm_revert", before)
+            await local.mine(3)
+            await until_read(local, provider)
+            await local.mine(2 * DEPTH)
+            await until_read(local, provider)
+            assert provider.settlement.add(verify_message(newer)) is Refusal.UNDECIDED
+            await chain.tokens.approve(local.address("robot"), 2)
+            await local.mine(DEPTH)
+            await until_read(local, provider)
+            await until(lambda: provider.settlement.add(verify_message(newer)) is not Refusal.UNDECIDED)
+            assert list(provider.book.orders()) == [verify_message(newer)]
+
+
 @pytest.mark.sample("generation")
 @pytest.mark.parametrize("generation", [3, 5])
 @pytest.mark.parametrize("comes", ["before it failed", "after it failed"])
@@ -172,10 +195,34 @@ async def test_a_failed_transaction_in_a_replaced_block_is_mined_again_later(loc
     older, newer = map(verify_message, await versions_of(local, 2))
     versions = OrderVersions(DEPTH)
     versions.note(older)
-    versions.failed([older], 10)
+    versions.failed([older], nonce=3, block=10)
     versions.note(newer)
     versions.reorganised(10, head=14)
     assert versions.refusal(order_id(newer), head=10 + DEPTH) is None
     versions.reorganised(9, head=14)
     assert versions.refusal(order_id(newer), head=14 + DEPTH) is Refusal.UNDECIDED
     assert versions.refusal(order_id(newer), head=15 + DEPTH) is None
+
+
+@pytest.mark.parametrize(
+    ("mined", "pending", "is_open"),
+    [
+        pytest.param(2, 5, True, id="the transaction waits"),
+        pytest.param(2, 2, True, id="an earlier one was lost"),
+        pytest.param(3, 3, False, id="it was lost"),
+        pytest.param(4, 4, False, id="its nonce was used"),
+    ],
+)
+async def test_a_transaction_is_decided_by_the_nonces_of_its_account(
+    local: LocalMarket, mined: int, pending: int, is_open: bool
+) -> None:
+    older, newer = map(verify_message, await versions_of(local, 2))
+    versions = OrderVersions(DEPTH)
+    versions.note(older)
+    versions.failed([older], nonce=3, block=10)
+    versions.note(newer)
+    assert versions.need_count()
+    versions.counted(mined, pending, head=10 + DEPTH)
+    assert versions.need_count() is is_open
+    assert (versions.refusal(order_id(newer), head=10 + DEPTH) is Refusal.UNDECIDED) is is_open
+    assert versions.refusal(order_id(newer), head=11 + 2 * DEPTH) is None
