@@ -28,6 +28,7 @@ STEP_NS: Final = 20_000
 BUSY_STEPS: Final = 20_000
 """Steps of a process in a second that mean that it is busy with nothing. Honest work takes up to 5,200; 50,000 fit."""
 START_WALL_NS: Final = 1_800_000_000 * SECOND
+KEEPS_TASK: Final = sys.version_info >= (3, 14)
 
 
 class HistoryFailed(Exception):
@@ -50,7 +51,8 @@ class Fiber:
         self.timed_out = False
         self.loop: asyncio.AbstractEventLoop | None = None
         self.hooks: Any = None
-        """With the running event loop, what CPython keeps for each thread."""
+        self.task: Any = None
+        """With the running event loop, what CPython keeps for each thread; the task since Python 3.14."""
 
 
 class Process:
@@ -233,6 +235,8 @@ class Scheduler:
         if fiber.loop is not None:
             events._set_running_loop(fiber.loop)
             sys.set_asyncgen_hooks(*fiber.hooks)
+            if KEEPS_TASK:
+                asyncio.tasks._swap_current_task(fiber.loop, fiber.task)  # type: ignore[attr-defined]
         fiber.greenlet.switch()
         if fiber.greenlet.dead:
             self._fibers.discard(fiber)
@@ -243,5 +247,7 @@ class Scheduler:
         loop = fiber.loop = events._get_running_loop()
         if loop is not None:
             fiber.hooks = sys.get_asyncgen_hooks()
+            if KEEPS_TASK:
+                fiber.task = asyncio.tasks._swap_current_task(loop, None)  # type: ignore[attr-defined]
             events._set_running_loop(None)
         self._hub.switch()
