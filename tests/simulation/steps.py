@@ -153,12 +153,11 @@ class StepAudit:
     def _check_withdrawn(self, liability: str, demand: str) -> None:
         """The only provider, if it was never restarted, makes no contract of an order whose withdrawal it honours.
 
-        A restarted one does not know what it has sent before. One reorganisation after the other may keep a transaction
-        out of blocks for longer than a provider waits.
+        A restarted one does not know what it has sent before.
         """
         is_promised = any((one.name, demand) in self.honoured for one in self._market.providers)
-        is_settled = len(self._market.providers) == self._market.providers[0].starts == 1 >= self._reorganisations
-        if is_promised and is_settled and liability not in self._before:
+        is_alone = len(self._market.providers) == self._market.providers[0].starts == 1
+        if is_promised and is_alone and liability not in self._before:
             self._market.violated("contract-after-withdrawal", f"{liability} is of the withdrawn {demand[:12]}")
 
     def told(self, person: PersonRole, number: int) -> None:
