@@ -99,6 +99,11 @@ class LiabilityEvents:
                 self.outages.failed(error, f"the chain can't be read on from block {self.head + 1}")
                 await backoff.wait()
 
+    def note(self, order: Verified[Demand | Offer]) -> None:
+        """Remember which version of an order this is. The one that it replaces leaves the book."""
+        if (replaced := self._versions.note(order)) is not None:
+            self._book.remove(replaced)
+
     async def is_confirmed(self, messages: Sequence[Verified[Any]], tx: str) -> bool:
         """Wait until the event that used the messages has its confirmations; False if their transaction vanished."""
         timing, missing = self._chain.node.timing, 0

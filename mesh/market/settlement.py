@@ -67,8 +67,8 @@ class Settlement:
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
         assert chain.account is not None
-        self._chain = chain
         assert channel.address is not None
+        self._chain = chain
         self._lighthouse = channel.address
         self._book = book
         self._queue = queue
@@ -121,8 +121,7 @@ class Settlement:
         if order.signer in self.blocked:
             self._drop_blocked(order)
             return Refusal.BLOCKED
-        if (replaced := self._versions.note(order)) is not None:
-            self._book.remove(replaced)
+        self.events.note(order)
         outcome = self._refusal(order) or self._book.add(order)
         for evicted in outcome.evicted if isinstance(outcome, Added) else ():
             self._drops.count("book-full", evicted.signer)
@@ -144,13 +143,11 @@ class Settlement:
         return None
 
     def set_aside(self, order: Verified[Order], reason: str) -> None:
-        """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that.
-
-        Each copy is rejected, because an earlier rejection may have been lost.
-        """
+        """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
+        self.events.note(order)
         if self._refusal(order) is None and order_id(order) not in self._book:
             self._unfunded.add(order)
-        if order in self._unfunded:
+        if order in self._unfunded:  # each copy, because an earlier rejection may have been lost
             self.rejections.reject(order, reason, "its maker lacks the money, or the factory may not take it")
         self._forget(order, after=self._pause)
 
@@ -217,6 +214,7 @@ class Settlement:
             if error.reason == ORDER_USED or not await self._set_aside_unfunded(match, reason_of(error), str(error)):
                 await self._not_created(match, at_fault(match, error.reason, error.arguments), error)
         except (NodeUnreachable, RequestRefused, InputError) as error:
+            self._versions.failed(match, None, self.events.head)  # the node may have it
             await self._not_created(match, match, error)
         else:
             self._versions.sent(match, created.nonce)
@@ -228,18 +226,18 @@ class Settlement:
                 self._earnings.creation_reverted(created.liability, created.tx)
                 self._versions.failed(match, created.nonce, self.events.head)
             self._put_back(match)
+        finally:
+            self._versions.ended(match)
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
-        """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`.
-
-        The latter if an order is withdrawn, replaced or of a blocked signer, and no earlier attempt may still be mined.
-        """
+        """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`."""
         may_be_sent = False
 
         async def attempt() -> Created:
             nonlocal may_be_sent
             if not may_be_sent and any(self._taken_back(one) or one.signer in self.blocked for one in match):
                 raise MatchWithdrawn("an order was withdrawn or replaced before its contract was created")
+            self._versions.sending(match)
             try:
                 return await self._chain.liabilities.create(self._lighthouse, match.demand.message, match.offer.message)
             except (NodeUnreachable, TransactionTimeout):

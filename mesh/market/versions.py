@@ -4,10 +4,11 @@ When another order of an account has used a nonce, the account signs its open or
 reorganisation may free the nonce: then the older version would be valid again, and after it the newer one. A provider
 settles the newest version only, and none once another version has become a contract.
 
-A transaction that failed when it was mined may succeed after all, if a reorganisation has it mined again; so may one
-whose contract a reorganisation reverted. The order is undecided until its nonce was used in a deep block, or until the
-node has lost the transaction: a provider settles no other version of it, and honours no withdrawal. (Of another
-provider's transaction only the block is known, and that it is mined again soon.)
+An order is undecided while a transaction with it is on its way: a provider settles no other version then, and
+honours no withdrawal. A transaction that failed when it was mined may succeed after all, if a reorganisation has it
+mined again; so may one whose contract a reorganisation reverted. So the order stays undecided until the
+transaction's nonce was used in a deep block, or until the node has lost the transaction. (Of another provider's
+transaction only the block is known, and that it is mined again soon.)
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class _Undecided(NamedTuple):
     """A version with which a transaction may still succeed.
 
     `block` decides once it is deep: the transaction's, or a later one, up to which it was not mined. `nonce` is the
-    transaction's; None if it is another account's.
+    transaction's; None if it is not known, or another account's.
     """
 
     identity: bytes
@@ -73,6 +74,8 @@ class OrderVersions:
         self._undecided: BoundedDict[_Key, _Undecided] = BoundedDict(limit)
         self._nonces: BoundedDict[bytes, int] = BoundedDict(limit)
         """Of this account's last transaction with each version (identity)."""
+        self._sending: dict[_Key, bytes] = {}
+        """The version with which a transaction is on its way."""
 
     def note(self, order: Verified[Order]) -> bytes | None:
         """Remember an order. Returns the identity of the version that it replaces, if that was the newest."""
@@ -92,13 +95,15 @@ class OrderVersions:
         newest, undecided = self._newest.get(key), self._undecided.get(key)
         if self._used.get(key, identity) != identity or (newest is not None and newest.identity != identity):
             return Refusal.REPLACED
-        is_other = undecided is not None and undecided.identity != identity
-        return Refusal.UNDECIDED if is_other and self.is_undecided(identity, head) else None
+        others = {self._sending.get(key, identity)}
+        if undecided is not None and self._is_open(undecided, head):
+            others.add(undecided.identity)
+        return None if others == {identity} else Refusal.UNDECIDED
 
     def is_undecided(self, identity: bytes, head: int) -> bool:
         """Whether, at block `head`, a transaction with a version of this order may still succeed."""
-        undecided = self._undecided.get(self._key(identity))
-        return undecided is not None and self._is_open(undecided, head)
+        undecided = self._undecided.get(key := self._key(identity))
+        return key in self._sending or (undecided is not None and self._is_open(undecided, head))
 
     def use(self, identity: bytes, liability: str) -> bytes | None:
         """A version became the contract at an address. Returns the identity of the newest one, if that is another."""
@@ -108,12 +113,24 @@ class OrderVersions:
         newest = self._newest.get(key)
         return None if newest is None or newest.identity == identity else newest.identity
 
+    def sending(self, orders: Iterable[Verified[Order]]) -> None:
+        """A transaction with these orders is on its way, until `ended`."""
+        self._sending.update((self._key_of(order), order_id(order)) for order in orders)
+
+    def ended(self, orders: Iterable[Verified[Order]]) -> None:
+        """No transaction with these orders is on its way any more."""
+        for order in orders:
+            self._sending.pop(self._key_of(order), None)
+
     def sent(self, orders: Iterable[Verified[Order]], nonce: int) -> None:
         """The account's transaction with this nonce had these orders, and was mined."""
         self._nonces.update((order_id(order), nonce) for order in orders)
 
-    def failed(self, orders: Iterable[Verified[Order]], nonce: int, block: int) -> None:
-        """The account's transaction with this nonce, and these orders, failed or vanished, in a block or before it."""
+    def failed(self, orders: Iterable[Verified[Order]], nonce: int | None, block: int) -> None:
+        """The account's transaction with these orders failed or vanished, in a block or before it.
+
+        `nonce` is its nonce, None if it is not known.
+        """
         for order in orders:
             self._undecided[self._key_of(order)] = _Undecided(order_id(order), block, nonce)
 

@@ -100,6 +100,28 @@ async def fail_when_mined(
     await until(lambda: provider.earnings().gas_used, what="it has failed when it was mined")
 
 
+async def test_no_other_version_is_settled_while_a_transaction_is_on_its_way(local: LocalMarket) -> None:
+    older, newer = await versions_of(local, 2)
+    robot = local.address("robot")
+    offer = local.offer(sender=robot, nonce=await local.chain.liabilities.next_nonce(robot))
+    async with HeldNode(local.node) as node, local.provider(endpoint=node) as provider:
+        with node.back("eth_sendRawTransaction"):
+            local.publish(older, offer)
+            await until(lambda: node.waiting["eth_sendRawTransaction"])
+            assert provider.settlement.add(verify_message(newer)) is Refusal.UNDECIDED
+        await local.liability_of(older)
+        await until_read(local, provider)
+        assert provider.settlement.add(verify_message(newer)) is Refusal.REPLACED
+
+
+async def test_a_version_whose_maker_can_not_pay_replaces_an_older_one(local: LocalMarket) -> None:
+    older, newer = map(verify_message, await versions_of(local, 2))
+    async with local.provider() as provider:
+        assert provider.settlement.add(older) is None
+        provider.settlement.set_aside(newer, "ERC20InsufficientAllowance")
+        assert provider.settlement.add(older) is Refusal.REPLACED
+
+
 async def test_no_other_version_is_settled_until_a_failed_transaction_is_deep(local: LocalMarket) -> None:
     """A reorganisation might let the transaction succeed."""
     older, newer = await versions_of(local, 2)
