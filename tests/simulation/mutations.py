@@ -309,9 +309,9 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "another version of an order is settled although a failed transaction may succeed",
-        "mesh.market.versions:OrderVersions.is_undecided",
-        "return undecided is not None",
-        "return False",
+        "mesh.market.versions:OrderVersions._is_open",
+        "return undecided",
+        "return False and undecided",
         REORGANISATIONS + ",revoke",
         jobs=100,
     ),
