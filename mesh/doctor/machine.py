@@ -100,7 +100,7 @@ def check_data_folder(folder: Path, *, slow: float = SLOW) -> CheckResult:
     existing = _nearest(folder)
     began = time.monotonic()
     try:
-        with tempfile.NamedTemporaryFile(dir=existing, prefix=".aira-doctor-") as probe:
+        with tempfile.TemporaryFile(dir=existing) as probe:
             probe.write(bytes(PROBE))
             probe.flush()
             os.fsync(probe.fileno())

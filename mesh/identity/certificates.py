@@ -79,7 +79,7 @@ def site_certificate(key: Key, name: str, days: float) -> x509.Certificate:
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     usage = x509.KeyUsage(digital_signature=True, key_cert_sign=True, crl_sign=True, **NO_OTHER_USAGE)
     return (
-        _builder(subject, subject, key.public_key(), days)
+        _builder(subject, subject, key.public_key(), days, issuer_key=key)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
         .sign(key, hashes.SHA256())
@@ -99,7 +99,7 @@ def member_certificate(
     remaining = (site.not_valid_after_utc - datetime.now(UTC)) / timedelta(days=1)
     usage = x509.KeyUsage(digital_signature=True, key_cert_sign=False, crl_sign=False, **NO_OTHER_USAGE)
     builder = (
-        _builder(subject, site.subject, public_key, min(days, remaining))
+        _builder(subject, site.subject, public_key, min(days, remaining), issuer_key=site_key)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(usage, critical=True)
         .add_extension(USES, critical=False)
@@ -176,8 +176,13 @@ def check_pair(certificate: x509.Certificate, key: Key, path: Path) -> None:
         raise IdentityError(path, "the key does not belong to the certificate")
 
 
-def _builder(subject: x509.Name, issuer: x509.Name, public_key: Any, days: float) -> x509.CertificateBuilder:
+def _builder(
+    subject: x509.Name, issuer: x509.Name, public_key: Any, days: float, *, issuer_key: Key
+) -> x509.CertificateBuilder:
+    """What all certificates have. TLS clients ask for the identifiers of both keys, as Python does from 3.13 on."""
     now = datetime.now(UTC)
+    subject_id = x509.SubjectKeyIdentifier.from_public_key(public_key)
+    issuer_id = x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key())
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -186,6 +191,8 @@ def _builder(subject: x509.Name, issuer: x509.Name, public_key: Any, days: float
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - EARLIER)
         .not_valid_after(now + timedelta(days=days))
+        .add_extension(subject_id, critical=False)
+        .add_extension(issuer_id, critical=False)
     )
 
 

@@ -150,12 +150,16 @@ def test_an_unsigned_message_is_not_encoded() -> None:
         b'{"tx":"\\udc00aaaaaaaaaaaaaa"}',
         b'{"\xff":1}',
         b'{"a":' * 3_000,
-        b'{"a":' + b"[" * 8_000 + b"]" * 8_000 + b"}",
     ],
     ids=lambda data: repr(data[:20]),
 )
 def test_invalid_json_is_refused(data: bytes) -> None:
     assert reason(data) == "not-json"
+
+
+def test_deep_json_is_refused() -> None:
+    """As no JSON up to Python 3.13, where it is too deep."""
+    assert reason(b'{"a":' + b"[" * 8_000 + b"]" * 8_000 + b"}") in {"not-json", "unknown-kind"}
 
 
 @pytest.mark.parametrize("data", [b"[" * 16_000, b"[]", b"5", b"null", b'"tx"', b"{}", b'{"model":1}', b'[{"tx":"a"}]'])

@@ -36,6 +36,7 @@ def rosbag2(folder: Path, messages: Iterable[Sent], storage: Storage, *, definit
     if not definitions:
         with sqlite3.connect(path) as database:
             database.execute("DROP TABLE message_definitions")
+        database.close()
     return path
 
 

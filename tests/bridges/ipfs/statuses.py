@@ -36,7 +36,8 @@ def health(port: int) -> tuple[int, dict[str, str]]:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=SECONDS) as answer:
             return answer.status, json.load(answer)["parts"]
     except urllib.error.HTTPError as answer:
-        return answer.code, json.load(answer)["parts"]
+        with answer:
+            return answer.code, json.load(answer)["parts"]
 
 
 def metrics(port: int) -> str:

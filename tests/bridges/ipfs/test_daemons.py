@@ -80,7 +80,8 @@ async def test_a_library_node_and_a_js_daemon_are_in_one_swarm_and_hear_each_oth
     async def heard() -> bool:
         try:
             await asyncio.to_thread(post, js_ipfs.api, f"pubsub/pub?arg={topic}", b"hello")
-        except urllib.error.HTTPError:  # nobody listens yet, as far as it knows
+        except urllib.error.HTTPError as refused:  # nobody listens yet, as far as it knows
+            refused.close()
             return False
         return b"hello" in await asyncio.to_thread(library.heard, "support")
 

@@ -112,6 +112,7 @@ def test_withdrawals_of_an_earlier_version_are_promised(tmp_path: Path) -> None:
         database.execute("CREATE TABLE withdrawals (identity BLOB PRIMARY KEY, signer TEXT, payload BLOB)")
         row = withdrawn_id(before), before.signer, encode(before.message)
         database.execute("INSERT INTO withdrawals VALUES (?, ?, ?)", row)
+    database.close()
     with Withdrawals(path) as withdrawals:
         assert withdrawals.is_kept(withdrawn_id(before))
 

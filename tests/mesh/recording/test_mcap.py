@@ -250,7 +250,7 @@ def test_malformed_records_are_corrupt(tmp_path: Path, content: bytes, why: str)
 
 
 def test_a_file_changed_after_opening_is_corrupt(tmp_path: Path) -> None:
-    path = kept(tmp_path, with_messages([T0 + n for n in range(500)]))
+    path = kept(tmp_path, with_messages([T0 + n for n in range(20_000)]))  # more than Python reads at once
     objective = open_objective(path)
     messages = objective.messages()
     next(messages)
