@@ -60,6 +60,7 @@ async def test_services_run_with_minimal_rights(demo: ComposeDeployment) -> None
 async def test_the_page_shows_the_job_to_who_logs_in(demo: ComposeDeployment) -> None:
     await demo.ready()
     context = ssl.create_default_context(cadata=demo.execute("page", "cat", "/secrets/ca.pem"))
+    context.verify_flags |= ssl.VERIFY_X509_STRICT  # as Python does from 3.13 on
     url = f"https://{demo.address('page')}:8585/api/v1"
     headers = {"Host": "localhost:8585", "X-Aira-Request": "1"}
     connector = TCPConnector(ssl=context)

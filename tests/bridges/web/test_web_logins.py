@@ -58,6 +58,7 @@ def of_the_page(site: Site) -> dict[str, Any]:
 async def visitor(site: Site, server: PageServer, folder: MemberFolder | None = None) -> AsyncIterator[Browser]:
     """Somebody on another machine, who shows the certificate in `folder`."""
     context = ssl.create_default_context(cafile=str(site.authority.certificate))
+    context.verify_flags |= ssl.VERIFY_X509_STRICT  # as Python does from 3.13 on
     if folder is not None:
         context.load_cert_chain(folder.certificate, folder.key)
     jar = CookieJar(unsafe=True)  # takes cookies of IP addresses
