@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Final
 from mesh.agent.declines import BUSY, grounds_of
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call
+from mesh.agent.offers import TooManyOffers
 from mesh.content import ContentUnavailable
 from mesh.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
+from mesh.work.database import LedgerUnusable
 from mesh.work.objectives import Buyer, ObjectiveNotFetched
 
 if TYPE_CHECKING:
@@ -149,7 +151,7 @@ class DemandDispatcher:
                     self._drop(demand, f"objective-{error.reason}")
                 elif isinstance(error, ContentUnavailable):
                     self._drop(demand, "objective-missing")
-                elif error is not None and _is_outage(error):
+                elif error is not None and _may_pass(error):
                     self._drop(demand, error.code)
                 if error is not None and (reason := grounds_of(error)) is not None:
                     grounds.append(reason)
@@ -169,9 +171,9 @@ class DemandDispatcher:
         self._subscription.forget(demand, after=after)
 
 
-def _is_outage(error: AiraError) -> bool:
-    """Whether a handler ended because the node failed."""
+def _may_pass(error: AiraError) -> bool:
+    """Whether a handler that ended with this error may succeed later: the node failed, a disk or a limit is full."""
     from mesh.chain import TransactionTimeout
     from mesh.chain.following import NODE_ERRORS
 
-    return isinstance(error, (*NODE_ERRORS, TransactionTimeout))
+    return isinstance(error, (*NODE_ERRORS, TransactionTimeout, LedgerUnusable, TooManyOffers))

@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import secrets
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.agent.offers import TooManyOffers
 from mesh.chain import NodeUnreachable, RequestRefused, TransactionTimeout
 from mesh.network import Channel, Endpoints, Network
+from mesh.work.database import LedgerUnusable
 from schemas import Demand, Signer, cid_of_bytes
 from tests.support import orders
 from tests.support.market import MODEL, Place, offering
@@ -120,10 +123,12 @@ async def test_a_demand_is_handled_once_its_maker_can_pay(place: Place) -> None:
         NodeUnreachable("http://there", "it is away"),
         RequestRefused("eth_call", -32000, "busy"),
         TransactionTimeout("0x01", 9.0),
+        LedgerUnusable(Path("ledger.sqlite"), "database or disk is full"),
+        TooManyOffers("0x02"),
     ],
     ids=lambda error: error.code,
 )
-async def test_a_demand_is_handled_again_when_the_node_failed(place: Place, error: AiraError) -> None:
+async def test_a_demand_is_handled_again_after_a_failure_that_passes(place: Place, error: AiraError) -> None:
     """Nobody else may be there to offer, and the demand would wait until its deadline."""
     robot, attempts = place.agent("robot"), list[str]()
 
