@@ -58,6 +58,11 @@ def withdrawals_of(settings: ChainSettings, account: Account, lighthouse: str) -
     return settings.state_directory / account.address / f"withdrawals-{lighthouse.lower()}.sqlite"
 
 
+def sent_orders_of(settings: ChainSettings, account: Account, lighthouse: str) -> Path:
+    """The file in which a provider keeps the orders whose transactions may still be mined."""
+    return settings.state_directory / account.address / f"sent-orders-{lighthouse.lower()}.sqlite"
+
+
 def endpoints_of(settings: NetworkSettings) -> Endpoints:
     """Where the settings' client session connects to."""
     return Endpoints.from_settings(settings)

@@ -106,6 +106,14 @@ class TransactionSender:
                 pending.abandon(entry)
             return await self._outcome(entry, signed, receipt)
 
+    async def last_nonce(self) -> int:
+        """The highest nonce that a transaction of the account may have; -1 if it has sent none."""
+        pending = self._node.pending_transactions(self.account.address)
+        async with pending.lock:
+            await pending.refresh()
+        counted = await self._node.transaction_count(self.account.address, block="pending")
+        return max((counted - 1, *pending.taken, *(entry.nonce for entry in pending.abandoned)))
+
     async def _send_new(self, pending: PendingTransactions, fields: dict[str, Any]) -> PendingTransaction:
         """Simulate, price, number, sign and send a transaction."""
         gas = await self._simulate(fields)

@@ -154,7 +154,13 @@ async def serve_market(
         folder = await state_folder(settings, chain, served.market.accounts["provider"].address)
         providers = []
         for name in markets:
-            provider = Provider(network.session, chain, name, withdrawals=folder / f"withdrawals-{name.lower()}.sqlite")
+            provider = Provider(
+                network.session,
+                chain,
+                name,
+                withdrawals=folder / f"withdrawals-{name.lower()}.sqlite",
+                sent_orders=folder / f"sent-orders-{name.lower()}.sqlite",
+            )
             providers.append(await stack.enter_async_context(provider))
         process = ProviderProcess(network, chain, providers)
         stack.enter_context(telemetry.showing(measure=process.measure, health=process.health))

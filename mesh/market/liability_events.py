@@ -147,6 +147,7 @@ class LiabilityEvents:
                 self.open.pop(event.liability, None)
                 self.unconfirmed.finalized(event.liability, block.block_number)
         await self._count_transactions(block.block_number)
+        await self._versions.expire(block.block_number)
         self.head, self.read_at = block.block_number, time.monotonic()
         self.unconfirmed.confirm(self.head)
         self._withdrawals.expire(self.head - self._chain.node.timing.reorg_depth)

@@ -1,8 +1,8 @@
 """The provider of a lighthouse: matches demands and offers, creates their liabilities, finalizes them by results.
 
-A provider keeps nothing on disk but withdrawals. Orders and results are sent again until their effect is on the chain,
-and the chain refuses an order that was used before; so a provider that was killed starts empty and catches up. It asks
-the others for open orders and withdrawals.
+A provider keeps on disk only withdrawals, and the orders whose transactions may still be mined. Orders and results are
+sent again until their effect is on the chain, and the chain refuses an order that was used before; so a provider that
+was killed starts with an empty book and catches up. It asks the others for open orders and withdrawals.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.blocklist import Blocklist
 from mesh.chain import InsufficientFunds
+from mesh.chain.transactions import TransactionSender
 from mesh.flood import Drops
 from mesh.fresh_file import CHECK_INTERVAL
 from mesh.log_context import LogSource, source_context
@@ -19,10 +20,12 @@ from mesh.market.arrivals import Arrivals
 from mesh.market.book import LIMIT, Match, OrderBook
 from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.liability_events import OPEN_LIABILITIES
+from mesh.market.sent_orders import SentOrders
 from mesh.market.services import OrderBookService, ProviderStatusService
 from mesh.market.settlement import Settlement
 from mesh.market.transaction_queue import LEAST_GAS, RETRY, UNDER_WAY, TransactionQueue
 from mesh.market.turns import NoStake
+from mesh.market.versions import OrderVersions
 from mesh.market.withdrawals import Withdrawals
 from mesh.network.channel import Channel
 from mesh.network.metrics import link_state, network_families
@@ -55,10 +58,10 @@ class Provider(Role):
     `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
     is called with each match before its liability is created, `retry` is the policy for transactions that fail,
     `unmined_limit` the most of them that wait to be mined, and `open_liabilities` the most records of open liabilities
-    in memory. Withdrawals are kept in the file `withdrawals`, if given. Orders leave the book after `deadline_limit`
-    blocks. Messages of `blocked` signers are rejected, and their orders leave the book; what is dropped is counted in
-    `drops`. The caller closes session and chain. When `run` is cancelled, a transaction that was sent may still be
-    mined.
+    in memory. Withdrawals are kept in the file `withdrawals`, if given, and what may still be mined in `sent_orders`.
+    Orders leave the book after `deadline_limit` blocks. Messages of `blocked` signers are rejected, and their orders
+    leave the book; what is dropped is counted in `drops`. The caller closes session and chain. When `run` is cancelled,
+    a transaction that was sent may still be mined.
     """
 
     title = "provider"
@@ -75,6 +78,7 @@ class Provider(Role):
         unmined_limit: int = UNDER_WAY,
         open_liabilities: int = OPEN_LIABILITIES,
         withdrawals: Path | None = None,
+        sent_orders: Path | None = None,
         deadline_limit: int = DEADLINE_LIMIT,
         blocked: BlockedSigners = frozenset(),
         drops: Drops | None = None,
@@ -93,6 +97,7 @@ class Provider(Role):
         self._deadline_limit = deadline_limit
         self._blocked = blocked
         self.withdrawals = Withdrawals(withdrawals)
+        self._sent_orders = SentOrders(sent_orders)
         self.ledger = EarningsLedger()
         self.drops = Drops() if drops is None else drops
         """What it dropped because of floods."""
@@ -105,6 +110,7 @@ class Provider(Role):
         self.book.expire(head)
         stack.enter_context(self.withdrawals)
         self.withdrawals.expire(head)
+        versions = await self._restore(stack)
         self.queue = TransactionQueue(
             self._chain,
             address,
@@ -129,7 +135,7 @@ class Provider(Role):
         self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
         self._withdrawn = await stack.enter_async_context(self.channel.subscribe(Withdrawal))
         self.results = await stack.enter_async_context(self.channel.subscribe(Result))
-        self._wire(head)
+        self._wire(head, versions)
         await stack.enter_async_context(
             OrderBookService(self._session, self._lighthouse, self.book, self.withdrawals, drops=self.drops)
         )
@@ -139,7 +145,17 @@ class Provider(Role):
             services.offer("logs", LogService("provider", self.address).logs)
         self.channel.announce("provider", self.address)
 
-    def _wire(self, head: int) -> None:
+    async def _restore(self, stack: AsyncExitStack) -> OrderVersions:
+        """The versions of orders that an earlier process has left on disk."""
+        assert self._chain.account is not None
+        stack.enter_context(self._sent_orders)
+        versions = OrderVersions(self._chain.node.timing.reorg_depth, self._sent_orders)
+        if self._sent_orders.left:
+            nonce = await TransactionSender(self._chain.node, self._chain.account).last_nonce()
+            versions.restore(nonce, await self._chain.block_number())
+        return versions
+
+    def _wire(self, head: int, versions: OrderVersions) -> None:
         """Connect book, queue, channel and chain, which has been read up to block `head`."""
         self.settlement = Settlement(
             self._chain,
@@ -151,6 +167,7 @@ class Provider(Role):
             matched=self._matched,
             forget=self._forget,
             withdrawals=self.withdrawals,
+            versions=versions,
             drops=self.drops,
             open_limit=self._open_liabilities,
         )

@@ -22,7 +22,6 @@ from mesh.market.judgements import ResultSettlement
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
 from mesh.market.refusals import RETRIED, MatchWithdrawn, Refusal
 from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
-from mesh.market.versions import OrderVersions
 from mesh.market.withdrawals import withdrawn_id
 from schemas import Result
 
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from mesh.market.book import Order, OrderBook
     from mesh.market.earnings import EarningsLedger
     from mesh.market.transaction_queue import TransactionQueue
+    from mesh.market.versions import OrderVersions
     from mesh.market.withdrawals import Withdrawals
     from mesh.network import Channel
     from schemas import Verified, Withdrawal
@@ -63,6 +63,7 @@ class Settlement:
         matched: Callable[[Match], None],
         forget: Callable[..., None],
         withdrawals: Withdrawals,
+        versions: OrderVersions,
         drops: Drops,
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
@@ -78,7 +79,7 @@ class Settlement:
         self._withdrawals = withdrawals
         self._drops = drops
         self.rejections: Final = RejectionPublisher(channel, chain.account, earnings, drops)
-        self._versions = OrderVersions(chain.node.timing.reorg_depth)
+        self._versions = versions
         self.events: Final = LiabilityEvents(
             chain,
             channel.address,
@@ -227,7 +228,7 @@ class Settlement:
                 self._versions.failed(match, created.nonce, self.events.head)
             self._put_back(match)
         finally:
-            self._versions.ended(match)
+            self._versions.ended(match, self.events.head)
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
         """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`."""
@@ -237,7 +238,7 @@ class Settlement:
             nonlocal may_be_sent
             if not may_be_sent and any(self._taken_back(one) or one.signer in self.blocked for one in match):
                 raise MatchWithdrawn("an order was withdrawn or replaced before its contract was created")
-            self._versions.sending(match)
+            await self._versions.sending(match)
             try:
                 return await self._chain.liabilities.create(self._lighthouse, match.demand.message, match.offer.message)
             except (NodeUnreachable, TransactionTimeout):

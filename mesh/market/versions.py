@@ -20,6 +20,7 @@ from msgspec.structs import replace
 from mesh.flood import BoundedDict
 from mesh.market.book import order_id
 from mesh.market.refusals import Refusal
+from mesh.market.sent_orders import SentOrder, SentOrders
 from schemas import message_hash
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ class _Undecided(NamedTuple):
     """
 
     identity: bytes
+    """Empty: several versions."""
     block: int
     nonce: int | None
 
@@ -59,11 +61,13 @@ class _Undecided(NamedTuple):
 class OrderVersions:
     """The versions of the orders that a provider has seen; the last `limit` of them.
 
-    In generation 3 there is one of each. A reorganisation replaces up to `reorg_depth` blocks.
+    In generation 3 there is one of each. A reorganisation replaces up to `reorg_depth` blocks. `sent` keeps on disk
+    what is undecided, or was a short time ago.
     """
 
-    def __init__(self, reorg_depth: int, *, limit: int = LIMIT) -> None:
+    def __init__(self, reorg_depth: int, sent: SentOrders | None = None, *, limit: int = LIMIT) -> None:
         self._depth = reorg_depth
+        self._sent = sent or SentOrders()
         self._keys: BoundedDict[bytes, _Key] = BoundedDict(limit)
         """Of each version (identity) its lasting hash and signer."""
         self._newest: BoundedDict[_Key, _Newest] = BoundedDict(limit)
@@ -76,6 +80,16 @@ class OrderVersions:
         """Of this account's last transaction with each version (identity)."""
         self._sending: dict[_Key, bytes] = {}
         """The version with which a transaction is on its way."""
+        self._ended: dict[bytes, int] = {}
+        """The versions (identity) on disk of which none is, and the block at which it ended."""
+
+    def restore(self, nonce: int, head: int) -> None:
+        """Take over what an earlier process has left on disk: transactions with nonces up to `nonce`."""
+        for one in self._sent.left:
+            if one.lasting:
+                self._keys[one.identity] = one.lasting, one.signer
+            self._suspect(one.identity, head + 1, nonce)
+            self._ended[one.identity] = head
 
     def note(self, order: Verified[Order]) -> bytes | None:
         """Remember an order. Returns the identity of the version that it replaces, if that was the newest."""
@@ -113,14 +127,28 @@ class OrderVersions:
         newest = self._newest.get(key)
         return None if newest is None or newest.identity == identity else newest.identity
 
-    def sending(self, orders: Iterable[Verified[Order]]) -> None:
-        """A transaction with these orders is on its way, until `ended`."""
-        self._sending.update((self._key_of(order), order_id(order)) for order in orders)
-
-    def ended(self, orders: Iterable[Verified[Order]]) -> None:
-        """No transaction with these orders is on its way any more."""
+    async def sending(self, orders: Iterable[Verified[Order]]) -> None:
+        """A transaction with these orders will be sent, and is on its way until `ended`."""
+        kept = []
         for order in orders:
-            self._sending.pop(self._key_of(order), None)
+            key, identity = self._key_of(order), order_id(order)
+            self._sending[key] = identity
+            kept.append(SentOrder(identity, *key) if order.message.generation == 5 else SentOrder(identity, "", ""))
+        await self._sent.add(kept)
+
+    def ended(self, orders: Iterable[Verified[Order]], head: int) -> None:
+        """No transaction with these orders is on its way any more, at block `head`."""
+        for order in orders:
+            if self._sending.pop(self._key_of(order), None) is not None:
+                self._ended[order_id(order)] = head
+
+    async def expire(self, head: int) -> None:
+        """Forget on disk what can't change any more at block `head`."""
+        deep = [identity for identity, block in self._ended.items() if block + self._depth <= head]
+        done = [identity for identity in deep if not self.is_undecided(identity, head)]
+        for identity in done:
+            del self._ended[identity]
+        await self._sent.remove(done)
 
     def sent(self, orders: Iterable[Verified[Order]], nonce: int) -> None:
         """The account's transaction with this nonce had these orders, and was mined."""
@@ -132,7 +160,8 @@ class OrderVersions:
         `nonce` is its nonce, None if it is not known.
         """
         for order in orders:
-            self._undecided[self._key_of(order)] = _Undecided(order_id(order), block, nonce)
+            self._key_of(order)
+            self._suspect(order_id(order), block, nonce)
 
     def need_count(self) -> bool:
         """Whether `counted` must be called at the next block."""
@@ -141,11 +170,12 @@ class OrderVersions:
     def counted(self, mined: int, pending: int, head: int) -> None:
         """The account has `mined` transactions up to block `head`, and `pending` with those that wait in a row.
 
-        What may still be mined is decided later than this block. A transaction whose nonce is the next one is lost, as
-        the node does not have it.
+        What may still be mined is decided later than this block. If none waits, a transaction whose nonce is the next
+        one is lost, as the node does not have it.
         """
         for key, one in list(self._undecided.items()):
-            if one.nonce is not None and one.nonce >= mined and one.nonce != pending:
+            is_lost = mined == pending == one.nonce
+            if one.nonce is not None and one.nonce >= mined and not is_lost:
                 self._undecided[key] = one._replace(block=head + 1)
             elif not self._is_open(one, head):
                 del self._undecided[key]
@@ -160,7 +190,16 @@ class OrderVersions:
         """A reorganisation of the blocks up to `head` reverted the contract at an address."""
         for key in self._contracts.pop(liability, ()):
             if (identity := self._used.pop(key, None)) is not None:
-                self._undecided[key] = _Undecided(identity, head + 1, self._nonces.get(identity))
+                self._suspect(identity, head + 1, self._nonces.get(identity))
+
+    def _suspect(self, identity: bytes, block: int, nonce: int | None) -> None:
+        """A transaction with this version may still succeed; see `_Undecided`."""
+        key = self._key(identity)
+        before = self._undecided.get(key)
+        if before is not None and before.identity != identity and self._is_open(before, block):
+            nonces = [one for one in (before.nonce, nonce) if one is not None]
+            identity, block, nonce = b"", max(before.block, block), max(nonces, default=None)
+        self._undecided[key] = _Undecided(identity, block, nonce)
 
     def _is_open(self, undecided: _Undecided, head: int) -> bool:
         return undecided.block + self._depth > head

@@ -11,7 +11,7 @@ from mesh.agent import Agent, JobFailed
 from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
 from mesh.agent.orders import OrderState
 from mesh.chain import XRT, Chain
-from mesh.composition import withdrawals_of
+from mesh.composition import sent_orders_of, withdrawals_of
 from mesh.errors import AiraError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
@@ -186,9 +186,14 @@ class ProviderRole(Role):
         """Match and settle."""
         async with Network(Endpoints(connect=(ENDPOINT,), timeout=-1)) as network, self.chain() as chain:
             await chain.lighthouses.become_provider(self.lighthouse, STAKE)
-            kept = withdrawals_of(self.settings(), self.account, self.lighthouse)
+            where = self.settings(), self.account, self.lighthouse
             async with Provider(
-                network.session, chain, self.lighthouse, matched=self._matched, withdrawals=kept
+                network.session,
+                chain,
+                self.lighthouse,
+                matched=self._matched,
+                withdrawals=withdrawals_of(*where),
+                sent_orders=sent_orders_of(*where),
             ) as self.provider:
                 await self.provider.run()
 

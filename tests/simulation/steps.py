@@ -151,12 +151,9 @@ class StepAudit:
             self._market.violated("unannounced-payment", f"{person.name}'s agent does not list {demand[:12]}")
 
     def _check_withdrawn(self, liability: str, demand: str) -> None:
-        """The only provider, if it was never restarted, makes no contract of an order whose withdrawal it honours.
-
-        A restarted one does not know what it has sent before.
-        """
+        """The only provider makes no contract of an order whose withdrawal it honours."""
         is_promised = any((one.name, demand) in self.honoured for one in self._market.providers)
-        is_alone = len(self._market.providers) == self._market.providers[0].starts == 1
+        is_alone = len(self._market.providers) == 1
         if is_promised and is_alone and liability not in self._before:
             self._market.violated("contract-after-withdrawal", f"{liability} is of the withdrawn {demand[:12]}")
 

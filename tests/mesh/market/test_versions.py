@@ -9,6 +9,7 @@ import pytest
 
 from mesh.chain import Timing
 from mesh.market import Refusal, order_id
+from mesh.market.sent_orders import SentOrders
 from mesh.market.versions import OrderVersions
 from mesh.market.withdrawals import withdrawn_id
 from schemas import Demand, Withdrawal, verify_message
@@ -17,6 +18,8 @@ from tests.mesh.market.observation import until_read
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.market.provider import Provider
     from tests.mesh.market.local_market import LocalMarket
 
@@ -211,6 +214,54 @@ async def test_no_withdrawal_is_honoured_while_a_reverted_contract_may_come_back
         provider.settlement.withdraw(withdrawal)
         await local.rejection_of(demand)
         assert reasons(local) == ["withdrawn"]
+
+
+async def test_a_restarted_provider_knows_the_orders_of_earlier_transactions(
+    local: LocalMarket, tmp_path: Path
+) -> None:
+    older, newer = await versions_of(local, 2)
+    async with HeldNode(local.node) as node:
+        async with local.provider(endpoint=node, sent_orders=tmp_path / "sent") as provider:
+            await fail_when_mined(local, provider, node, older)
+        async with local.provider(endpoint=node, sent_orders=tmp_path / "sent") as provider:
+            assert provider.settlement.add(verify_message(newer)) is Refusal.UNDECIDED
+            await local.mine(DEPTH)
+            await until_read(local, provider)
+            assert provider.settlement.add(verify_message(newer)) is Refusal.UNDECIDED
+            await local.mine(1)
+            await until_read(local, provider)
+            assert provider.settlement.add(verify_message(newer)) is None
+        with SentOrders(tmp_path / "sent") as sent:
+            assert sent.left == ()
+
+
+async def test_a_restarted_provider_honours_no_withdrawal_of_what_may_be_mined(
+    local: LocalMarket, tmp_path: Path
+) -> None:
+    demand = local.demand()
+    async with HeldNode(local.node) as node:
+        async with local.provider(endpoint=node, sent_orders=tmp_path / "sent") as provider:
+            await fail_when_mined(local, provider, node, demand)
+        async with local.provider(endpoint=node, sent_orders=tmp_path / "sent") as provider:
+            local.publish(withdrawal := local.withdrawal(demand))
+            await until(lambda: withdrawn_id(verify_message(withdrawal)) in provider.withdrawals)
+            assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
+            assert "withdrawn" not in reasons(local)
+            await local.mine(DEPTH + 1)
+            await until_read(local, provider)
+            provider.settlement.withdraw(verify_message(withdrawal))
+            await local.rejection_of(demand)
+            assert reasons(local).count("withdrawn") == 1
+
+
+async def test_no_version_is_settled_while_transactions_with_two_may_succeed(local: LocalMarket) -> None:
+    versions = OrderVersions(DEPTH)
+    older, newer = map(verify_message, await versions_of(local, 2))
+    for order, block in ((older, 10), (newer, 12)):
+        versions.note(order)
+        versions.failed([order], nonce=3, block=block)
+    assert versions.refusal(order_id(newer), head=11 + DEPTH) is Refusal.UNDECIDED
+    assert versions.refusal(order_id(newer), head=12 + DEPTH) is None
 
 
 async def test_a_failed_transaction_in_a_replaced_block_is_mined_again_later(local: LocalMarket) -> None:
