@@ -28,7 +28,7 @@ router.install(lambda: history.CURRENT[-1])  # type: ignore[arg-type,return-valu
 
 from mesh.chain.rpc_client import RpcClient  # noqa: E402, F401
 from tests.simulation.deployment import CROWDED_JOBS, JOBS, ON_EVM, ON_MODEL, Deployments  # noqa: E402
-from tests.simulation.faults import KINDS  # noqa: E402
+from tests.simulation.fault_plan import KINDS  # noqa: E402
 from tests.simulation.mutants import find_mutants  # noqa: E402
 from tests.simulation.runs import Child, Run, Stopped, numbers_in, run_in_children  # noqa: E402
 from tests.simulation.shrinking import Shrinking  # noqa: E402

@@ -17,13 +17,14 @@ from tests.simulation import loop, threads
 from tests.simulation.audit import Audit
 from tests.simulation.chance import FaultDraw
 from tests.simulation.deployment import JOBS, PAUSES, market_plan
-from tests.simulation.faults import Faults, choose
+from tests.simulation.fault_plan import choose
+from tests.simulation.faults import Faults
 from tests.simulation.market import Market
 from tests.simulation.scheduler import REAL_TIME, SECOND, HistoryFailed, Process
 
 if TYPE_CHECKING:
     from tests.simulation.deployment import Deployed
-    from tests.simulation.faults import FaultPlan
+    from tests.simulation.fault_plan import FaultPlan
 
 CHAOS_SECONDS: Final = 400
 """How long faults happen, for each job of a person."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from tests.simulation.faults import KINDS
+from tests.simulation.fault_plan import KINDS
 from tests.simulation.runs import Run, run_in_child
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.simulation.faults import KINDS
+from tests.simulation.fault_plan import KINDS
 from tests.simulation.mutations import CANDIDATES, MUTATIONS
 from tests.simulation.runs import numbers_in, ranges
 
