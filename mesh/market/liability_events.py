@@ -136,6 +136,7 @@ class LiabilityEvents:
             return False  # a used order is rejected when its next match fails
 
     async def _take_block(self, block: BlockEvents) -> None:
+        await self._count_transactions(block.block_number)
         created = [event.liability for event in block.events if isinstance(event, NewLiability)]
         records = dict(zip(created, await self._chain.liabilities.get_all_with_orders(created), strict=True))
         for event in block.events:
@@ -146,7 +147,6 @@ class LiabilityEvents:
             elif isinstance(event, Finalized):
                 self.open.pop(event.liability, None)
                 self.unconfirmed.finalized(event.liability, block.block_number)
-        await self._count_transactions(block.block_number)
         await self._versions.expire(block.block_number)
         self.head, self.read_at = block.block_number, time.monotonic()
         self.unconfirmed.confirm(self.head)

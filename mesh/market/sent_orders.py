@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
@@ -47,12 +47,15 @@ class SentOrders:
     def __enter__(self) -> Self:
         if self._path is None:
             return self
-        with self._on_disk():
+        with self._on_disk(), ExitStack() as stack:
             make_private_folder(self._path.parent)
-            self._database = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
+            database = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
+            stack.callback(database.close)
             self._path.chmod(0o600)
-            self._database.executescript(_TABLE)
-            rows = self._database.execute("SELECT identity, lasting, signer FROM sent").fetchall()
+            database.executescript(_TABLE)
+            rows = database.execute("SELECT identity, lasting, signer FROM sent").fetchall()
+            stack.pop_all()
+        self._database = database
         self.left = tuple(SentOrder(*row) for row in rows)
         self._kept = {one.identity for one in self.left}
         return self
@@ -70,8 +73,8 @@ class SentOrders:
     async def remove(self, identities: Sequence[bytes]) -> None:
         """Forget orders whose transactions can't be mined any more."""
         if identities:
+            self._kept.difference_update(identities)  # first, so that one that is sent again meanwhile is written again
             await self._write("DELETE FROM sent WHERE identity = ?", [(identity,) for identity in identities])
-            self._kept.difference_update(identities)
 
     async def _write(self, statement: str, rows: Sequence[tuple[object, ...]]) -> None:
         async with self._lock:
