@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
-from mesh.chain.errors import TransactionsNotKept
 from mesh.private_files import make_private_folder
 from mesh.threads import finish_in_thread
 
@@ -97,5 +96,7 @@ class SentOrders:
         try:
             yield
         except (OSError, sqlite3.Error) as error:
+            from mesh.chain.errors import TransactionsNotKept  # needs the extra `chain`; agents load this module
+
             assert self._path is not None
             raise TransactionsNotKept(self._path, str(error)) from error

@@ -238,6 +238,7 @@ async def test_cancelling_the_opening_takes_effect_at_once() -> None:
 async def test_a_session_that_opens_after_its_cancellation_is_closed(router: EmbeddedRouter) -> None:
     opened: set[str] = set()
     closed: set[str] = set()
+    cancelled = 0
 
     def changed(event: zenoh.TransportEvent) -> None:
         (opened if event.kind == zenoh.SampleKind.PUT else closed).add(str(event.transport.zid))
@@ -245,12 +246,17 @@ async def test_a_session_that_opens_after_its_cancellation_is_closed(router: Emb
     assert router.session is not None
     listener = router.session.info.declare_transport_events_listener(changed)
     async with asyncio.timeout(60):
-        while len(opened) < 3:
-            opening = asyncio.create_task(client(router.endpoint).__aenter__())
+        while len(opened) < 3 or cancelled < 3:
+            network = client(router.endpoint)
+            opening = asyncio.create_task(network.__aenter__())
             await asyncio.sleep(0)
             opening.cancel()
-            with pytest.raises(asyncio.CancelledError):
+            try:
                 await opening
+            except asyncio.CancelledError:
+                cancelled += 1
+            else:  # a busy machine opened it before
+                await network.__aexit__(None, None, None)
 
     await until(lambda: opened == closed, what="the end of each session")
     listener.undeclare()  # type: ignore[no-untyped-call]
