@@ -141,7 +141,7 @@ MUTATIONS: Final = (
         "return not self.is_finalized",
         "return self.is_finalized",
         "leave,crash_every",
-        seeds=40,
+        seeds=80,
         jobs=6,
     ),
     Mutation(
@@ -247,7 +247,7 @@ MUTATIONS: Final = (
         "created = [",
         "return []\n    created = [",
         REORGANISATIONS,
-        seeds=60,
+        seeds=120,
     ),
     Mutation(
         "messages are recorded with the time of day",
