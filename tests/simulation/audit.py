@@ -97,7 +97,8 @@ class Audit:
 
         People are told after one confirmation, so a reorganisation may contradict that. A payment that it reverts is
         made again, unless the robot has left for good (only the robot is sure to keep its result), or the payment came,
-        or the faults ended, so late that a refund may be mined instead.
+        or the faults ended, so late that a refund may be mined instead. Instead of a refund that it reverts, a payment
+        may be mined.
         """
         node = SimulatedNode(self._chain, NodeFaults())
         told = {order.contract: order for person in self._market.people for order in person.orders if order.contract}
@@ -140,6 +141,8 @@ class Audit:
             done = max(order.told_block + MOST_BLOCKS, self._market.calm_since + DONE_WITHIN)
             is_late = done >= refundable_from
             if told == "paid" and self._chain.reorganisations and (is_late or self._has_left(record.promisor)):
+                return
+            if told == "refunded" and order.told_ns < self._market.steps.reorganised_ns:
                 return
             detail = f"{record.address}: told {told!r}, but success is {record.is_success}"
             self._market.violated("promise-broken", detail)

@@ -44,7 +44,7 @@ class StepAudit:
         self._liabilities: dict[str, str] = {}
         """Of each liability the demand's hash."""
         self._reorganisations = 0
-        self._reorganised_ns = -UNSETTLED_NS
+        self.reorganised_ns = -UNSETTLED_NS
         """When the last one was."""
         self._forget()
         self.honoured: set[tuple[str, str]] = set()
@@ -84,7 +84,7 @@ class StepAudit:
         """A block was mined, or some were replaced."""
         if self._chain.reorganisations != self._reorganisations:
             self._reorganisations = self._chain.reorganisations
-            self._reorganised_ns = self._market.scheduler.now_ns
+            self.reorganised_ns = self._market.scheduler.now_ns
             self._forget()
         head = self._chain.evm.head
         self._listed()
@@ -139,7 +139,7 @@ class StepAudit:
             return
         person, number = self.demands[demand]
         order = person.orders[number]
-        is_excused = order.told_ns < self._reorganised_ns + UNSETTLED_NS
+        is_excused = order.told_ns < self.reorganised_ns + UNSETTLED_NS
         if order.is_dead and (not is_excused or order.told == "nothing-found"):
             self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
         self._check_withdrawn(liability, demand)
@@ -161,7 +161,7 @@ class StepAudit:
         """A person was told something of an order."""
         order = person.orders[number]
         order.told_ns, order.told_block = self._market.scheduler.now_ns, self._chain.evm.head
-        if not order.is_dead or order.told_ns < self._reorganised_ns + UNSETTLED_NS:
+        if not order.is_dead or order.told_ns < self.reorganised_ns + UNSETTLED_NS:
             return
         mine = {demand for demand, maker in self.demands.items() if maker == (person, number)}
         found = [liability for liability, demand in self._liabilities.items() if demand in mine]
