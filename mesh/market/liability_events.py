@@ -162,11 +162,14 @@ class LiabilityEvents:
         if account is None or not self._versions.need_count():
             return
         count = partial(self._chain.node.transaction_count, account.address)
+        mined, pending = 0, None
         try:
-            mined, pending = await asyncio.gather(count(block=head), count(block="pending"))
+            mined, waiting = await asyncio.gather(count(block=head), count(block="pending"))
         except RequestRefused as error:  # a node that is behind, or met a reorganisation
             log.debug("the account's transactions can't be counted: %s", error)
-            mined, pending = 0, -1
+        else:
+            # While later ones wait, a transaction that the node has lost is sent again.
+            pending = None if self._chain.node.pending_transactions(account.address).taken else waiting
         self._versions.counted(mined, pending, head)
 
     def _take_created(self, liability: Liability, order_hashes: tuple[bytes, bytes], block: int) -> None:

@@ -167,11 +167,12 @@ class OrderVersions:
         """Whether `counted` must be called at the next block."""
         return any(one.nonce is not None for one in self._undecided.values())
 
-    def counted(self, mined: int, pending: int, head: int) -> None:
+    def counted(self, mined: int, pending: int | None, head: int) -> None:
         """The account has `mined` transactions up to block `head`, and `pending` with those that wait in a row.
 
         What may still be mined is decided later than this block. If none waits, a transaction whose nonce is the next
-        one is lost, as the node does not have it.
+        one is lost: the node does not have it, and the account's next transaction takes its nonce. (`pending` is None
+        if that is not certain.)
         """
         for key, one in list(self._undecided.items()):
             is_lost = mined == pending == one.nonce

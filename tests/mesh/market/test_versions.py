@@ -283,11 +283,12 @@ async def test_a_failed_transaction_in_a_replaced_block_is_mined_again_later(loc
         pytest.param(2, 5, True, id="the transaction waits"),
         pytest.param(2, 2, True, id="an earlier one was lost"),
         pytest.param(3, 3, False, id="it was lost"),
+        pytest.param(3, None, True, id="it may be sent again"),
         pytest.param(4, 4, False, id="its nonce was used"),
     ],
 )
 async def test_a_transaction_is_decided_by_the_nonces_of_its_account(
-    local: LocalMarket, mined: int, pending: int, is_open: bool
+    local: LocalMarket, mined: int, pending: int | None, is_open: bool
 ) -> None:
     older, newer = map(verify_message, await versions_of(local, 2))
     versions = OrderVersions(DEPTH)
