@@ -126,7 +126,7 @@ def _play(market: Market, plan: FaultPlan) -> None:
     market.calm_since = market.deployed.chain.evm.head
     market.trace("faults", "stopped", block=market.calm_since)
     audit = market.audit = Audit(market)
-    calm = (CALM_SECONDS + pause) * most
+    calm = (CALM_SECONDS + pause) * max(most, 2)  # crowded markets with few jobs: longer than the refund delay
     scheduler.run(lambda: _is_settled(market, audit), until_ns=scheduler.now_ns + round(calm * SECOND))
     for person in market.people:
         for order in person.orders:
