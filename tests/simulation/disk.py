@@ -136,18 +136,23 @@ class SimulatedDisk:
             elif path.endswith(INDEX):
                 os.unlink(path)
             elif not power:
-                if inode in self.databases or inode in self.logs or is_locked(Path(path)):
+                if self._is_held(path, inode):
                     self._copy(path, inode, Path(path).read_bytes())
             elif (left := self._after_power_failure(path, inode, now := Path(path).read_bytes(), entries)) is None:
                 self._draw.counts["file-lost"] += 1
                 os.unlink(path)
             else:
-                if left != now or inode in self.databases or inode in self.logs or is_locked(Path(path)):
+                if left != now or self._is_held(path, inode):
                     inode = self._copy(path, inode, left)
                 if inode in self.logs:
                     self.logs[inode] = self.logs[inode].ending_at(len(left))
                 elif inode not in self.databases:
                     self.synced[inode] = left
+
+    def _is_held(self, path: str, inode: int) -> bool:
+        """Whether the dead process may still have a file, as SQLite or by a lock."""
+        is_database = inode in self.databases or os.path.exists(path + LOG)
+        return is_database or inode in self.logs or path.endswith(LOG) or is_locked(Path(path))
 
     def _copy(self, path: str, inode: int, data: bytes) -> int:
         """Put a new file with this content in the place of one, of which it inherits the rest; its inode."""
