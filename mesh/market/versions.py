@@ -139,8 +139,10 @@ class OrderVersions:
     def ended(self, orders: Iterable[Verified[Order]], head: int) -> None:
         """No transaction with these orders is on its way any more, at block `head`."""
         for order in orders:
-            if self._sending.pop(self._key_of(order), None) is not None:
-                self._ended[order_id(order)] = head
+            key, identity = self._key_of(order), order_id(order)
+            if self._sending.get(key) == identity:  # not another version's
+                del self._sending[key]
+                self._ended[identity] = head
 
     async def expire(self, head: int) -> None:
         """Forget on disk what can't change any more at block `head`."""

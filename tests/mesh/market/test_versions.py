@@ -254,6 +254,18 @@ async def test_a_restarted_provider_honours_no_withdrawal_of_what_may_be_mined(
             assert reasons(local).count("withdrawn") == 1
 
 
+async def test_the_end_of_a_match_that_was_not_sent_ends_no_other(local: LocalMarket) -> None:
+    older, newer = map(verify_message, await versions_of(local, 2))
+    versions = OrderVersions(DEPTH)
+    versions.note(older)
+    await versions.sending([older])
+    versions.note(newer)
+    versions.ended([newer], head=10)
+    assert versions.refusal(order_id(newer), head=99) is Refusal.UNDECIDED
+    versions.ended([older], head=10)
+    assert versions.refusal(order_id(newer), head=99) is None
+
+
 async def test_no_version_is_settled_while_transactions_with_two_may_succeed(local: LocalMarket) -> None:
     versions = OrderVersions(DEPTH)
     older, newer = map(verify_message, await versions_of(local, 2))
