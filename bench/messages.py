@@ -29,8 +29,17 @@ if TYPE_CHECKING:
 
 if sys.version_info >= (3, 14):
     from btclib_secp256k1.recovery import recover
+
+    def recover_key(signature: bytes, digest: bytes) -> None:
+        """One recovery by the library that the project uses, in the library's own way."""
+        recover(digest, signature[:64], signature[64])
 else:
     from coincurve import PublicKey
+
+    def recover_key(signature: bytes, digest: bytes) -> None:
+        """One recovery by the library that the project uses, in the library's own way."""
+        PublicKey.from_signature_and_message(signature, digest, hasher=None)
+
 
 WINDOW: Final = 1024
 """Most messages in flight; Zenoh's queue holds twice as many."""
@@ -120,14 +129,6 @@ def compact(demand: Demand) -> tuple[bytes, bytes]:
     """The signature as `recover_key` takes it, and the digest that was signed."""
     signature = bytes.fromhex(demand.signature)
     return signature[:64] + bytes([signature[64] - 27]), keccak256(PREFIX + message_hash(demand))
-
-
-def recover_key(signature: bytes, digest: bytes) -> None:
-    """One recovery by the library that the project uses, in the library's own way."""
-    if sys.version_info >= (3, 14):
-        recover(digest, signature[:64], signature[64])
-    else:
-        PublicKey.from_signature_and_message(signature, digest, hasher=None)
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from contextlib import suppress
 from typing import Any
 
@@ -159,7 +160,8 @@ def test_invalid_json_is_refused(data: bytes) -> None:
 
 def test_deep_json_is_refused() -> None:
     """As no JSON up to Python 3.13, where it is too deep."""
-    assert reason(b'{"a":' + b"[" * 8_000 + b"]" * 8_000 + b"}") in {"not-json", "unknown-kind"}
+    expected = "not-json" if sys.version_info < (3, 14) else "unknown-kind"
+    assert reason(b'{"a":' + b"[" * 8_000 + b"]" * 8_000 + b"}") == expected
 
 
 @pytest.mark.parametrize("data", [b"[" * 16_000, b"[]", b"5", b"null", b'"tx"', b"{}", b'{"model":1}', b'[{"tx":"a"}]'])
