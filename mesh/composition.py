@@ -6,7 +6,7 @@ use: what runs without one never loads it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from mesh.network import Endpoints
 
@@ -53,14 +53,17 @@ def chain_of(settings: ChainSettings, account: Account | None, *, attempts: int 
     )
 
 
-def withdrawals_of(settings: ChainSettings, account: Account, lighthouse: str) -> Path:
-    """The file in which a provider keeps the withdrawals at a lighthouse (ENS name)."""
-    return settings.state_directory / account.address / f"withdrawals-{lighthouse.lower()}.sqlite"
+class ProviderFiles(TypedDict):
+    """The files of a `Provider`, as it takes them."""
+
+    withdrawals: Path
+    sent_orders: Path
 
 
-def sent_orders_of(settings: ChainSettings, account: Account, lighthouse: str) -> Path:
-    """The file in which a provider keeps the orders whose transactions may still be mined."""
-    return settings.state_directory / account.address / f"sent-orders-{lighthouse.lower()}.sqlite"
+def provider_files(folder: Path, lighthouse: str) -> ProviderFiles:
+    """The files of the provider of a lighthouse (ENS name), in the folder of its account."""
+    name = f"{lighthouse.lower()}.sqlite"
+    return ProviderFiles(withdrawals=folder / f"withdrawals-{name}", sent_orders=folder / f"sent-orders-{name}")
 
 
 def endpoints_of(settings: NetworkSettings) -> Endpoints:

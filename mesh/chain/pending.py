@@ -6,17 +6,18 @@ import asyncio
 import time
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from mesh.chain.accounts import SignedTransaction
 from mesh.flood import BoundedDict
-from mesh.threads import finish_in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
     from mesh.chain.answers import BlockHeader, MinedTransaction
     from mesh.chain.transaction_store import LockedEntry, TransactionStore
+
+T = TypeVar("T")
 
 MINED_KEPT: Final = 256
 """Mined transactions of an account that are remembered: a reorganisation may send them back to the pool."""
@@ -126,7 +127,7 @@ class PendingTransactions:
         if self._store is None:
             return
         mine = {nonce for nonce, entry in self._entries.items() if entry.is_watched}
-        left, self._elsewhere = await finish_in_thread(partial(self._store.read, mine))
+        left, self._elsewhere = await _in_thread(partial(self._store.read, mine))
         watched = {nonce: self._entries[nonce] for nonce in mine if nonce in self._entries}
         self._entries = {nonce: PendingTransaction.stored(nonce, left[nonce]) for nonce in left} | watched
 
@@ -169,7 +170,7 @@ class PendingTransactions:
         entry.fields = fields
         entry.versions.append(signed)
         if entry.locked is not None:
-            await finish_in_thread(partial(entry.locked.append, entry.version))
+            await _in_thread(partial(entry.locked.append, entry.version))
 
     async def take_over(self, entry: PendingTransaction) -> bool:
         """Wait for a transaction that nothing waits for from now on; False if another process was faster."""
@@ -206,14 +207,24 @@ class PendingTransactions:
             await self._lock_entry(entry, partial(self._store.lock, entry.nonce))
         if entry.locked is not None:
             locked, entry.locked = entry.locked, None
-            await finish_in_thread(locked.remove)
+            await _in_thread(locked.remove)
 
     async def _lock_entry(self, entry: PendingTransaction, lock: Callable[[], LockedEntry | None]) -> None:
         def work() -> None:
             entry.locked = lock()
 
         try:
-            await finish_in_thread(work)
+            await _in_thread(work)
         except asyncio.CancelledError:
             self.abandon(entry)
             raise
+
+
+async def _in_thread(work: Callable[[], T]) -> T:
+    """Do work that waits for the disk outside of the event loop. When cancelled, the work is finished first."""
+    working = asyncio.get_running_loop().run_in_executor(None, work)
+    try:
+        return await asyncio.shield(working)
+    except asyncio.CancelledError:
+        await asyncio.wait([working])
+        raise

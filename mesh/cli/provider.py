@@ -81,7 +81,7 @@ async def _open_provider(
 ) -> AsyncIterator[tuple[Network, Provider]]:
     """The provider with its chain and network, and its metrics. Raises `AiraError` for what is not ready yet."""
     from mesh.blocklist import blocklist_at
-    from mesh.composition import chain_of, endpoints_of, sent_orders_of, withdrawals_of
+    from mesh.composition import chain_of, endpoints_of, provider_files
     from mesh.market.provider import Provider, ProviderProcess, check_account
     from mesh.network import Network
 
@@ -98,8 +98,7 @@ async def _open_provider(
                 unmined_limit=settings.unmined_limit,
                 deadline_limit=settings.deadline_limit,
                 blocked=blocklist_at(settings.blocked_signers),
-                withdrawals=withdrawals_of(settings, account, lighthouse),
-                sent_orders=sent_orders_of(settings, account, lighthouse),
+                **provider_files(settings.state_directory / account.address, lighthouse),
             ) as provider,
         ):
             process = ProviderProcess(network, chain, [provider])

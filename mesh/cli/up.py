@@ -137,6 +137,7 @@ async def serve_market(
 ) -> None:
     from mesh.agent.components import state_folder
     from mesh.devchain.development import serve_chain
+    from mesh.composition import provider_files
     from mesh.identity.routers import check_loopback
     from mesh.market.provider import Provider, ProviderProcess
     from mesh.network import Endpoints, Network
@@ -154,13 +155,7 @@ async def serve_market(
         folder = await state_folder(settings, chain, served.market.accounts["provider"].address)
         providers = []
         for name in markets:
-            provider = Provider(
-                network.session,
-                chain,
-                name,
-                withdrawals=folder / f"withdrawals-{name.lower()}.sqlite",
-                sent_orders=folder / f"sent-orders-{name.lower()}.sqlite",
-            )
+            provider = Provider(network.session, chain, name, **provider_files(folder, name))
             providers.append(await stack.enter_async_context(provider))
         process = ProviderProcess(network, chain, providers)
         stack.enter_context(telemetry.showing(measure=process.measure, health=process.health))

@@ -148,7 +148,7 @@ class Provider(Role):
     async def _restore(self, stack: AsyncExitStack) -> OrderVersions:
         """The versions of orders that an earlier process has left on disk."""
         assert self._chain.account is not None
-        stack.enter_context(self._sent_orders)
+        await stack.enter_async_context(self._sent_orders)
         versions = OrderVersions(self._chain.node.timing.reorg_depth, self._sent_orders)
         if self._sent_orders.left:
             nonce = await TransactionSender(self._chain.node, self._chain.account).last_nonce()

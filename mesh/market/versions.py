@@ -86,9 +86,8 @@ class OrderVersions:
     def restore(self, nonce: int, head: int) -> None:
         """Take over what an earlier process has left on disk: transactions with nonces up to `nonce`."""
         for one in self._sent.left:
-            if one.lasting:
-                self._keys[one.identity] = one.lasting, one.signer
-            self._suspect(one.identity, head + 1, nonce)
+            key = self._keys[one.identity] = one.lasting, one.signer
+            self._suspect(key, one.identity, head + 1, nonce)
             self._ended[one.identity] = head
 
     def note(self, order: Verified[Order]) -> bytes | None:
@@ -133,7 +132,7 @@ class OrderVersions:
         for order in orders:
             key, identity = self._key_of(order), order_id(order)
             self._sending[key] = identity
-            kept.append(SentOrder(identity, *key) if order.message.generation == 5 else SentOrder(identity, "", ""))
+            kept.append(SentOrder(identity, *key))
         await self._sent.add(kept)
 
     def ended(self, orders: Iterable[Verified[Order]], head: int) -> None:
@@ -162,8 +161,7 @@ class OrderVersions:
         `nonce` is its nonce, None if it is not known.
         """
         for order in orders:
-            self._key_of(order)
-            self._suspect(order_id(order), block, nonce)
+            self._suspect(self._key_of(order), order_id(order), block, nonce)
 
     def need_count(self) -> bool:
         """Whether `counted` must be called at the next block."""
@@ -193,11 +191,10 @@ class OrderVersions:
         """A reorganisation of the blocks up to `head` reverted the contract at an address."""
         for key in self._contracts.pop(liability, ()):
             if (identity := self._used.pop(key, None)) is not None:
-                self._suspect(identity, head + 1, self._nonces.get(identity))
+                self._suspect(key, identity, head + 1, self._nonces.get(identity))
 
-    def _suspect(self, identity: bytes, block: int, nonce: int | None) -> None:
-        """A transaction with this version may still succeed; see `_Undecided`."""
-        key = self._key(identity)
+    def _suspect(self, key: _Key, identity: bytes, block: int, nonce: int | None) -> None:
+        """A transaction with this version of an order may still succeed; see `_Undecided`."""
         before = self._undecided.get(key)
         if before is not None and before.identity != identity and self._is_open(before, block):
             nonces = [one for one in (before.nonce, nonce) if one is not None]

@@ -11,7 +11,7 @@ from mesh.agent import Agent, JobFailed
 from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
 from mesh.agent.orders import OrderState
 from mesh.chain import XRT, Chain
-from mesh.composition import sent_orders_of, withdrawals_of
+from mesh.composition import provider_files
 from mesh.errors import AiraError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
@@ -186,14 +186,13 @@ class ProviderRole(Role):
         """Match and settle."""
         async with Network(Endpoints(connect=(ENDPOINT,), timeout=-1)) as network, self.chain() as chain:
             await chain.lighthouses.become_provider(self.lighthouse, STAKE)
-            where = self.settings(), self.account, self.lighthouse
+            files = provider_files(self.settings().state_directory / self.account.address, self.lighthouse)
             async with Provider(
                 network.session,
                 chain,
                 self.lighthouse,
                 matched=self._matched,
-                withdrawals=withdrawals_of(*where),
-                sent_orders=sent_orders_of(*where),
+                **files,
             ) as self.provider:
                 await self.provider.run()
 

@@ -21,25 +21,25 @@ SECOND = SentOrder(b"2" * 52, "", "")
 
 async def test_orders_are_there_after_a_restart_until_they_are_removed(tmp_path: Path) -> None:
     path = tmp_path / "missing" / "sent.sqlite"
-    with SentOrders(path) as sent:
+    async with SentOrders(path) as sent:
         assert sent.left == ()
         await sent.add([FIRST, SECOND])
         await sent.add([FIRST])
-    with SentOrders(path) as sent:
+    async with SentOrders(path) as sent:
         assert set(sent.left) == {FIRST, SECOND}
         await sent.remove([FIRST.identity])
         await sent.add([SECOND])
-    with SentOrders(path) as sent:
+    async with SentOrders(path) as sent:
         assert sent.left == (SECOND,)
         await sent.remove([SECOND.identity])
         await sent.add([SECOND])
-    with SentOrders(path) as sent:
+    async with SentOrders(path) as sent:
         assert sent.left == (SECOND,)
     assert path.stat().st_mode & 0o777 == 0o600
 
 
 async def test_without_a_path_nothing_is_kept() -> None:
-    with SentOrders() as sent:
+    async with SentOrders() as sent:
         await sent.add([FIRST])
         await sent.remove([FIRST.identity])
         assert sent.left == ()
@@ -47,28 +47,28 @@ async def test_without_a_path_nothing_is_kept() -> None:
 
 async def test_many_writes_at_once(tmp_path: Path) -> None:
     orders = [SentOrder(os.urandom(52), "", "") for _ in range(64)]
-    with SentOrders(tmp_path / "sent.sqlite") as sent:
+    async with SentOrders(tmp_path / "sent.sqlite") as sent:
         await asyncio.gather(*(sent.add([order]) for order in orders))
         await asyncio.gather(*(sent.remove([order.identity]) for order in orders[1:]))
-    with SentOrders(tmp_path / "sent.sqlite") as sent:
+    async with SentOrders(tmp_path / "sent.sqlite") as sent:
         assert sent.left == (orders[0],)
 
 
-def test_a_damaged_file_is_reported(tmp_path: Path) -> None:
+async def test_a_damaged_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "sent.sqlite"
     path.write_bytes(b"not a database, however you look at it" * 100)
-    with pytest.raises(TransactionsNotKept) as caught, SentOrders(path):
-        pass
+    with pytest.raises(TransactionsNotKept) as caught:
+        await SentOrders(path).__aenter__()
     assert str(path) in str(caught.value)
     assert caught.value.hint
 
 
 async def test_a_full_disk_is_reported_and_what_was_kept_stays(tmp_path: Path) -> None:
     path = tmp_path / "sent.sqlite"
-    with SentOrders(path) as sent:
+    async with SentOrders(path) as sent:
         await sent.add([FIRST])
         with file_size_limit(1 << 16), pytest.raises(TransactionsNotKept):
             await sent.add([SentOrder(os.urandom(52), "", "") for _ in range(4000)])
         await sent.add([SECOND])
-    with SentOrders(path) as sent:
+    async with SentOrders(path) as sent:
         assert set(sent.left) == {FIRST, SECOND}

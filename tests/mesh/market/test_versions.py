@@ -231,7 +231,7 @@ async def test_a_restarted_provider_knows_the_orders_of_earlier_transactions(
             await local.mine(1)
             await until_read(local, provider)
             assert provider.settlement.add(verify_message(newer)) is None
-        with SentOrders(tmp_path / "sent") as sent:
+        async with SentOrders(tmp_path / "sent") as sent:
             assert sent.left == ()
 
 
