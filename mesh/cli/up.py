@@ -136,8 +136,8 @@ async def serve_market(
     state: Path | None = None,
 ) -> None:
     from mesh.agent.components import state_folder
-    from mesh.devchain.development import serve_chain
     from mesh.composition import provider_files
+    from mesh.devchain.development import serve_chain
     from mesh.identity.routers import check_loopback
     from mesh.market.provider import Provider, ProviderProcess
     from mesh.network import Endpoints, Network
