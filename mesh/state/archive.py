@@ -89,7 +89,8 @@ class ArchiveWriter:
                 with raising_store_full(self._path.parent):
                     self._finish()
         finally:
-            self._file.close()
+            with suppress(OSError):  # what is still buffered then is deleted, and the first error is the one to raise
+                self._file.close()
             with suppress(FileNotFoundError):
                 self._temporary.unlink()
 
