@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, Self
 from mesh.errors import AiraError
 from mesh.flood import Rate, RateLimiter
 from mesh.outage_log import OutageLog
+from mesh.private_files import make_private_database, make_private_folder
 from schemas import InvalidMessage, Verified, Withdrawal, address_bytes, decode, encode
 from schemas.wire import message_hash
 
@@ -88,9 +89,9 @@ class Withdrawals:
     def __enter__(self) -> Self:
         if self._path is not None:
             try:
-                self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                make_private_folder(self._path.parent)
+                make_private_database(self._path)
                 self._database = sqlite3.connect(self._path, timeout=0.1, isolation_level=None, check_same_thread=False)
-                self._path.chmod(0o600)
                 self._database.executescript(_TABLE)
                 if not self._database.execute("PRAGMA user_version").fetchone()[0]:
                     self._database.executescript(_LASTING)
