@@ -263,7 +263,7 @@ MUTATIONS: Final = (
         "block.block_number - 1, history",
         "block.block_number, history",
         CRASHES,
-        seeds=40,
+        seeds=80,
     ),
     Mutation(
         "orders of a reverted contract are forgotten",
