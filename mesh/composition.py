@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from mesh.chain import Account, Chain
     from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
+    from mesh.settings.groups import StorageSettings
 
 
 def load_account(settings: AccountSettings) -> Account:
@@ -60,10 +61,19 @@ class ProviderFiles(TypedDict):
     sent_orders: Path
 
 
-def provider_files(folder: Path, lighthouse: str) -> ProviderFiles:
-    """The files of the provider of a lighthouse (ENS name), in the folder of its account."""
-    name = f"{lighthouse.lower()}.sqlite"
+async def provider_files(settings: StorageSettings, chain: Chain, address: str, lighthouse: str) -> ProviderFiles:
+    """The files of an account's provider on a chain, for a lighthouse (ENS name)."""
+    folder, name = await state_folder(settings, chain, address), f"{lighthouse.lower()}.sqlite"
     return ProviderFiles(withdrawals=folder / f"withdrawals-{name}", sent_orders=folder / f"sent-orders-{name}")
+
+
+async def state_folder(settings: StorageSettings, chain: Chain, address: str) -> Path:
+    """The folder of an account's files that belong to this chain, such as its ledger.
+
+    Only this chain has its name: a restarted development chain has the same number, with other contracts.
+    """
+    first = await chain.node.block_hash(min(1, await chain.block_number()))
+    return settings.state_directory / address / f"{chain.chain_id}-{first.hex()[:8]}"
 
 
 def endpoints_of(settings: NetworkSettings) -> Endpoints:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from mesh.blocklist import blocklist_at
-from mesh.composition import chain_of, endpoints_of
+from mesh.composition import chain_of, endpoints_of, state_folder
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
 from mesh.network import Channel, Network, Services
@@ -182,17 +182,6 @@ async def connected(
         ) as channel,
     ):
         yield network, channel
-
-
-async def state_folder(settings: Settings, chain: Chain, address: str) -> Path:
-    """The folder of what belongs to this chain: an account's ledger and unfinished recordings."""
-    return settings.state_directory / address / await _chain_folder(chain)
-
-
-async def _chain_folder(chain: Chain) -> str:
-    """A name that only this chain has: a restarted development chain has the same number, with other contracts."""
-    first = await chain.node.block_hash(min(1, await chain.block_number()))
-    return f"{chain.chain_id}-{first.hex()[:8]}"
 
 
 def _make_folder(folder: Path) -> None:

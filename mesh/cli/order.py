@@ -73,7 +73,8 @@ async def _list(settings: Settings, as_json: bool) -> None:
 
 async def _stored_orders(settings: Settings, chain: Chain, address: str) -> Sequence[StoredOrder]:
     """The orders in the account's ledger for this chain; none if it has no ledger."""
-    from mesh.agent.components import LEDGER, state_folder
+    from mesh.agent.components import LEDGER
+    from mesh.composition import state_folder
     from mesh.work import Ledger
 
     path = await state_folder(settings, chain, address) / LEDGER

@@ -88,6 +88,7 @@ async def _open_provider(
     lighthouse = settings.lighthouse_contract
     async with chain_of(settings, account) as chain:
         await check_account(chain, lighthouse)
+        files = await provider_files(settings, chain, account.address, lighthouse)
         async with (
             Network(endpoints_of(settings)) as network,
             Provider(
@@ -98,7 +99,7 @@ async def _open_provider(
                 unmined_limit=settings.unmined_limit,
                 deadline_limit=settings.deadline_limit,
                 blocked=blocklist_at(settings.blocked_signers),
-                **provider_files(settings.state_directory / account.address, lighthouse),
+                **files,
             ) as provider,
         ):
             process = ProviderProcess(network, chain, [provider])

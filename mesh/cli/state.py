@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 @click.group("state")
 def command() -> None:
-    """Show, back up and restore the state of the agents of a data folder: jobs, signed messages, unfinished recordings
-    and content. Keyfiles and passwords are never included.
+    """Show, back up and restore the state of the agents and providers of a data folder: jobs, signed messages,
+    unfinished recordings, content, and withdrawals. Keyfiles and passwords are never included.
     """
 
 
@@ -129,11 +129,12 @@ def _print_inventory(found: Inventory) -> None:
                 _counted(chain.verdicts),
                 chain.waiting,
                 chain.recordings,
+                ", ".join(chain.provides) or "-",
             )
             for chain in account.chains
         ]
     if rows:
-        print_table(("ACCOUNT", "CHAIN", "BLOCK", "JOBS", "VERDICTS", "TO SEND", "RECORDING"), rows)
+        print_table(("ACCOUNT", "CHAIN", "BLOCK", "JOBS", "VERDICTS", "TO SEND", "RECORDING", "PROVIDER OF"), rows)
     print_facts(
         {
             account.address: f"{plural(account.files, 'file')}, {format_size(account.bytes)}"

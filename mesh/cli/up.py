@@ -135,7 +135,6 @@ async def serve_market(
     anvil: Path | None = None,
     state: Path | None = None,
 ) -> None:
-    from mesh.agent.components import state_folder
     from mesh.composition import provider_files
     from mesh.devchain.development import serve_chain
     from mesh.identity.routers import check_loopback
@@ -152,10 +151,10 @@ async def serve_market(
         )
         chain = await stack.enter_async_context(served.market.chain(served.url, "provider"))
         markets = [Settings(generation=generation).lighthouse_contract for generation in (3, 5)]
-        folder = await state_folder(settings, chain, served.market.accounts["provider"].address)
-        providers = []
+        address, providers = served.market.accounts["provider"].address, []
         for name in markets:
-            provider = Provider(network.session, chain, name, **provider_files(folder, name))
+            files = await provider_files(settings, chain, address, name)
+            provider = Provider(network.session, chain, name, **files)
             providers.append(await stack.enter_async_context(provider))
         process = ProviderProcess(network, chain, providers)
         stack.enter_context(telemetry.showing(measure=process.measure, health=process.health))
@@ -163,7 +162,7 @@ async def serve_market(
         tasks = await stack.enter_async_context(asyncio.TaskGroup())
         for name, provider in zip(markets, providers, strict=True):
             tasks.create_task(provider.run(), name=f"provider of {name}")
-        router, address = ", ".join(settings.listen), providers[0].address
+        router = ", ".join(settings.listen)
         words = f"router      {router}\n{served.describe()}\n{where}provider    {address}"
         announce(log, "market-started", words, **served.facts(), provider=address)
 

@@ -34,6 +34,7 @@ from mesh.state.layout import (
     part_of,
     parts_in,
     pin_name,
+    provider_files_in,
     transactions_in,
 )
 from mesh.work import Phase
@@ -97,6 +98,7 @@ async def back_up(folder: Path, target: Path, *, content: ContentScope) -> Backu
         for home in homes:
             await writer.home(home)
         await asyncio.to_thread(writer.transactions, folder)
+        await asyncio.to_thread(writer.providers, homes)
     return BackupReport(
         accounts=tuple(home.address for home in homes),
         jobs=writer.jobs,
@@ -118,11 +120,11 @@ class _BackupWriter:
         self.missing: set[str] = set()
 
     async def home(self, home: AccountFolder) -> None:
-        """Add all of an account except its transactions."""
+        """Add all of an account except its transactions and what its providers keep."""
         wanted: set[str] = set()
         for chain in home.chains:
             if (chain / VERDICTS).is_file():
-                await asyncio.to_thread(self._add_verdicts, home.folder.parent, chain / VERDICTS)
+                await asyncio.to_thread(self._add_copy, home.folder.parent, chain / VERDICTS)  # its files are pinned
             if not (chain / LEDGER).is_file():
                 continue
             with ExitStack() as opened:
@@ -140,6 +142,12 @@ class _BackupWriter:
             with suppress(FileNotFoundError), path.open("rb") as file:
                 self._add(folder, path, file)
 
+    def providers(self, homes: Iterable[AccountFolder]) -> None:
+        """Add what providers keep: after the transactions, so that no transaction is included without its order."""
+        for home in homes:
+            for path in (path for chain in home.chains for path in provider_files_in(chain)):
+                self._add_copy(home.folder.parent, path)
+
     async def _consistent(self, chain: Path, opened: ExitStack) -> tuple[LedgerFacts, list[OpenFile]]:
         """The contents of a chain's ledger, and its copy and the matching recordings as open files."""
         ledger, copy, later = chain / LEDGER, self._scratch / LEDGER, self._scratch / f"later-{LEDGER}"
@@ -154,12 +162,12 @@ class _BackupWriter:
                     return facts, files
         raise StateChanging(chain)
 
-    def _add_verdicts(self, folder: Path, ledger: Path) -> None:
-        """Add a validator's ledger. The files that it needs are pinned."""
-        copy = self._scratch / VERDICTS
-        copy_ledger(ledger, copy)
+    def _add_copy(self, folder: Path, database: Path) -> None:
+        """Add a database as it is now."""
+        copy = self._scratch / "copy.sqlite"
+        copy_ledger(database, copy)
         with copy.open("rb") as file:
-            self._add(folder, ledger, file)
+            self._add(folder, database, file)
 
     def _add_content(self, home: AccountFolder, needed: set[str]) -> None:
         with Store(home.content) as store:

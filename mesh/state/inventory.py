@@ -21,10 +21,13 @@ from mesh.state.layout import (
     LEDGER,
     PINS,
     RECORDINGS,
+    SENT_ORDERS,
     VERDICTS,
+    WITHDRAWALS,
     NoState,
     StateInUse,
     account_folders,
+    lighthouses_in,
     parts_in,
     transactions_in,
 )
@@ -41,7 +44,14 @@ if TYPE_CHECKING:
     from mesh.state.layout import AccountFolder
     from mesh.work import JobRecord
 
-_KINDS: Final = {LEDGER: "ledgers", VERDICTS: "verdicts", "mcap": "recordings", "jsonl": "transactions"}
+_KINDS: Final = {
+    LEDGER: "ledgers",
+    VERDICTS: "verdicts",
+    WITHDRAWALS: "withdrawals",
+    SENT_ORDERS: "sent orders",
+    "mcap": "recordings",
+    "jsonl": "transactions",
+}
 ACTIVE: Final = (
     "SELECT CASE type WHEN 'table' THEN 'virtual table' ELSE type END FROM sqlite_master"
     " WHERE type IN ('view', 'trigger') OR sql LIKE 'CREATE VIRTUAL%'"
@@ -65,7 +75,8 @@ class LedgerFacts:
 
 class ChainState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     """An account's state on one chain. `block` is the last one handled, None before the first; `waiting` messages are
-    in the outbox, and `recordings` are being written. `verdicts` are a validator's, by stage."""
+    in the outbox, and `recordings` are being written. `verdicts` are a validator's, by stage; `provides` are the
+    lighthouses that it is a provider of."""
 
     chain: str
     block: int | None
@@ -73,6 +84,7 @@ class ChainState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     waiting: int
     recordings: int
     verdicts: dict[str, int] = {}
+    provides: tuple[str, ...] = ()
 
 
 class AccountState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
@@ -249,6 +261,7 @@ async def _chain(folder: Path) -> ChainState:
         waiting=facts.waiting,
         recordings=len(list((folder / RECORDINGS).glob("*.mcap*"))),
         verdicts=verdicts,
+        provides=lighthouses_in(folder),
     )
 
 

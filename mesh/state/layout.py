@@ -2,6 +2,8 @@
 
     0x…/1-5f3a…/ledger.sqlite               jobs, outbox and cursor of an account on one chain
     0x…/1-5f3a…/verdicts.sqlite             what a validator judged and signed, and its cursor
+    0x…/1-5f3a…/withdrawals-NAME.sqlite     withdrawals that the provider of the lighthouse NAME knows
+    0x…/1-5f3a…/sent-orders-NAME.sqlite     orders of its transactions that may still be mined
     0x…/1-5f3a…/recordings/0x….mcap.part    recordings of running jobs
     0x…/content/Qm…                         files by their CID, and `.pins` beside them
     transactions/1-5f3a…/0x…/….jsonl        pending transactions
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
 LEDGER: Final = "ledger.sqlite"
 VERDICTS: Final = "verdicts.sqlite"
+WITHDRAWALS: Final = "withdrawals-"
+SENT_ORDERS: Final = "sent-orders-"
 RECORDINGS: Final = "recordings"
 CONTENT: Final = "content"
 PINS: Final = ".pins"
@@ -35,7 +39,8 @@ _ADDRESS: Final = r"0x[0-9a-fA-F]{40}"
 _CHAIN: Final = r"[0-9]{1,20}-[0-9a-f]{8,64}"
 _CID: Final = r"Qm[1-9A-HJ-NP-Za-km-z]{44}"
 _ACCOUNT_FILE: Final = re.compile(
-    rf"(?P<part>{_ADDRESS})/(?:{_CHAIN}/(?:(?:ledger|verdicts)\.sqlite|recordings/{_ADDRESS}\.mcap(?:\.part|\.cut)?)"
+    rf"(?P<part>{_ADDRESS})/(?:{_CHAIN}/(?:(?:ledger|verdicts|(?:{WITHDRAWALS}|{SENT_ORDERS})[^/\0]+)\.sqlite"
+    rf"|recordings/{_ADDRESS}\.mcap(?:\.part|\.cut)?)"
     rf"|content/(?:{_CID}|\.pins/{_CID}/[A-Za-z0-9_-]{{1,64}}))"
 )
 _TRANSACTION: Final = re.compile(rf"(?P<part>transactions/{_CHAIN}/{_ADDRESS})/[0-9]{{12}}\.jsonl")
@@ -60,10 +65,10 @@ class ArchiveUnusable(InputError, code="archive-unusable"):
 
 
 class StateInUse(ConfigurationError, code="state-in-use"):
-    """An agent is using the state that should be replaced."""
+    """A process is using the state that should be replaced."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(f"{path} is in use", hint="stop the agent first")
+        super().__init__(f"{path} is in use", hint="stop the process that uses it first")
         self.path = path
 
 
@@ -134,9 +139,19 @@ class AccountFolder:
 
     @property
     def chains(self) -> tuple[Path, ...]:
-        """The folders of the chains on which the account has a ledger."""
+        """The folders of the chains on which the account has a database."""
         named = (path for path in _folders(self.folder) if _CHAIN_NAME.fullmatch(path.name))
-        return tuple(path for path in named if any((path / name).is_file() for name in (LEDGER, VERDICTS)))
+        return tuple(path for path in named if any(path.glob("*.sqlite")))
+
+
+def provider_files_in(chain: Path) -> tuple[Path, ...]:
+    """What an account's folder for a chain has of its providers."""
+    return tuple(path for name in (WITHDRAWALS, SENT_ORDERS) for path in sorted(chain.glob(f"{name}*.sqlite")))
+
+
+def lighthouses_in(chain: Path) -> tuple[str, ...]:
+    """The lighthouses that an account is, or was, a provider of on a chain."""
+    return tuple(path.stem.removeprefix(WITHDRAWALS) for path in sorted(chain.glob(f"{WITHDRAWALS}*.sqlite")))
 
 
 def account_folders(folder: Path) -> tuple[AccountFolder, ...]:

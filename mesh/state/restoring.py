@@ -24,7 +24,6 @@ from mesh.state.layout import (
     CONTENT,
     LEDGER,
     TRANSACTIONS,
-    VERDICTS,
     ArchiveUnusable,
     DataFolderUnwritable,
     StateExists,
@@ -79,11 +78,10 @@ async def restore(archive: Path, folder: Path, *, existing: ExistingState = Exis
         await asyncio.to_thread(_unpack, archive, staging)
         parts = tuple(part for part in about.parts if (staging / part).is_dir())
         jobs: list[JobRecord] = []
-        for ledger in sorted(staging.glob(f"*/*/{LEDGER}")):
-            await asyncio.to_thread(check_ledger, ledger)
-            jobs += (await read_ledger(ledger)).jobs.values()
-        for ledger in sorted(staging.glob(f"*/*/{VERDICTS}")):
-            await asyncio.to_thread(check_ledger, ledger)
+        for database in sorted(staging.glob("*/*/*.sqlite")):
+            await asyncio.to_thread(check_ledger, database)
+            if database.name == LEDGER:
+                jobs += (await read_ledger(database)).jobs.values()
         await asyncio.to_thread(_sync, staging)
         replaced = _check_free(folder, parts, existing, locks=locks)
         aside = _exchange(staging, folder, parts, replaced)
@@ -153,8 +151,8 @@ def _check_free(
 
 
 def _lock(part: Path, held: ExitStack) -> None:
-    for ledger in sorted((*part.glob(f"*/{LEDGER}"), *part.glob(f"*/{VERDICTS}"))):
-        held.enter_context(locked_ledger(ledger))
+    for database in sorted(part.glob("*/*.sqlite")):
+        held.enter_context(locked_ledger(database))
     if (part / CONTENT).is_dir() and is_in_use(part / CONTENT):
         raise StateInUse(part / CONTENT)
     for entry in sorted(part.glob("*.jsonl")):

@@ -8,9 +8,9 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from mesh.agent.components import ChainHead, connected, state_folder
+from mesh.agent.components import ChainHead, connected
 from mesh.chain import ChainWentBack
-from mesh.composition import chain_of
+from mesh.composition import chain_of, state_folder
 from mesh.content import Exchange, Store
 from mesh.errors import ChainError
 from mesh.log_context import log_event

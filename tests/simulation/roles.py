@@ -186,7 +186,7 @@ class ProviderRole(Role):
         """Match and settle."""
         async with Network(Endpoints(connect=(ENDPOINT,), timeout=-1)) as network, self.chain() as chain:
             await chain.lighthouses.become_provider(self.lighthouse, STAKE)
-            files = provider_files(self.settings().state_directory / self.account.address, self.lighthouse)
+            files = await provider_files(self.settings(), chain, self.account.address, self.lighthouse)
             async with Provider(
                 network.session,
                 chain,

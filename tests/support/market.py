@@ -127,12 +127,14 @@ class Place:
         return Agent(model, settings=settings, account=account, chain=chain, resend=QUICK_RESEND)
 
     @asynccontextmanager
-    async def provider(self, *, seconds: float = 180) -> AsyncIterator[Provider]:
-        """The lighthouse's provider at work, for so long at most: no test may hang."""
+    async def provider(self, *, seconds: float = 180, **options: Any) -> AsyncIterator[Provider]:
+        """The lighthouse's provider at work, with these options, for so long at most: no test may hang."""
         async with (
             asyncio.timeout(seconds),
             Network(Endpoints(connect=(self.endpoint,))) as network,
-            Provider(network.session, self.chains["provider"], self.market.deployment.lighthouse_name) as provider,
+            Provider(
+                network.session, self.chains["provider"], self.market.deployment.lighthouse_name, **options
+            ) as provider,
             Background() as tasks,
         ):
             tasks.start(provider.run(), "provider of the test")

@@ -30,7 +30,7 @@ def test_show_lists_the_state_of_agents(folder: Folder) -> None:
     assert done.exit_code == 0, done.output
     head, row, content, transactions = done.stdout.splitlines()
     assert head.split("  ")[0] == "ACCOUNT"
-    assert row.split() == [ADDRESS, CHAIN, "99", "1", "running", "none", "1", "1"]
+    assert row.split() == [ADDRESS, CHAIN, "99", "1", "running", "none", "1", "1", "-"]
     assert content == f"{ADDRESS}  2 files, 27 bytes (10 bytes pinned)"
     assert transactions == "pending transactions  1"
 
@@ -39,7 +39,15 @@ def test_show_prints_json(folder: Folder) -> None:
     found = json.loads(call("show", "--json", "--data-dir", folder.path).stdout)
     assert found["folder"] == str(folder.path)
     assert found["accounts"][0]["chains"] == [
-        {"chain": CHAIN, "block": 99, "jobs": {"running": 1}, "waiting": 1, "recordings": 1, "verdicts": {}}
+        {
+            "chain": CHAIN,
+            "block": 99,
+            "jobs": {"running": 1},
+            "waiting": 1,
+            "recordings": 1,
+            "verdicts": {},
+            "provides": [],
+        }
     ]
 
 
