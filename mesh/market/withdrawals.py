@@ -134,10 +134,7 @@ class Withdrawals:
             self._unwritten.discard(identity)
         else:
             self._unwritten.add(identity)
-        if len(self._known) > self._limit:
-            own = withdrawal.message.deadline, identity
-            self._forget([self._brief.pop() if self._brief else self._lasting.pop(bisect_left(self._lasting, own))])
-        return identity in self._known
+        return True
 
     def is_kept(self, order: bytes) -> bool:
         """Whether the withdrawal of the order with this identity is known until its deadline, also after a restart."""
@@ -151,11 +148,16 @@ class Withdrawals:
                 del due[:count]
 
     def _take(self, identity: bytes, withdrawal: Verified[Withdrawal], *, is_lasting: bool) -> bool:
+        due = withdrawal.message.deadline, identity
         if self._by_signer[withdrawal.signer] >= self._limit_per_signer:
             return False
+        if len(self._known) >= self._limit:
+            if not self._brief or not (is_lasting or due < self._brief[-1]):
+                return False
+            self._forget([self._brief.pop()])
         self._known[identity] = withdrawal
         self._by_signer[withdrawal.signer] += 1
-        insort(self._lasting if is_lasting else self._brief, (withdrawal.message.deadline, identity))
+        insort(self._lasting if is_lasting else self._brief, due)
         return True
 
     def _is_brief(self, order: bytes) -> bool:
