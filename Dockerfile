@@ -63,7 +63,7 @@ COPY --from=server-environment /opt/aira /opt/aira
 FROM with-server AS chain
 USER root
 RUN install -d -o aira -g aira -m 0700 /chain /site \
- && for one in authority router router-north router-south provider agent edge bridge page person operator; do \
+ && for one in authority router router-north router-south provider agent validator edge bridge page person operator; do \
         install -d -o aira -g aira -m 0700 "/site/$one"; \
     done
 COPY --from=foundry /usr/local/bin/anvil /usr/local/bin/anvil

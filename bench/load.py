@@ -28,7 +28,7 @@ from common import SPAWN, arguments, router, show, signed_demands  # noqa: E402
 from mesh import Agent  # noqa: E402
 from mesh.background import Background  # noqa: E402
 from mesh.chain import Account, Node  # noqa: E402
-from mesh.composition import chain_of  # noqa: E402
+from mesh.composition import chain_of, provider_of  # noqa: E402
 from mesh.demo.lamp import write_objective  # noqa: E402
 from mesh.devchain import EmbeddedChain  # noqa: E402
 from mesh.devchain.anvil import find_anvil, serve_anvil  # noqa: E402
@@ -210,9 +210,7 @@ async def _provide(settings: Settings, keys: Sequence[bytes], number: int, pipe:
     async with (
         chain_of(settings, Account.from_key(keys[0])) as chain,
         Network(Endpoints(connect=settings.connect)) as network,
-        Provider(
-            network.session, chain, settings.lighthouse_contract, unmined_limit=settings.unmined_limit
-        ) as provider,
+        await provider_of(settings, network.session, chain) as provider,
         Background() as tasks,
     ):
         tasks.start(provider.run(), "provider")

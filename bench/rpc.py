@@ -37,10 +37,9 @@ sys.path.insert(0, str(ROOT))  # `peers` finds anvil
 from common import SPAWN, arguments, router  # noqa: E402
 from mesh import Agent  # noqa: E402
 from mesh.chain import Account, Chain  # noqa: E402
-from mesh.composition import chain_of  # noqa: E402
+from mesh.composition import chain_of, provider_of  # noqa: E402
 from mesh.devchain.anvil import find_anvil, serve_anvil  # noqa: E402
 from mesh.devchain.development import ROLES, deploy_market  # noqa: E402
-from mesh.market.provider import Provider  # noqa: E402
 from mesh.network import Endpoints, Network  # noqa: E402
 from mesh.settings import Settings  # noqa: E402
 from peers.catalog import locate  # noqa: E402
@@ -166,7 +165,7 @@ async def run_provider(settings: Settings, key: bytes, pipe: Any) -> None:
     async with (
         chain_of(settings, Account.from_key(key)) as chain,
         Network(Endpoints(connect=settings.connect)) as network,
-        Provider(network.session, chain, settings.lighthouse_contract) as provider,
+        await provider_of(settings, network.session, chain) as provider,
     ):
         pipe.send("ready")
         await provider.run()

@@ -35,6 +35,9 @@ WHAT: Final = {
     "recording": re.compile(r"/recordings"),
     "pins": re.compile(r"/\.pins"),
     "content": re.compile(r"/content"),
+    "transactions": re.compile(r"/transactions/"),
+    "sent orders": re.compile(r"/sent-orders-"),
+    "withdrawals": re.compile(r"/withdrawals-"),
 }
 """What was synced, by its path; the first that fits."""
 

@@ -28,10 +28,12 @@ if TYPE_CHECKING:
         Progress,
     )
     from mesh.agent.answers import Answer, Unanswered
+    from mesh.agent.offers import TooManyOffers
     from mesh.agent.own_model import ModelUnfit
     from mesh.agent.validators import AnnouncedValidator, ValidatorSilent
     from mesh.amounts import XRT
     from mesh.chain import InsufficientTokens, NodeUnreachable, NotALiability
+    from mesh.chain.validators import UnsafeValidator
     from mesh.content import ContentUnavailable
     from mesh.errors import (
         AiraError,
@@ -51,7 +53,7 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
     from mesh.validator.evidence import Evidence
     from mesh.validator.validator import Validator
-    from mesh.work.objectives import ObjectiveUnfit
+    from mesh.work.objectives import ObjectiveNotFetched, ObjectiveUnfit
     from mesh.work.phases import WrongPhase
     from schemas import (
         STRING,
@@ -79,12 +81,14 @@ _NAMES: Final = {
     "mesh.agent.answers": "Answer Unanswered",
     "mesh.agent.contract": "Contract Outcome",
     "mesh.agent.errors": "Declined LiabilityReverted OrderClosed OrderExpired",
+    "mesh.agent.offers": "TooManyOffers",
     "mesh.agent.own_model": "ModelUnfit",
     "mesh.agent.orders": "Order OrderState",
     "mesh.agent.progress": "Progress",
     "mesh.agent.validators": "AnnouncedValidator ValidatorSilent",
     "mesh.amounts": "XRT",
     "mesh.chain": "InsufficientTokens NodeUnreachable NotALiability",
+    "mesh.chain.validators": "UnsafeValidator",
     "mesh.content": "ContentUnavailable",
     "mesh.errors": (
         "AiraError ChainError ClosedError ConfigurationError ContentError InputError NetworkUnavailable RemoteError"
@@ -99,7 +103,7 @@ _NAMES: Final = {
     "mesh.validator.validator": "Validator",
     "mesh.work.job": "Job JobFailed",
     "mesh.work.phases": "Phase WrongPhase",
-    "mesh.work.objectives": "ObjectiveUnfit",
+    "mesh.work.objectives": "ObjectiveNotFetched ObjectiveUnfit",
     "schemas": (
         "Demand Empty InvalidPayload Liability Offer Payload PayloadType Result STRING String Verified ZERO_ADDRESS"
         " cid_of_file"
@@ -163,6 +167,7 @@ __all__ = [
     "NodeUnreachable",
     "NotALiability",
     "Objective",
+    "ObjectiveNotFetched",
     "ObjectiveUnfit",
     "Offer",
     "Order",
@@ -185,8 +190,10 @@ __all__ = [
     "RosTypes",
     "Settings",
     "String",
+    "TooManyOffers",
     "Unanswered",
     "UnknownRosType",
+    "UnsafeValidator",
     "Validator",
     "ValidatorAnnouncement",
     "ValidatorReport",

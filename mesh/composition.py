@@ -13,8 +13,11 @@ from mesh.network import Endpoints
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import zenoh
+
     from mesh.chain import Account, Chain
-    from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
+    from mesh.market.provider import Provider
+    from mesh.settings import AccountSettings, ChainSettings, NetworkSettings, Settings
     from mesh.settings.groups import StorageSettings
 
 
@@ -65,6 +68,25 @@ async def provider_files(settings: StorageSettings, chain: Chain, address: str, 
     """The files of an account's provider on a chain, for a lighthouse (ENS name)."""
     folder, name = await state_folder(settings, chain, address), f"{lighthouse.lower()}.sqlite"
     return ProviderFiles(withdrawals=folder / f"withdrawals-{name}", sent_orders=folder / f"sent-orders-{name}")
+
+
+async def provider_of(settings: Settings, session: zenoh.Session, chain: Chain) -> Provider:
+    """The provider that the settings name, not yet opened, with the account of an open chain."""
+    from mesh.blocklist import blocklist_at
+    from mesh.market.provider import Provider
+
+    assert chain.account is not None
+    lighthouse = settings.lighthouse_contract
+    return Provider(
+        session,
+        chain,
+        lighthouse,
+        limit=settings.open_orders_limit,
+        unmined_limit=settings.unmined_limit,
+        deadline_limit=settings.deadline_limit,
+        blocked=blocklist_at(settings.blocked_signers),
+        **await provider_files(settings, chain, chain.account.address, lighthouse),
+    )
 
 
 async def state_folder(settings: StorageSettings, chain: Chain, address: str) -> Path:

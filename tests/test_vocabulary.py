@@ -105,6 +105,8 @@ def test_the_documented_log_events_are_those_of_the_source() -> None:
             match node:
                 case ast.Call(func=ast.Name(id="log_event"), args=[ast.Constant(value=str(name)), *_]):
                     names.add(name)
+                case ast.Call(func=ast.Name(id="announce"), args=[_, ast.Constant(value=str(name)), *_]):
+                    names.add(name)
                 case ast.Call(func=ast.Name(id="OutageLog"), args=[_, ast.Constant(value=str(name))]):
                     names |= {f"{name}-outage", f"{name}-recovered"}
 

@@ -17,12 +17,12 @@ from schemas.loading import on_demand
 if TYPE_CHECKING:
     from bridges.serial.device import CallReply, Device
     from bridges.serial.dialect import CallStatus
-    from bridges.serial.errors import CallFailed, CallInDoubt, CallNotDone, CallRefused
+    from bridges.serial.errors import CallFailed, CallInDoubt, CallNotDone, CallRefused, NoSuchTopic
 
 _NAMES: Final = {
     "bridges.serial.device": "CallReply Device",
     "bridges.serial.dialect": "CallStatus",
-    "bridges.serial.errors": "CallFailed CallInDoubt CallNotDone CallRefused",
+    "bridges.serial.errors": "CallFailed CallInDoubt CallNotDone CallRefused NoSuchTopic",
 }
 
 # An edge agent runs in a few tens of megabytes, so a name is imported when it is first used.
@@ -36,4 +36,5 @@ __all__ = [
     "CallReply",
     "CallStatus",
     "Device",
+    "NoSuchTopic",
 ]

@@ -271,7 +271,7 @@ class NoAccount(ConfigurationError, code="no-account"):
 
 
 class TransactionsNotKept(ConfigurationError, code="transactions-not-kept"):
-    """The disk refuses the sent transactions in `folder`."""
+    """The disk refuses sent transactions, or the orders in them; `folder` is their folder or file."""
 
     def __init__(self, folder: Path, why: str) -> None:
         super().__init__(

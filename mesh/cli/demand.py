@@ -169,9 +169,11 @@ async def _post(agent: Agent, cid: str, checked: Objective | None, printer: JobP
     """Publish the demand; first check its objective, unless that was done."""
     if (objective := checked or await _check_held(agent, cid)) is not None:
         size = f"{plural(objective.count, 'message')}, {format_duration(objective.duration_ns)}"
-        printer.line(f"objective {cid}: {size}")
+        facts = {"objective": cid, "messages": objective.count, "seconds": objective.duration_ns / 1e9}
+        printer.line(f"objective {cid}: {size}", kind="objective", **facts)
     order = await agent.order(cid, **terms)
-    printer.line(f"posted {order.hash}, valid until block {order.deadline:,}")
+    until = f"valid until block {order.deadline:,}"
+    printer.line(f"posted {order.hash}, {until}", kind="posted", order=order.hash, deadline=order.deadline)
     return order
 
 

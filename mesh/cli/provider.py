@@ -80,27 +80,15 @@ async def _open_provider(
     settings: Settings, account: Account, telemetry: Telemetry
 ) -> AsyncIterator[tuple[Network, Provider]]:
     """The provider with its chain and network, and its metrics. Raises `AiraError` for what is not ready yet."""
-    from mesh.blocklist import blocklist_at
-    from mesh.composition import chain_of, endpoints_of, provider_files
-    from mesh.market.provider import Provider, ProviderProcess, check_account
+    from mesh.composition import chain_of, endpoints_of, provider_of
+    from mesh.market.provider import ProviderProcess, check_account
     from mesh.network import Network
 
-    lighthouse = settings.lighthouse_contract
     async with chain_of(settings, account) as chain:
-        await check_account(chain, lighthouse)
-        files = await provider_files(settings, chain, account.address, lighthouse)
+        await check_account(chain, settings.lighthouse_contract)
         async with (
             Network(endpoints_of(settings)) as network,
-            Provider(
-                network.session,
-                chain,
-                lighthouse,
-                limit=settings.open_orders_limit,
-                unmined_limit=settings.unmined_limit,
-                deadline_limit=settings.deadline_limit,
-                blocked=blocklist_at(settings.blocked_signers),
-                **files,
-            ) as provider,
+            await provider_of(settings, network.session, chain) as provider,
         ):
             process = ProviderProcess(network, chain, [provider])
             with telemetry.showing(measure=process.measure, health=process.health):

@@ -60,10 +60,12 @@ class JobPrinter:
             self.close()
             print_line(words)
 
-    def line(self, text: str) -> None:
-        """Print a line for people."""
+    def line(self, text: str, **facts: Any) -> None:
+        """Print a line for people or, as JSON, its facts, if it has any."""
         if not self.as_json:
             print_line(text)
+        elif facts:
+            print_json(facts)
 
     def close(self) -> None:
         """End the bar."""

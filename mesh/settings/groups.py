@@ -79,7 +79,7 @@ class StorageSettings:
     """Where state is kept."""
 
     data_dir: str = option(
-        "", "folder for the ledger, content, recordings and sent transactions (default: the user's data folder)"
+        "", "folder for ledgers, content, recordings, transactions and withdrawals (default: the user's data folder)"
     )
 
     @property

@@ -105,7 +105,9 @@ async def test_a_failed_job_is_shown_with_its_reason_and_its_recording_is_kept(s
     async with site.provider(), robot:
         with pytest.raises(JobNotDone):
             await demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=True, **TERMS)
-    *progress, end = map(json.loads, output.out.splitlines())
+    checked, posted, *progress, end = map(json.loads, output.out.splitlines())
+    assert (checked["kind"], checked["messages"]) == ("objective", 1)
+    assert (posted["kind"], len(bytes.fromhex(posted["order"]))) == ("posted", 32)
     assert {
         "kind": "refunded",
         "agent": site.address("robot"),

@@ -93,7 +93,7 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
         assert '"liability"' in printed
         kinds, end = progress_and_end(printed.text)
         assert [kind for kind in kinds if kind not in ("offer", "gone", "back")] == [
-            "contract", "ready", "playing", "result", "paid",
+            "objective", "posted", "contract", "ready", "playing", "result", "paid",
         ]  # fmt: skip
         assert set(end) == {"liability", "success", "result", "recording"}
         assert cid_of_file(Path(end["recording"])) == end["result"]
