@@ -20,6 +20,8 @@ from schemas.signing import recover
 from schemas.wire import message_hash
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from mesh.chain.abi import ContractCall, ContractFunctions
     from mesh.chain.names import Names
     from mesh.chain.node import Node
@@ -97,9 +99,13 @@ class ContractVersion:
 
     async def is_liability(self, address: str) -> bool:
         """Whether the factory created the contract at an address."""
-        if address not in self._liabilities and await self._asked_is_liability(address):
+        if address not in self._liabilities and await self._node.read(self._created(address)):
             self.recognise(address)
         return address in self._liabilities
+
+    async def are_liabilities(self, addresses: Sequence[str]) -> list[bool]:
+        """Whether the factory created the contracts at these addresses, as of the latest block; 100 in one call."""
+        return [bool(answer) for answer in await self._node.read_all(map(self._created, addresses), block="latest")]
 
     async def state(self, lighthouse: str) -> LighthouseState:
         """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none."""
@@ -110,8 +116,9 @@ class ContractVersion:
         functions = self._node.contract("Lighthouse", lighthouse)
         return bool(await self._node.read(functions.isTurnOf(provider), block="pending"))
 
-    async def _asked_is_liability(self, address: str) -> bool:
-        return bool(await self._node.read(self._factory.isLiability(address)))
+    def _created(self, address: str) -> ContractCall:
+        """The call that returns neither 0 nor false for a liability of the factory."""
+        return self._factory.isLiability(address)
 
     def _liability(self, address: str) -> ContractFunctions:
         return self._node.contract("Liability", address)
@@ -179,9 +186,12 @@ class OriginalContracts(ContractVersion):
         silence = await self._node.block_number() + 1 - state.keep_alive_block
         return provider in state.stakes and (provider == state.current or silence > state.timeout_blocks)
 
-    async def _asked_is_liability(self, address: str) -> bool:
-        gas_of = self._factory[GAS_OF[self.generation]]
-        return int(await self._node.read(gas_of(address))) > 0
+    async def are_liabilities(self, addresses: Sequence[str]) -> list[bool]:
+        counted = await super().are_liabilities(addresses)
+        return [found or address in self._liabilities for address, found in zip(addresses, counted, strict=True)]
+
+    def _created(self, address: str) -> ContractCall:
+        return self._factory[GAS_OF[self.generation]](address)
 
 
 def contract_version(kind: ContractKind, node: Node, factory: str, generation: int) -> ContractVersion:

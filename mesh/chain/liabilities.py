@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from functools import partial
+from itertools import compress
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.answers import LIABILITY_GETTERS, liability_record
@@ -97,13 +98,18 @@ class Liabilities:
         return await self.next_nonce(signer) > int(order.nonce)
 
     async def get_with_orders(self, address: str) -> tuple[Liability, tuple[bytes, bytes]]:
-        """The same as `get` and `order_hashes`, in one call."""
+        """The same as `get`, and the hashes of the demand and of the offer that it was created from."""
         return await _read(self._contracts.node, await self._recognised(address))
 
     async def get_all_with_orders(self, addresses: Sequence[str]) -> list[tuple[Liability, tuple[bytes, bytes]]]:
         """The same for several liabilities, six or more of them in one call."""
         recognised = [await self._recognised(address) for address in addresses]
         return await _read_all(self._contracts.node, recognised)
+
+    async def find_all(self, addresses: Sequence[str]) -> dict[str, Liability]:
+        """The records of those among these addresses that are liabilities, in few calls."""
+        found = list(compress(addresses, await self._contracts.version.are_liabilities(addresses)))
+        return {record.address: record for record, _ in await _read_all(self._contracts.node, found)}
 
     async def parties(self, addresses: Sequence[str]) -> list[tuple[str, str]]:
         """Promisee and promisor of each of these, which are known to be liabilities, in one call for fifty."""
@@ -144,10 +150,6 @@ class Liabilities:
             if record is not None:
                 return record
             await asyncio.sleep(node.timing.poll_interval)
-
-    async def order_hashes(self, liability: str) -> tuple[bytes, bytes]:
-        """The hashes of the demand and of the offer that a liability was created from."""
-        return (await _read(self._contracts.node, liability))[1]
 
     async def create(self, lighthouse: str, demand: Demand, offer: Offer) -> Created:
         """Create a liability from two signed orders, as a provider of the lighthouse.
@@ -274,16 +276,14 @@ class Liabilities:
 
 
 async def _read(node: Node, address: str, *, block: int | str = "latest") -> tuple[Liability, tuple[bytes, bytes]]:
-    """The record of an address that is known to be a liability, and the hashes of its demand and its offer.
-
-    Raises `NodeUnreachable`, and `NoContracts` for a block before its creation.
-    """
+    """As `_read_all`, for one. Raises `NoContracts` for a block before its creation."""
     return (await _read_all(node, [address], block=block))[0]
 
 
 async def _read_all(
     node: Node, addresses: Sequence[str], *, block: int | str = "latest"
 ) -> list[tuple[Liability, tuple[bytes, bytes]]]:
+    """The records of addresses that are known to be liabilities, and the hashes of their demands and offers."""
     calls = [call for address in addresses for call in getters("Liability", address, LIABILITY_GETTERS)]
     values = await node.read_all(calls, block=block)
     found = []

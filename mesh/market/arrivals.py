@@ -1,58 +1,142 @@
-"""The orders that arrive at a provider: which are settled first, and which wait until their makers can pay."""
+"""What arrives at a provider: orders, settled first or held until there is room for them, and results of contracts."""
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.flood import FairQueue
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Callable, Sequence
 
     from mesh.flood import Drops, KnownSenders
     from mesh.market.book import Order
     from mesh.market.settlement import Settlement
+    from mesh.market.transaction_queue import TransactionQueue
     from mesh.network import Subscription
-    from schemas import Verified
+    from schemas import Result, Verified
 
 CHECKED: Final = 512
 """Orders whose makers' funds are asked for at once."""
 WAITING: Final = 32_768
 """Orders that wait for that."""
+LOOKED_UP: Final = 100
+"""Results whose contracts are looked up in one call."""
+RESULTS_OF_SIGNER: Final = 64
+"""Results of one signer that wait for that …"""
+RESULTS: Final = 4096
+"""… and results in all."""
 
 
-class Arrivals:
+class OrderArrivals:
     """Takes orders from subscriptions (`take`), and passes them to `settlement` (`run`).
 
-    Those of known signers go first. What an order says that it pays counts only when its maker can pay it.
+    Those of known signers go first. What an order says that it pays (`worth`, a priority) counts only when its maker
+    can pay it. While `queue` is full of transactions that are worth as much, an order is held.
     """
 
     def __init__(
-        self, settlement: Settlement, *, known: KnownSenders, has_room: Callable[[], Awaitable[None]], drops: Drops
+        self,
+        settlement: Settlement,
+        queue: TransactionQueue,
+        *,
+        worth: Callable[[Order], int],
+        known: KnownSenders,
+        drops: Drops,
     ) -> None:
         self._settlement = settlement
+        self._transactions = queue
+        self._worth = worth
         self._known = known
-        self._has_room = has_room
         self._drops = drops
-        self._queue: FairQueue[tuple[Verified[Order], Subscription[Any]]] = FairQueue(per_sender=WAITING, total=WAITING)
+        self._arrived: FairQueue[tuple[Verified[Order], Subscription[Any]]] = FairQueue(
+            per_sender=WAITING, total=WAITING
+        )
+        self._held: FairQueue[tuple[Verified[Order], Subscription[Any]]] = FairQueue(per_sender=WAITING, total=WAITING)
 
     async def take(self, orders: Subscription[Any]) -> None:
         """Take the open orders of other providers, then those that are published, until cancelled."""
         await orders.recall()
         async for order in orders:
-            is_known = order.signer in self._known
-            for dropped, subscription in self._queue.put(order.signer, (order, orders), priority=int(is_known)):
+            self._put(self._arrived, order, orders)
+
+    async def run(self) -> None:
+        """Pass on what was taken, until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._pass_arrived(), name="arrived orders")
+            tasks.create_task(self._pass_held(), name="held orders")
+
+    async def _pass_arrived(self) -> None:
+        while True:
+            batch = await self._arrived.get_batch(CHECKED)
+            await asyncio.sleep(0)  # the transactions of the batch before enter the queue
+            settled = []
+            for order, orders in batch:
+                if self._transactions.has_room_for(self._worth(order.message)):
+                    settled.append(order)
+                else:
+                    self._put(self._held, order, orders)
+            await self._pass(settled)
+
+    async def _pass_held(self) -> None:
+        while True:
+            batch = await self._held.get_batch(CHECKED)
+            await self._transactions.has_room()
+            await self._pass([order for order, _ in batch])
+
+    async def _pass(self, orders: Sequence[Verified[Order]]) -> None:
+        if not orders:
+            return
+        for order, shortage in zip(orders, await self._settlement.shortages(orders), strict=True):
+            if shortage:
+                self._drops.count("unfunded", order.signer)
+                self._settlement.set_aside(order, shortage)
+            else:
+                self._settlement.add(order)
+
+    def _put(
+        self,
+        queue: FairQueue[tuple[Verified[Order], Subscription[Any]]],
+        order: Verified[Order],
+        orders: Subscription[Any],
+    ) -> None:
+        is_known = order.signer in self._known
+        for dropped, subscription in queue.put(order.signer, (order, orders), priority=int(is_known)):
+            self._drops.count("queue-full", dropped.signer)
+            subscription.forget(dropped)
+
+
+class ResultArrivals:
+    """Takes results from a subscription (`take`), and passes them to `settlement`.
+
+    Those of open contracts that it knows go on at once. The others wait until the chain was asked for their contracts
+    (`run`), for many in one call: a stranger can sign any number.
+    """
+
+    def __init__(self, settlement: Settlement, *, known: KnownSenders, drops: Drops) -> None:
+        self._settlement = settlement
+        self._known = known
+        self._drops = drops
+        self._unknown: FairQueue[tuple[Verified[Result], Subscription[Result]]] = FairQueue(
+            per_sender=RESULTS_OF_SIGNER, total=RESULTS
+        )
+
+    async def take(self, results: Subscription[Result]) -> None:
+        """Take what is published, until cancelled."""
+        async for result in results:
+            if result.message.liability in self._settlement.events.open:
+                await self._settlement.results.add(result)
+                continue
+            is_known = result.signer in self._known
+            for dropped, subscription in self._unknown.put(result.signer, (result, results), priority=int(is_known)):
                 self._drops.count("queue-full", dropped.signer)
                 subscription.forget(dropped)
 
     async def run(self) -> None:
-        """Pass on what was taken, until cancelled."""
+        """Look up the contracts of the others, until cancelled."""
         while True:
-            batch = [order for order, _ in await self._queue.get_batch(CHECKED)]
-            await self._has_room()
-            for order, shortage in zip(batch, await self._settlement.shortages(batch), strict=True):
-                if shortage:
-                    self._drops.count("unfunded", order.signer)
-                    self._settlement.set_aside(order, shortage)
-                else:
-                    self._settlement.add(order)
+            batch = [result for result, _ in await self._unknown.get_batch(LOOKED_UP)]
+            found = await self._settlement.events.liabilities([result.message.liability for result in batch])
+            for result in batch:
+                await self._settlement.results.settle(result, found.get(result.message.liability))

@@ -119,19 +119,10 @@ class UnfundedOrders:
 
 
 class Commitments:
-    """What the transactions under way take.
+    """What the transactions under way take. `funding` asks the chain for what is there of holdings."""
 
-    `funding` asks the chain for what is there of holdings. What waits does so within `waiting()`.
-    """
-
-    def __init__(
-        self,
-        funding: Callable[[Sequence[Holding]], Awaitable[Mapping[Holding, Funding | None]]],
-        *,
-        waiting: Callable[[], AbstractContextManager[object]] = nullcontext,
-    ) -> None:
+    def __init__(self, funding: Callable[[Sequence[Holding]], Awaitable[Mapping[Holding, Funding | None]]]) -> None:
         self._funding = funding
-        self._waiting = waiting
         self._taken: Counter[Holding | str] = Counter()
         self._there: dict[Holding, Funding | None] = {}
         """Of holdings of which something is taken: what there was after anything was given back the last time."""
@@ -140,9 +131,14 @@ class Commitments:
         self._released = asyncio.Event()
 
     @asynccontextmanager
-    async def take(self, stakes: Stakes) -> AsyncIterator[None]:
-        """Meanwhile take something, as soon as those before leave enough of it, or take nothing of the kind."""
-        with self._waiting():
+    async def take(
+        self, stakes: Stakes, *, waiting: AbstractContextManager[object] | None = None
+    ) -> AsyncIterator[None]:
+        """Meanwhile take something, as soon as those before leave enough of it, or take nothing of the kind.
+
+        It waits for that within `waiting`.
+        """
+        with waiting or nullcontext():
             while not await self._is_left(stakes):
                 await self._released.wait()
         self._taken.update(stakes)

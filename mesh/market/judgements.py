@@ -194,6 +194,7 @@ class ResultSettlement:
         self._commitments = commitments
         self._rejections = rejections
         self._forget = forget
+        self._drops = drops
         self._judgements = Judgements(chain, events, forget=forget, drops=drops)
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
@@ -202,8 +203,12 @@ class ResultSettlement:
 
     async def add(self, result: Verified[Result]) -> None:
         """Finalize the liability that a result names, if the result may do that, or once it may with others."""
+        address = result.message.liability
+        await self.settle(result, (await self._events.liabilities([address])).get(address))
+
+    async def settle(self, result: Verified[Result], liability: Liability | None) -> None:
+        """The same for a liability that was looked up; None if the node knows none."""
         with liability_context(result.message.liability):
-            liability = await self._events.liability(result.message.liability)
             if result in self._events.unconfirmed:
                 return
             if liability is None or liability.is_finalized:  # which may not be confirmed either
@@ -212,6 +217,9 @@ class ResultSettlement:
                 self._begin(await self._judgements.add(result, liability), liability)
             elif result.signer != liability.promisor:
                 self._rejections.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
+            elif not self._queue.has_room_for(self._chain.costs.worth(liability)):
+                self._drops.count("queue-full", result.signer)
+                self._forget(result)
             else:
                 self._begin((result,), liability)
 
@@ -225,9 +233,10 @@ class ResultSettlement:
         message, *others = (result.message for result in results)
         with liability_context(message.liability):
             try:
-                async with self._commitments.take({message.liability: 1}):
+                priority = self._chain.costs.worth(liability)
+                async with self._commitments.take({message.liability: 1}, waiting=self._queue.counted(priority)):
                     finalize = partial(self._chain.liabilities.finalize, self._lighthouse, message, *others)
-                    finalized = await self._queue.send(finalize, priority=self._chain.costs.worth(liability))
+                    finalized = await self._queue.send(finalize, priority=priority)
             except (Reverted, NodeUnreachable, NotOffered, RequestRefused) as error:
                 if isinstance(error, Reverted) and error.gas_used:
                     await self._judgements.wasted(liability)

@@ -27,7 +27,7 @@ from mesh.retry import Backoff
 from schemas import Demand, Offer, Result, address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from mesh.chain import BlockEvents, Chain
     from mesh.market.book import OrderBook
@@ -116,16 +116,18 @@ class LiabilityEvents:
             missing = 0 if is_there or await self._chain.retrying(has_mined, outages=self.lookups) else missing + 1
         return False
 
-    async def liability(self, address: str) -> Liability | None:
-        """The record of a liability; None while the node knows none at that address."""
-        if (known := self.open.get(address)) is not None:
+    async def liabilities(self, addresses: Sequence[str]) -> Mapping[str, Liability]:
+        """The records of the liabilities that the node knows among these addresses."""
+        known = {address: liability for address in addresses if (liability := self.open.get(address)) is not None}
+        unknown = [address for address in dict.fromkeys(addresses) if address not in known]
+        if not unknown:
             return known
         try:
-            read = partial(self._chain.liabilities.get, address)
-            return await self._chain.retrying(read, outages=self.lookups, errors=(NodeUnreachable,))
-        except (NotALiability, NoContracts, RequestRefused) as error:  # or a reorganisation took it
-            log.debug("a result waits to be sent again: %s", error)
-            return None
+            read = partial(self._chain.liabilities.find_all, unknown)
+            return known | await self._chain.retrying(read, outages=self.lookups, errors=(NodeUnreachable,))
+        except (NoContracts, RequestRefused) as error:  # or a reorganisation took one
+            log.debug("results wait to be sent again: %s", error)
+            return known
 
     async def is_used(self, order: Verified[Demand | Offer]) -> bool:
         """Whether an order became a liability, or was withdrawn on the chain."""

@@ -16,7 +16,7 @@ from mesh.chain.transactions import TransactionSender
 from mesh.flood import Drops
 from mesh.fresh_file import CHECK_INTERVAL
 from mesh.log_context import LogSource, source_context
-from mesh.market.arrivals import Arrivals
+from mesh.market.arrivals import OrderArrivals, ResultArrivals
 from mesh.market.book import LIMIT, Match, OrderBook
 from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.liability_events import OPEN_LIABILITIES
@@ -193,16 +193,17 @@ class Provider(Role):
                 # Before the orders that they concern; one that comes later still stops what was not sent.
                 await self._withdrawn.recall()
                 tasks.create_task(self._take_withdrawals(), name="provider withdrawals")
-                arrivals = Arrivals(
-                    self.settlement,
-                    known=self.book.known,
-                    has_room=self.queue.has_room,
-                    drops=self.drops,
-                )
-                tasks.create_task(arrivals.take(self._demands), name="provider demands")
-                tasks.create_task(arrivals.take(self._offers), name="provider offers")
-                tasks.create_task(arrivals.run(), name="provider arrivals")
-                tasks.create_task(self._take_results(), name="provider results")
+                self._take_arrivals(tasks)
+
+    def _take_arrivals(self, tasks: asyncio.TaskGroup) -> None:
+        known, drops = self.book.known, self.drops
+        orders = OrderArrivals(self.settlement, self.queue, worth=self._chain.costs.worth, known=known, drops=drops)
+        tasks.create_task(orders.take(self._demands), name="provider demands")
+        tasks.create_task(orders.take(self._offers), name="provider offers")
+        tasks.create_task(orders.run(), name="provider orders")
+        results = ResultArrivals(self.settlement, known=known, drops=drops)
+        tasks.create_task(results.take(self.results), name="provider results")
+        tasks.create_task(results.run(), name="provider unknown results")
 
     def earnings(self) -> Earnings:
         """What was done, earned and spent so far."""
@@ -230,11 +231,6 @@ class Provider(Role):
     async def _take_withdrawals(self) -> None:
         async for withdrawal in self._withdrawn:
             self.settlement.withdraw(withdrawal)
-
-    async def _take_results(self) -> None:
-        async for result in self.results:
-            await self.queue.has_room()
-            await self.settlement.results.add(result)
 
 
 class ProviderProcess:

@@ -92,7 +92,7 @@ class Settlement:
             open_limit=open_limit,
         )
         self._ask = partial(chain.retrying, outages=self.events.lookups)
-        self._commitments = Commitments(self._funding, waiting=queue.counted)
+        self._commitments = Commitments(self._funding)
         self.results: Final = ResultSettlement(
             chain,
             channel.address,
@@ -203,11 +203,11 @@ class Settlement:
     async def _create(self, match: Match) -> None:
         demand, offer = match
         try:
-            async with self._commitments.take(creation_stakes(match, self._chain.costs)):
-                if shortage := next(filter(None, await self.shortages(match)), ""):
-                    await self._set_aside_unfunded(match, shortage, "its maker can't pay any more")
+            priority, stakes = self._chain.costs.worth(demand.message), creation_stakes(match, self._chain.costs)
+            async with self._commitments.take(stakes, waiting=self._queue.counted(priority)):
+                shortage = next(filter(None, await self.shortages(match)), "")  # which may be over by now
+                if shortage and await self._set_aside_unfunded(match, shortage, "its maker can't pay any more"):
                     return
-                priority = self._chain.costs.worth(demand.message)
                 created = await self._queue.send(self._creation(match), priority=priority)
         except MatchWithdrawn:
             self._put_back(match)

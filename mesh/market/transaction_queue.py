@@ -11,6 +11,7 @@ import asyncio
 import heapq
 import itertools
 import logging
+from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -45,7 +46,7 @@ BUSY_SECONDS: Final = 100.0
 UNDER_WAY: Final = 16
 """Transactions that wait to be mined at the same time, by default: some nodes keep no more of one account."""
 QUEUED: Final = 1024
-"""Transactions in the queue above which `has_room` waits."""
+"""Transactions in the queue above which there is no room for others of their priority, or a lower one."""
 SET_ASIDE: Final = 4096
 """Transactions that may wait for their next attempt at the same time."""
 OUT_OF_TURN: Final = frozenset({"NotYourTurn", "NotAProvider"})
@@ -106,7 +107,8 @@ class TransactionQueue:
         self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
         """A heap of those that wait for a place: the negative priority, a serial number, and what wakes them."""
         self._numbers = itertools.count()
-        self._queued = 0
+        self._queued: Counter[int] = Counter()
+        """How many there are of each priority."""
         self._set_aside = 0
         self._room = asyncio.Event()
         self._room.set()
@@ -120,12 +122,16 @@ class TransactionQueue:
     @property
     def waiting(self) -> int:
         """Transactions that wait in the queue, or for their next attempt."""
-        return self._queued + self._set_aside
+        return self._queued.total() + self._set_aside
 
     async def has_room(self) -> None:
-        """Wait until the queue is shorter than its limit. Await it before accepting work that leads to `send`."""
+        """Wait until the queue is shorter than its limit."""
         await asyncio.sleep(0)  # tasks that were created just now enter the queue
         await self._room.wait()
+
+    def has_room_for(self, priority: int) -> bool:
+        """Whether fewer than the limit wait of this priority and above. Check it before `send`."""
+        return sum(count for level, count in self._queued.items() if level >= priority) < self._limit
 
     async def send(self, transaction: Callable[[], Awaitable[T]], *, priority: int = 0) -> T:
         """Send a transaction when all that go before it are under way, in the provider's turn; return its outcome.
@@ -152,7 +158,7 @@ class TransactionQueue:
 
     async def _wait_for_place(self, priority: int, attempts: _SendAttempts) -> None:
         """Wait until all that go before are under way, and for a place among them, and the turn; take both."""
-        with self.counted():
+        with self.counted(priority):
             await self._become_first(priority)
             try:
                 await self._take_turn(attempts.since)
@@ -164,16 +170,18 @@ class TransactionQueue:
                 self._admit()
 
     @contextmanager
-    def counted(self) -> Iterator[None]:
+    def counted(self, priority: int) -> Iterator[None]:
         """Meanwhile count one more transaction in the queue."""
-        self._queued += 1
-        if self._queued >= self._limit:
+        self._queued[priority] += 1
+        if self._queued.total() >= self._limit:
             self._room.clear()
         try:
             yield
         finally:
-            self._queued -= 1
-            if self._queued < self._limit:
+            self._queued[priority] -= 1
+            if not self._queued[priority]:
+                del self._queued[priority]
+            if self._queued.total() < self._limit:
                 self._room.set()
 
     async def _become_first(self, priority: int) -> None:

@@ -111,7 +111,7 @@ class Audit:
         makers: dict[object, str] = {}
         async with Chain(node, ens=self._market.deployed.market.deployment.ens) as chain:
             for address in self.liabilities():
-                demand, _ = await chain.liabilities.order_hashes(address)
+                demand, _ = (await chain.liabilities.get_with_orders(address))[1]
                 maker = self._market.steps.demands.get(demand.hex())
                 if maker is not None and (other := makers.setdefault(maker, address)) != address:
                     self._market.violated("ordered-twice", f"{maker[0].name}'s job {maker[1]}: {other} and {address}")

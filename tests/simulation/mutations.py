@@ -374,9 +374,9 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "a result for a contract that a reorganisation took ends the provider",
-        "mesh.market.liability_events:LiabilityEvents.liability",
-        "NoContracts, RequestRefused",
-        "RequestRefused",
+        "mesh.market.arrivals:ResultArrivals.run",
+        "found.get(result.message.liability)",
+        "found[result.message.liability]",
         REORGANISATIONS + ",duplicate,delay",
     ),
     Mutation(

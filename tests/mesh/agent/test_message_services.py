@@ -106,7 +106,7 @@ async def test_orders_that_two_agents_signed_become_a_contract(place: Place, gen
         await until_found(is_made, what="a contract", seconds=30)
         [liability] = await chain.liabilities.list(from_block=before)
         assert (liability.cost, liability.promisee, liability.promisor) == (9, person.address, robot.address)
-        hashes = await chain.liabilities.order_hashes(liability.address)
+        hashes = (await chain.liabilities.get_with_orders(liability.address))[1]
         assert tuple(digest.hex() for digest in hashes) == (demanded.hash, offered.hash)
         await until_settled(person)
         await until_settled(robot)

@@ -114,7 +114,7 @@ async def test_a_restarted_program_can_wait_for_the_contract_of_its_order(place:
         (resumed,) = person.orders()
         contract = await resumed.contract()
         assert (await contract.outcome()).success
-        demand_hash, _ = await place.chains["person"].liabilities.order_hashes(contract.address)
+        demand_hash, _ = (await place.chains["person"].liabilities.get_with_orders(contract.address))[1]
         assert demand_hash.hex() == order.hash
         assert person.orders() == []
         assert (await resumed.contract()).address == contract.address

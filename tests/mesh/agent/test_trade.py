@@ -195,7 +195,7 @@ async def test_an_offer_without_demand_waits_for_one(place: Place) -> None:
         assert await waiting(robot) == ["offer"]
         contract = await person.demand(job(place), cost=55)
         assert (await contract.outcome()).success
-        _, offer_hash = await place.chains["person"].liabilities.order_hashes(contract.address)
+        _, offer_hash = (await place.chains["person"].liabilities.get_with_orders(contract.address))[1]
         assert offer_hash.hex() == offer
         assert [kind for kind in await waiting(robot) if kind == "offer"] == []
     assert working_on == ["there"]

@@ -64,7 +64,7 @@ async def test_a_rejection_is_information_and_the_order_stays_valid(
             assert (await waiting_too).address == contract.address
         kinds = [progress.kind for progress in heard if progress.kind != "offer"]
         assert kinds == ["rejected", "contract"]
-        assert (await place.chains["person"].liabilities.order_hashes(contract.address))[0].hex() == order.hash
+        assert (await place.chains["person"].liabilities.get_with_orders(contract.address))[1][0].hex() == order.hash
 
 
 async def test_the_reason_of_the_contracts_is_reported(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,7 +109,7 @@ async def test_nonces_that_a_reorganisation_freed_do_not_keep_the_next_order_wai
             patch.setattr(Liabilities, "next_nonce", before_the_reorganisation)
             order = await person.order(OBJECTIVE, cost=7)
         contract = await order.contract()
-        assert (await place.chains["person"].liabilities.order_hashes(contract.address))[0].hex() == order.hash
+        assert (await place.chains["person"].liabilities.get_with_orders(contract.address))[1][0].hex() == order.hash
         assert await liabilities.next_nonce() == free + 3
 
 
@@ -182,7 +182,7 @@ async def test_a_rejection_of_an_order_that_became_a_contract_is_ignored(place: 
             await until(lambda: provider.earnings().created == 1)
             network.session.put(key, rejection(place, "provider", identity, reason="WrongSigner").encode())
             contract = await demand
-        demand_hash, _ = await chain.liabilities.order_hashes(contract.address)
+        demand_hash, _ = (await chain.liabilities.get_with_orders(contract.address))[1]
         assert demand_hash.hex() == identity
         assert await chain.liabilities.next_nonce(me.address) == before + 1
 
@@ -273,7 +273,7 @@ async def test_a_contract_on_equal_terms_of_another_signer_leaves_our_demand_ope
         offer = person.parts.signer.sign(Offer(**terms, **fresh))
         chain = place.chains["provider"]
         made = await chain.liabilities.create(place.market.deployment.lighthouse, stolen, offer)
-        assert (await chain.liabilities.order_hashes(made.liability))[0] == message_hash(ours)
+        assert (await chain.liabilities.get_with_orders(made.liability))[1][0] == message_hash(ours)
 
         head = await chain.block_number()
         await until(lambda: person.parts.chain_head.head >= head)
@@ -324,5 +324,5 @@ async def test_an_earlier_version_of_an_order_that_a_reorganisation_makes_valid_
         await until(lambda: other.hash in {one.hash for one in person.orders()})
         await create(earlier)
         contract = await asyncio.wait_for(order.contract(), 60)
-        assert (await provider.liabilities.order_hashes(contract.address))[0].hex() == message_hash(earlier).hex()
+        assert (await provider.liabilities.get_with_orders(contract.address))[1][0].hex() == message_hash(earlier).hex()
         await until(lambda: [one.message.cost for one in person.orders(OrderState.OPEN)] == [8])

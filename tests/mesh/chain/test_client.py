@@ -139,7 +139,7 @@ async def test_a_job_goes_from_orders_to_payment(market: DeployedMarket, generat
         assert created.gas_used < 260_000
 
         hashes = message_hash(demand), message_hash(offer)
-        assert await chain.liabilities.order_hashes(created.liability) == hashes
+        assert (await chain.liabilities.get_with_orders(created.liability))[1] == hashes
         used = [
             await chain.liabilities.is_order_used(order_hash, who)
             for order_hash, who in zip(hashes, people, strict=True)
@@ -150,6 +150,8 @@ async def test_a_job_goes_from_orders_to_payment(market: DeployedMarket, generat
         )
 
         made = await chain.liabilities.get(created.liability)
+        strange = [market.promisee.address, market.stranger.address]
+        assert await chain.liabilities.find_all([*strange, created.liability]) == {created.liability: made}
         assert (made.model, made.objective, made.result) == (demand.model, demand.objective, "")
         assert (made.promisee, made.promisor, made.lighthouse) == (*people, market.deployment.lighthouse)
         assert (made.token, made.cost, made.lighthouse_fee) == (market.deployment.xrt, cost, fee)

@@ -179,10 +179,9 @@ class LocalMarket:
         made = []
         async for block in self.chain.follow(self.started):
             for event in block.events:
-                if isinstance(event, NewLiability) and digest in await self.chain.liabilities.order_hashes(
-                    event.liability
-                ):
-                    made.append(await self.chain.liabilities.get(event.liability))
+                if isinstance(event, NewLiability):
+                    liability, hashes = await self.chain.liabilities.get_with_orders(event.liability)
+                    made += [liability] if digest in hashes else []
             if block.block_number >= await self.chain.block_number():
                 return made
         raise AssertionError

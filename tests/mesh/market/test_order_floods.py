@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 from mesh.background import Background
 from mesh.flood import Drops, KnownSenders
 from mesh.market import Added, OrderBook, Refusal
-from mesh.market.arrivals import CHECKED, Arrivals
+from mesh.market.arrivals import CHECKED, OrderArrivals
 from schemas import Demand, Signer, verify_message
+from tests.mesh.market.held_node import HeldNode
 from tests.mesh.market.observation import until_read
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
 from tests.support.waiting import until, until_found
@@ -99,11 +100,13 @@ def copies(local: LocalMarket, count: int, **terms: Any) -> list[Demand]:
 
 
 class Market:
-    """A subscription to orders, and what settles them."""
+    """A subscription to orders, what settles them, and a queue with room for what is worth more than `full`."""
 
-    def __init__(self, *orders: Verified[Order]) -> None:
+    def __init__(self, *orders: Verified[Order], full: int = -1) -> None:
         self._orders = orders
+        self._full = full
         self.checked: list[Verified[Order]] = []
+        self.room = asyncio.Event()
 
     async def recall(self) -> None:
         pass
@@ -120,7 +123,18 @@ class Market:
         pass
 
     async def has_room(self) -> None:
-        pass
+        await self.room.wait()
+
+    def has_room_for(self, priority: int) -> bool:
+        return priority > self._full
+
+
+def arrivals_of(market: Market, known: KnownSenders) -> OrderArrivals:
+    return OrderArrivals(market, market, worth=worth, known=known, drops=Drops())  # type: ignore[arg-type]
+
+
+def worth(order: Order) -> int:
+    return order.cost.bit_length()
 
 
 async def test_known_signers_are_checked_before_strangers_that_promise_more() -> None:
@@ -128,12 +142,41 @@ async def test_known_signers_are_checked_before_strangers_that_promise_more() ->
     honest = verified_demand(signer=PERSON, cost=1)
     market, known = Market(*promised, honest), KnownSenders()
     known.add(PERSON.address)
-    arrivals = Arrivals(market, known=known, has_room=market.has_room, drops=Drops())  # type: ignore[arg-type]
+    arrivals = arrivals_of(market, known)
     await arrivals.take(market)  # type: ignore[arg-type]
     async with Background() as tasks:
         tasks.start(arrivals.run(), "arrivals")
         await until(lambda: market.checked)
     assert market.checked[0] == honest
+
+
+async def test_while_transactions_wait_for_free_contracts_orders_that_pay_more_are_settled() -> None:
+    free = [verified_demand(signer=stranger(), cost=0) for _ in range(2 * CHECKED)]
+    paid = verified_demand(signer=PERSON, cost=1)
+    market = Market(*free, paid, full=0)
+    arrivals = arrivals_of(market, KnownSenders())
+    await arrivals.take(market)  # type: ignore[arg-type]
+    async with Background() as tasks:
+        tasks.start(arrivals.run(), "arrivals")
+        await until(lambda: market.checked)
+        assert market.checked == [paid]
+        market.room.set()
+        await until(lambda: len(market.checked) == len(free) + 1)
+
+
+async def test_results_of_unknown_contracts_hold_up_no_others(local: LocalMarket) -> None:
+    async with HeldNode(local.node) as node, local.provider(endpoint=node) as provider:
+        demand = local.demand()
+        local.publish(demand, local.offer())
+        liability = await local.liability_of(demand)
+        await until(lambda: liability.address in provider.settlement.events.open)
+        honest = local.result(liability.address)
+        with node.back("eth_call"):
+            local.publish(*(local.result(stranger().address, "rival") for _ in range(50)))
+            await until(lambda: node.waiting["eth_call"])
+            local.publish(honest)
+            await until(lambda: verify_message(honest) in provider.settlement.events.unconfirmed)
+        await until(lambda: provider.earnings().finalized == 1)
 
 
 async def test_unfunded_demands_with_the_same_terms_take_no_offer(local: LocalMarket) -> None:

@@ -18,6 +18,8 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import pytest
+
     from schemas import Demand, Offer, Verified
     from tests.mesh.market.local_market import LocalMarket
 
@@ -153,3 +155,21 @@ async def test_each_copy_of_an_unfunded_order_is_rejected(local: LocalMarket) ->
         await until_found(partial(is_rejected, 3), what="three rejections")
         assert {one.reason for one in local.rejections} == {"ERC20InsufficientAllowance"}
         assert len(provider.book) == 1
+
+
+async def test_a_match_is_settled_whose_maker_can_pay_in_the_latest_block(
+    local: LocalMarket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The provider looks again before it sets an order aside, and the maker may have paid in meanwhile."""
+    async with local.provider() as provider:
+        shortages = provider.settlement.shortages
+
+        async def stale(orders: Sequence[Verified[Demand | Offer]], *, fresh: bool = False) -> list[str]:
+            is_late = isinstance(orders, Match) and not fresh
+            return ["ERC20InsufficientAllowance", ""] if is_late else await shortages(orders, fresh=fresh)
+
+        monkeypatch.setattr(provider.settlement, "shortages", stale)
+        demand = local.demand()
+        local.publish(demand, local.offer())
+        await local.liability_of(demand)
+        assert not local.rejections

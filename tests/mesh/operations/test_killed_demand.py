@@ -115,7 +115,7 @@ async def test_run_again_it_can_withdraw_the_killed_demand(person: Person) -> No
             (contract,) = await person.ended(1)
     assert (contract.is_success, done) == (True, ["work"])
     async with person.site.chain("person") as chain:
-        demand_hash, _ = await chain.liabilities.order_hashes(contract.address)
+        demand_hash, _ = (await chain.liabilities.get_with_orders(contract.address))[1]
     assert demand_hash.hex() != killed
 
 
@@ -135,7 +135,7 @@ async def test_run_again_it_can_post_another_demand_with_allowance_for_both(pers
     assert [contract.is_success for contract in contracts] == [True, True]
     assert done == ["work", "work"]
     async with person.site.chain("person") as chain:
-        hashes = {(await chain.liabilities.order_hashes(contract.address))[0].hex() for contract in contracts}
+        hashes = {(await chain.liabilities.get_with_orders(contract.address))[1][0].hex() for contract in contracts}
     assert killed in hashes
 
 

@@ -69,7 +69,7 @@ async def test_providers_share_jobs_and_take_over_and_each_job_is_done_once(serv
             outcomes = await asyncio.gather(*jobs)
             log = await asyncio.to_thread(stopped, provider)
         made = await chain.liabilities.list(from_block=start)
-        hashes = [await chain.liabilities.order_hashes(liability.address) for liability in made]
+        hashes = [(await chain.liabilities.get_with_orders(liability.address))[1] for liability in made]
         after, supply = await wealth(site, chain), (await chain.tokens.info()).total_supply
         transactions = await sent(site, chain, start)
 

@@ -124,7 +124,7 @@ async def test_a_liability_that_ended_before_the_agent_read_it_is_not_a_job(plac
 
 async def created_again(robot: Agent, contract: Contract) -> None:
     """Revert a contract and create it again, as when the same transaction is mined in another block."""
-    hashes = await robot.parts.chain.liabilities.order_hashes(contract.address)
+    hashes = (await robot.parts.chain.liabilities.get_with_orders(contract.address))[1]
     await robot.runtime.listener.liability_reverted(contract.address)
     assert await robot.parts.ledger.job(contract.address) is None
     assert "result" not in [waiting.kind for waiting in await robot.parts.ledger.outbox(head=0)]
