@@ -20,9 +20,11 @@ SHARE: Final = 4
 LEAST_BLOCKS: Final = 20
 """… or fewer than this."""
 SOON: Final = 3
-"""Blocks that leave a Result unsettled before the chain is asked when it would be late."""
+"""Blocks that leave a Result unsettled before the chain is asked when it would be late, and between two attempts."""
 JUDGED: Final = frozenset({"NotTheValidator", "RefusedByValidator"})
 """How the contracts refuse a Result that only a validator can finalize."""
+NOT_OURS: Final = "WrongSigner"
+"""How they refuse a Result of another account."""
 NEVER: Final = 2**63
 
 
@@ -66,9 +68,10 @@ class LateResults:
         except (NodeUnreachable, RequestRefused, NotALiability) as error:
             log.debug("looking at the result again after the next block: %s", error)
         except (NotOffered, Reverted) as error:
-            # The originals, a liability that has ended, or one whose validator must confirm the result.
-            self._late_from[address] = NEVER
-            log.debug("only a provider can finalize this: %s", error)
+            is_final = isinstance(error, NotOffered) or error.reason in (*JUDGED, NOT_OURS)
+            # Else somebody's transaction may be pending that finalizes it, and fail.
+            self._late_from[address] = NEVER if is_final else head + SOON
+            log.debug("the contract is not finalized by its result: %s", error)
             if isinstance(error, Reverted) and error.reason in JUDGED:
                 facts = log_event("verdict-late", code=error.reason)
                 log.warning("the validator has not judged the result, and the cost can be refunded soon", extra=facts)

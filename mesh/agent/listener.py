@@ -169,17 +169,23 @@ class ChainListener:
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract was created that names this account: as promisee, as promisor, or as both."""
         await self._trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
-        if liability.promisor != self._account or not self._parts.settings.enable_executor:
+        if liability.promisor != self._account:
+            return
+        if not self._parts.settings.enable_executor:
+            if not liability.is_finalized:  # for the account's next run that does jobs, or one beside this
+                await self._ledger.add_job(liability)
             return
         await self._executor.wait_until_open()
         if liability.is_finalized:
             if await self._ledger.bring_back(liability.address):
                 await self.finalized(liability.address, success=liability.is_success, result=liability.result)
             return
-        if not await self._ledger.add_job(liability):
+        address, is_known = liability.address, not await self._ledger.add_job(liability)
+        job = await self._ledger.job(address)
+        # Another program of the account may have added it, and left it to this one.
+        if job is None or (is_known and (job.phase is not Phase.INCOMING or address in self._executor.preparing)):
             return
-        job = await self._ledger.job(liability.address)
-        if job is not None and job.result is not None:
+        if job.result is not None:
             await self._owe_result(job)
             return
         facts = log_event("job-accepted", model=liability.model, objective=liability.objective, cost=liability.cost)

@@ -21,13 +21,12 @@ from mesh.agent.withdrawing import ChainWithdrawals
 from mesh.background import Background
 from mesh.chain import Allowances, OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
-from mesh.flood import KnownSenders
+from mesh.flood import SENDERS, KnownSenders
 from mesh.log_context import log_event
 from mesh.market.refusals import Refusal
 from mesh.market.versions import lasting_hash
 from mesh.role import Lifecycle
 from mesh.work.database import LedgerUnusable
-from mesh.work.phases import Phase
 from schemas import Demand, Offer, Withdrawal, decode
 
 if TYPE_CHECKING:
@@ -77,8 +76,8 @@ class Trader(Lifecycle):
 
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.push_async_callback(self._close)
-        for job in await self._parts.ledger.jobs(Phase):
-            self.customers.add(job.liability.promisee)
+        for promisee in await self._parts.ledger.promisees(SENDERS):
+            self.customers.add(promisee)
         self._hear_declines = await stack.enter_async_context(received_declines(self._parts, self._orders))
         resumed = [order for order in await self.load() if order.is_open]
         for order in resumed:
@@ -144,6 +143,7 @@ class Trader(Lifecycle):
             order.close(OrderState.WITHDRAWN)
             facts = log_event("order-withdrawn", order=order.identity, deadline=order.deadline)
             log.info("the %s is withdrawn", order, extra=facts)
+        if order.state is OrderState.WITHDRAWN:  # also if it was before: the disk may have failed then
             withdrawal = Withdrawal(order=order.identity, lighthouse=order.signed.lighthouse, deadline=order.deadline)
             await self._parts.outbox.withdraw(self._parts.signer.sign(withdrawal))
         return order.shown(self)

@@ -47,8 +47,9 @@ def is_waiting_elsewhere(refused: RequestRefused) -> bool:
 async def submit(node: Node, signed: SignedTransaction) -> None:
     """Give a transaction to the node, and again after a lost connection: the same bytes never count twice.
 
-    Once an attempt may have arrived, the refusal of a later one may mean just that. Raises `NodeUnreachable`,
-    `RequestRefused`.
+    Once an attempt may have arrived, the refusal of a later one may mean just that; or it comes from another node,
+    which says nothing about the first. Raises `NodeUnreachable` if the transaction may still be mined, `RequestRefused`
+    if not.
     """
     backoff, may_have_arrived = Backoff(node.timing.request_retry), False
     while True:
@@ -58,10 +59,15 @@ async def submit(node: Node, signed: SignedTransaction) -> None:
             may_have_arrived = True
             if not await backoff.wait():
                 raise
-        except RequestRefused:
-            if may_have_arrived and await node.has_transaction(signed.hash):
+        except RequestRefused as refused:
+            if not may_have_arrived:
+                raise
+            if await node.has_transaction(signed.hash):
                 return None
-            raise
+            if is_nonce_taken(refused):
+                raise
+            why = f"it may have the transaction {signed.hash}, and refused it when it was sent again: {refused.detail}"
+            raise NodeUnreachable(node.endpoint, why) from None
 
 
 async def is_known(node: Node, versions: Iterable[SignedTransaction]) -> bool:

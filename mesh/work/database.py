@@ -34,6 +34,7 @@ CREATE TABLE IF NOT EXISTS jobs (
     changed REAL NOT NULL,
     recorded INTEGER NOT NULL DEFAULT 0
 );
+CREATE INDEX IF NOT EXISTS jobs_by_phase ON jobs (phase, changed) WHERE NOT aside;
 CREATE TABLE IF NOT EXISTS outbox (
     identity TEXT PRIMARY KEY,
     kind TEXT NOT NULL,

@@ -10,7 +10,7 @@ import asyncio
 import logging
 from contextlib import asynccontextmanager
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
 
@@ -69,7 +69,8 @@ class Executor:
         self._playbacks = playbacks
         self._handlers = handlers
         self._on_phase = on_phase
-        self._preparing: dict[str, asyncio.Task[None]] = {}
+        self.preparing: Final[dict[str, asyncio.Task[None]]] = {}
+        """The tasks that fetch and check objectives, by the address of the job."""
         self._fetched: dict[str, Objective] = {}
         self._ready: asyncio.Queue[str] = asyncio.Queue()
         self._tasks: asyncio.TaskGroup | None = None
@@ -103,7 +104,7 @@ class Executor:
         """Fetch and check a job's objective in a task. Then the job is ready, or complete without success."""
         address = liability.address
         task = self._task_group().create_task(self._fetch(liability), name=f"prepare {address}")
-        self._preparing[address] = task
+        self.preparing[address] = task
         task.add_done_callback(partial(self._drop_task, address))
 
     @asynccontextmanager
@@ -259,9 +260,8 @@ class Executor:
     async def _release_ended(self) -> None:
         """The same for all jobs: a crash may have come between their end and `_release`."""
         pins, recorded = await asyncio.to_thread(self._store.pins), await asyncio.to_thread(self._playbacks.recorded)
-        for label in recorded.union(*pins.values()):
-            if label.startswith("0x"):  # other labels belong to others
-                await self._release(label)
+        for label in (one for one in recorded.union(*pins.values()) if one.startswith("0x")):  # others are not of jobs
+            await self._release(label)
 
     async def _job(self, address: str, *, asked: str) -> JobRecord:
         job = await self._ledger.job(address)
@@ -278,13 +278,13 @@ class Executor:
     async def _wait_until_prepared(self, address: str) -> None:
         """Wait until the objective of a startable job is there: after a restart it is checked again first."""
         await self.wait_until_open()
-        job, preparing = await self._ledger.job(address), self._preparing.get(address)
+        job, preparing = await self._ledger.job(address), self.preparing.get(address)
         if job is not None and job.phase in STARTABLE and address not in self._fetched and preparing is not None:
             await asyncio.wait([preparing])
 
     def _drop_task(self, address: str, task: asyncio.Task[None]) -> None:
-        if self._preparing.get(address) is task:
-            del self._preparing[address]
+        if self.preparing.get(address) is task:
+            del self.preparing[address]
 
     def _task_group(self) -> asyncio.TaskGroup:
         if self._tasks is None:

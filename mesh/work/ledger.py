@@ -143,6 +143,11 @@ class Ledger:
         statement = f"SELECT * FROM jobs WHERE phase IN ({marks}) AND NOT aside ORDER BY rowid"
         return [_job(row) for row in await self._database.rows(statement, wanted)]
 
+    async def promisees(self, limit: int) -> list[str]:
+        """The promisees of the latest jobs, of `limit` jobs at most, the latest last."""
+        rows = await self._database.rows("SELECT record FROM jobs ORDER BY rowid DESC LIMIT ?", (limit,))
+        return [Liability.decode(row[0]).promisee for row in reversed(rows)]
+
     async def holds(self, names: Sequence[str]) -> set[str]:
         """Those of some names that are a job's liability (address), or the identity of a message in the outbox."""
         marks = ",".join("?" * len(names))

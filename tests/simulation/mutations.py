@@ -395,7 +395,7 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "a result under settlement is settled again",
-        "mesh.market.judgements:ResultSettlement.add",
+        "mesh.market.judgements:ResultSettlement.settle",
         "if result in self._events.unconfirmed:",
         "if False:",
         "duplicate,replay",

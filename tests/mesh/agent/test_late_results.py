@@ -9,7 +9,8 @@ import pytest
 
 from mesh.agent import Phase
 from mesh.agent.components import ChainHead
-from mesh.chain import DeploymentPlan
+from mesh.agent.late_results import SOON
+from mesh.chain import DeploymentPlan, Reverted
 from mesh.chain.liabilities import Liabilities
 from mesh.devchain.development import deploy_market
 from mesh.devchain.embedded import EmbeddedChain
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent import Agent
+    from mesh.chain import Settled
+    from schemas import Result
     from tests.support.routers import EmbeddedRouter
 
 REFUND_DELAY = 200
@@ -114,3 +117,28 @@ async def test_the_parties_of_a_silent_validator_are_told_and_the_cost_is_refund
         outcome = await contract.outcome()
         assert (outcome.success, outcome.code, outcome.reports) == (False, "no-result", ())
         assert "no verdict of the validator" in outcome.reason
+
+
+async def test_a_result_is_brought_again_if_a_pending_transaction_was_in_its_way(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finalize, attempts = Liabilities.finalize_without_turn, list[int]()
+
+    async def finalized(liabilities: Liabilities, result: Result) -> Settled:
+        attempts.append(await place.chains["person"].block_number())
+        if len(attempts) == 1:  # by a provider's transaction, which is dropped later
+            raise Reverted("AlreadyFinalized")
+        return await finalize(liabilities, result)
+
+    monkeypatch.setattr(Liabilities, "finalize_without_turn", finalized)
+    async with place.agent("person") as person, speaking(offering(place.agent("robot")), []) as robot:
+        contract = await made_by_a_provider_that_leaves(place, person, robot)
+        await in_phase(robot, contract, Phase.COMPLETE)
+        await _deadline_known(robot, place)
+        refundable = await place.chains["person"].liabilities.refundable_from(contract.address)
+        await place.node.mine((refundable - await place.chains["person"].block_number()) * 5 // 6)
+        await until(lambda: attempts)
+        await place.node.mine(SOON)
+        async with asyncio.timeout(60):
+            assert (await contract.outcome()).success
+    assert attempts[1] - attempts[0] == SOON

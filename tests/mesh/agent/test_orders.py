@@ -14,6 +14,7 @@ from mesh.agent.terms import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, def
 from mesh.chain import BlockHeader, InsufficientTokens
 from mesh.chain.answers import Count, Word
 from mesh.chain.heads import Heads
+from mesh.work.database import LedgerUnusable
 from schemas import Demand, Offer, Withdrawal, cid_of_bytes, decode, message_hash
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, unsettled, waiting, working
 from tests.support.log_events import logged_facts
@@ -145,6 +146,23 @@ async def test_a_withdrawn_order_is_sent_no_more_and_its_withdrawal_until_the_de
         await place.node.mine(20)
         await until(lambda: not person.orders(OrderState.WITHDRAWN))
         await until_found(lambda: all_posted(person, 0))
+
+
+async def test_a_withdrawal_that_failed_on_the_disk_can_be_repeated(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with place.agent("person") as person:
+        order = await person.order(OBJECTIVE, cost=300)
+
+        async def full(*_: object) -> None:
+            raise LedgerUnusable(place.folder, "database or disk is full")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(person.parts.ledger, "withdraw", full)
+            with pytest.raises(LedgerUnusable):
+                await order.withdraw()
+        assert (await order.withdraw()).state is OrderState.WITHDRAWN
+        assert await waiting(person) == ["withdrawal"]
 
 
 async def test_a_provider_confirms_that_it_honours_a_withdrawal(place: Place) -> None:

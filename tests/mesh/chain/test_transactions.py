@@ -201,3 +201,24 @@ async def test_cancelling_does_not_block_the_next_transaction(node: EmbeddedChai
             await sending
         await sender.send(to=friend, data=b"", value=2)
         assert await way.eth_balance(friend) == 2
+
+
+async def test_a_transaction_that_one_node_may_have_is_remembered_when_another_refuses_it(node: EmbeddedChain) -> None:
+    """Else it could be sent again with another nonce, and both be mined."""
+
+    class Nodes(EmbeddedProvider):
+        asked = 0
+
+        async def make_request(self, method: str, params: Any) -> Any:
+            if method != "eth_sendRawTransaction":
+                return await super().make_request(method, params)
+            self.asked += 1
+            if self.asked == 1:
+                raise ConnectionResetError("the answer was lost")
+            return {"jsonrpc": "2.0", "id": 1, "error": {"code": -32000, "message": "txpool is full"}}
+
+    account = Account.from_key(node.funded_keys[0])
+    async with Node(Nodes(node), timing=QUICK) as way:
+        with unreachable("txpool is full"):
+            await TransactionSender(way, account).send(to=unused_address(), data=b"", value=5)
+        assert len(way.pending_transactions(account.address).abandoned) == 1

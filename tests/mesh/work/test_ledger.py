@@ -7,12 +7,13 @@ import sqlite3
 from typing import TYPE_CHECKING
 
 import pytest
+from msgspec.structs import replace
 
 from mesh.work import Ledger, Phase
 from mesh.work.outbox import outgoing
 from tests.mesh.work.ledgers import RESULT, ledger, path
 from tests.mesh.work.samples import liability, message
-from tests.support.orders import demand, offer, withdrawal
+from tests.support.orders import PERSON, ROBOT, STRANGER, demand, offer, withdrawal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,6 +33,13 @@ async def test_a_new_job_is_incoming_and_holds_the_record(ledger: Ledger) -> Non
         0,
         "",
     )
+
+
+async def test_the_promisees_of_the_latest_jobs_are_listed(ledger: Ledger) -> None:
+    promisees = [signer.address for signer in (PERSON, ROBOT, STRANGER)]
+    for number, promisee in enumerate(promisees):
+        await ledger.add_job(replace(liability(str(number)), promisee=promisee))
+    assert await ledger.promisees(2) == promisees[1:]
 
 
 async def test_unknown_jobs_are_none(ledger: Ledger) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 from mesh.agent import Agent, Phase
@@ -116,6 +118,8 @@ async def test_a_liability_that_ended_before_the_agent_read_it_is_not_a_job(plac
         # As if it had been down since before the contract was made.
         async with Ledger(robot_memory / "ledger.sqlite") as ledger:
             await ledger.set_cursor(head)
+        with closing(sqlite3.connect(robot_memory / "ledger.sqlite", isolation_level=None)) as database:
+            database.execute("DELETE FROM jobs")
         async with speaking(place.agent("robot"), said) as robot:
             await reading(robot)
             assert await robot.parts.ledger.job(contract.address) is None
@@ -204,3 +208,42 @@ async def test_a_restarted_development_chain_has_a_ledger_of_its_own(place: Plac
                 assert robot.parts.chain.chain_id == place.chains["robot"].chain_id
                 assert robot.parts.directory != here
                 assert robot.parts.directory.parent == here.parent
+
+
+async def test_a_job_of_a_run_that_does_none_is_done_by_the_next_one(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.provider(), place.agent("person") as person:
+        async with offering(place.agent("robot", enable_executor=False)) as robot:
+            contract = await person.demand(words(place), cost=COST)
+            head = await place.chains["person"].block_number()
+            await robot.parts.chain_head.reached(head)
+        async with speaking(place.agent("robot"), said):
+            assert (await contract.outcome()).success
+    assert said == WORDS
+    assert await paid.once()
+
+
+async def test_a_program_of_the_account_that_does_no_jobs_leaves_them_to_the_robot_beside_it(
+    place: Place, paid: Paying
+) -> None:
+    said: list[str] = []
+    async with (
+        place.provider(),
+        place.agent("person") as person,
+        place.agent("robot", enable_executor=False) as page,
+        speaking(offering(place.agent("robot")), said) as robot,
+    ):
+        opened = robot.runtime.executor.wait_until_open
+
+        async def later() -> None:
+            """The page is first, as it may be."""
+            head = await place.chains["person"].block_number()
+            await page.parts.chain_head.reached(head)
+            await opened()
+
+        robot.runtime.executor.wait_until_open = later  # type: ignore[method-assign]
+        contract = await person.demand(words(place), cost=COST)
+        assert (await contract.outcome()).success
+        await in_phase(robot, contract, Phase.FINALIZED)
+    assert said == WORDS
+    assert await paid.once()
