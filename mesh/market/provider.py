@@ -96,7 +96,7 @@ class Provider(Role):
         self._open_liabilities = open_liabilities
         self._deadline_limit = deadline_limit
         self._blocked = blocked
-        self.withdrawals = Withdrawals(withdrawals)
+        self.withdrawals = Withdrawals(withdrawals, deadline_limit=deadline_limit)
         self._sent_orders = SentOrders(sent_orders)
         self.ledger = EarningsLedger()
         self.drops = Drops() if drops is None else drops
@@ -110,6 +110,7 @@ class Provider(Role):
         self.book.expire(head)
         stack.enter_context(self.withdrawals)
         self.withdrawals.expire(head)
+        await self.withdrawals.sync()  # those of the earlier process
         versions = await self._restore(stack)
         self.queue = TransactionQueue(
             self._chain,
@@ -230,7 +231,7 @@ class Provider(Role):
 
     async def _take_withdrawals(self) -> None:
         async for withdrawal in self._withdrawn:
-            self.settlement.withdraw(withdrawal)
+            self.settlement.withdrawn.add(withdrawal)
 
 
 class ProviderProcess:

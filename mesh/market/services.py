@@ -90,7 +90,9 @@ class OrderBookService:
 
     def _received(self, loop: asyncio.AbstractEventLoop, query: zenoh.Query) -> None:
         """Refuse what is too much on Zenoh's thread, so that the event loop is not kept busy."""
-        if len(self._answers) < self._limit and self._rate.allow("", min(len(self._book) + 1, self._most)):
+        order = query.parameters.get(ORDER)
+        replies = len(self._withdrawals.of(order)) if order else len(self._withdrawals) + len(self._book)
+        if len(self._answers) < self._limit and self._rate.allow("", min(replies + 1, self._most)):
             call_in_loop(loop, self.answer, query)
             return
         if self._drops is not None:
@@ -115,7 +117,7 @@ class OrderBookService:
     def _answer(self, order: str | None) -> list[Verified[Any]]:
         """The withdrawals of an order, if its hash is given; else all that is open."""
         if order:
-            return [withdrawal for withdrawal in self._withdrawals if withdrawal.message.order == order]
+            return self._withdrawals.of(order)
         return [*self._withdrawals, *self._book.orders()]
 
     def _reply(self, query: zenoh.Query, messages: list[Verified[Any]]) -> None:

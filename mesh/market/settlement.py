@@ -22,7 +22,7 @@ from mesh.market.judgements import ResultSettlement
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
 from mesh.market.refusals import RETRIED, MatchWithdrawn, Refusal
 from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
-from mesh.market.withdrawals import withdrawn_id
+from mesh.market.withdrawing import WithdrawalSettlement
 from schemas import Result
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from mesh.market.versions import OrderVersions
     from mesh.market.withdrawals import Withdrawals
     from mesh.network import Channel
-    from schemas import Verified, Withdrawal
+    from schemas import Verified
 
 log = logging.getLogger(__name__)
 
@@ -105,12 +105,23 @@ class Settlement:
             drops=drops,
         )
         self._pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
+        self.withdrawn: Final = WithdrawalSettlement(
+            withdrawals,
+            book=book,
+            events=self.events,
+            versions=versions,
+            rejections=self.rejections,
+            forget=forget,
+            drops=drops,
+            pause=self._pause,
+        )
         self._unfunded = UnfundedOrders(book, self.shortages, funded=self.add, interval=chain.node.timing.poll_interval)
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
         """Follow the chain, and from now on settle what is added, in tasks of this group."""
         self._tasks = tasks
         self.results.start(tasks)
+        self.withdrawn.start(tasks)
         tasks.create_task(self.events.follow(self._settle_again), name="provider chain")
         tasks.create_task(self._unfunded.run(), name="provider unfunded orders")
 
@@ -135,7 +146,7 @@ class Settlement:
             self.events.unconfirmed.begin(*outcome)
             self._tasks.create_task(self._create(outcome))
         elif isinstance(outcome, Refusal):
-            is_no_promise = outcome is Refusal.WITHDRAWN and not self._may_promise(order_id(order))
+            is_no_promise = outcome is Refusal.WITHDRAWN and not self.withdrawn.may_promise(order_id(order))
             if outcome is not Refusal.DUPLICATE and not is_no_promise:
                 self.rejections.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
             if outcome not in (Refusal.DUPLICATE, Refusal.WITHDRAWN):
@@ -166,28 +177,6 @@ class Settlement:
         if order in self.events.unconfirmed:
             return Refusal.DUPLICATE
         return self._taken_back(order)
-
-    def withdraw(self, withdrawal: Verified[Withdrawal]) -> None:
-        """Honour a withdrawal: its order leaves the book, and is refused until its deadline.
-
-        A transaction that was sent already can't be stopped. The maker is told when it is on disk.
-        """
-        identity = withdrawn_id(withdrawal)
-        is_settled = self.events.unconfirmed.get(identity) is not None
-        if not self._withdrawals.add(withdrawal, is_open=is_settled or self._book.stays(identity)):
-            self._drops.count("withdrawals", withdrawal.signer)
-            self.rejections.reject(withdrawal, Refusal.FULL.value, "too many withdrawals")
-            self._forget(withdrawal)
-            return
-        self._book.remove(identity)
-        if self._may_promise(identity) and not is_settled:
-            self.rejections.honour(withdrawal)
-        else:
-            self._forget(withdrawal, after=self._pause)
-
-    def _may_promise(self, withdrawn: bytes) -> bool:
-        """Whether a withdrawal is known to the end, and no transaction with its order may still succeed."""
-        return self._withdrawals.is_kept(withdrawn) and not self._versions.is_undecided(withdrawn, self.events.head)
 
     def block(self, signers: frozenset[str]) -> None:
         """Take no orders of these signers, and drop those in the book. A transaction that was sent can't be stopped."""

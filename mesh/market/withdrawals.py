@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import os
 import sqlite3
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from typing import TYPE_CHECKING, Final, Self
 
+from mesh.content.files import sync_directory
 from mesh.errors import AiraError
 from mesh.flood import Rate, RateLimiter
 from mesh.outage_log import OutageLog
 from mesh.private_files import make_private_database, make_private_folder
+from mesh.settings.groups import DEADLINE_LIMIT
 from schemas import InvalidMessage, Verified, Withdrawal, address_bytes, decode, encode
 from schemas.wire import message_hash
 
@@ -58,9 +62,10 @@ class Withdrawals:
     """The known withdrawals: `with Withdrawals(path) as withdrawals`; in memory only if `path` is None.
 
     At most `limit` are known. Those of open orders are never forgotten before their deadline, nor are others while that
-    leaves half of the places: these may be promised. Strangers can sign any number, so of the rest those with the
-    latest deadline are forgotten when there are too many: honest orders end soon. Writes take tens of microseconds and
-    run on the event loop; a failing disk is logged as an outage.
+    leaves half of the places, or three quarters if the deadline is further away than `deadline_limit` blocks: these may
+    be promised. Strangers can sign any number, so of the rest those with the latest deadline are forgotten when there
+    are too many: honest orders end soon. Writes take tens of microseconds and run on the event loop, while `sync` waits
+    for the disk in a thread. A failing disk is logged as an outage.
     """
 
     def __init__(
@@ -69,10 +74,13 @@ class Withdrawals:
         *,
         limit: int = LIMIT,
         limit_per_signer: int = LIMIT_PER_SIGNER,
+        deadline_limit: int = DEADLINE_LIMIT,
         rate: Rate = IN_TOTAL,
     ) -> None:
         self._path = path
         self._limit = limit
+        self._deadline_limit = deadline_limit
+        self._head = 0
         self._limit_per_signer = limit_per_signer
         self._rate = RateLimiter(per_sender=PER_SIGNER, total=rate)
         self._known: dict[bytes, Verified[Withdrawal]] = {}
@@ -83,6 +91,10 @@ class Withdrawals:
         self._by_signer: Counter[str] = Counter()
         self._unwritten: set[bytes] = set()
         """Orders whose withdrawal could not be written."""
+        self._unsynced: set[bytes] = set()
+        """Orders whose withdrawal was written, but that a power failure may take back."""
+        self._syncing = asyncio.Lock()
+        self._by_order: dict[str, dict[bytes, Verified[Withdrawal]]] = {}
         self._outage = OutageLog(log, "withdrawals")
         self._database: sqlite3.Connection | None = None
 
@@ -126,22 +138,41 @@ class Withdrawals:
             return True
         if not is_known and not (is_open or self._rate.allow(withdrawal.signer)):
             return False
-        is_lasting = is_open or len(self._lasting) < self._limit // 2
+        is_soon = withdrawal.message.deadline <= self._head + self._deadline_limit
+        is_lasting = is_open or len(self._lasting) < self._limit // (2 if is_soon else 4)
         if not is_known and not self._take(identity, withdrawal, is_lasting=is_lasting):
             return False
         row = identity, withdrawal.signer, encode(withdrawal.message), not self._is_brief(identity)
         if self._write("INSERT OR REPLACE INTO withdrawals VALUES (?, ?, ?, ?)", [row]):
             self._unwritten.discard(identity)
+            self._unsynced.add(identity)
         else:
             self._unwritten.add(identity)
         return True
 
+    async def sync(self) -> None:
+        """Wait until all that was added so far is on the disk, also after a power failure."""
+        async with self._syncing:
+            added = set(self._unsynced)
+            try:
+                if self._path is not None and added:
+                    await asyncio.to_thread(_sync, self._path)
+            except OSError as error:
+                self._failed(error)
+            else:
+                self._unsynced -= added
+
+    def of(self, order: str) -> list[Verified[Withdrawal]]:
+        """The withdrawals of the orders with this hash (64 hexadecimal digits), one of each signer."""
+        return list(self._by_order.get(order, {}).values())
+
     def is_kept(self, order: bytes) -> bool:
-        """Whether the withdrawal of the order with this identity is known until its deadline, also after a restart."""
-        return order in self._known and order not in self._unwritten and not self._is_brief(order)
+        """Whether the withdrawal of the order with this identity is known until its deadline, whatever fails."""
+        return order in self._known and order not in self._unwritten | self._unsynced and not self._is_brief(order)
 
     def expire(self, head: int) -> None:
         """Forget the withdrawals whose deadline is not after block `head`: their orders have expired, too."""
+        self._head = head
         for due in (self._lasting, self._brief):
             if count := bisect_right(due, head, key=lambda one: one[0]):
                 self._forget(due[:count])
@@ -156,6 +187,7 @@ class Withdrawals:
                 return False
             self._forget([self._brief.pop()])
         self._known[identity] = withdrawal
+        self._by_order.setdefault(withdrawal.message.order, {})[identity] = withdrawal
         self._by_signer[withdrawal.signer] += 1
         insort(self._lasting if is_lasting else self._brief, due)
         return True
@@ -167,8 +199,13 @@ class Withdrawals:
 
     def _forget(self, due: list[tuple[int, bytes]]) -> None:
         for _, identity in due:
-            signer = self._known.pop(identity).signer
+            forgotten = self._known.pop(identity)
+            signer, order = forgotten.signer, forgotten.message.order
+            del self._by_order[order][identity]
+            if not self._by_order[order]:
+                del self._by_order[order]
             self._unwritten.discard(identity)
+            self._unsynced.discard(identity)
             self._by_signer[signer] -= 1
             if not self._by_signer[signer]:
                 del self._by_signer[signer]
@@ -179,13 +216,19 @@ class Withdrawals:
             return
         try:
             rows = self._database.execute("SELECT identity, signer, payload, lasting FROM withdrawals").fetchall()
-            for identity, signer, payload, lasting in rows:
-                message = decode(payload)
-                if isinstance(message, Withdrawal):
-                    verified = Verified(message, message_hash(message), signer)
-                    self._take(identity, verified, is_lasting=bool(lasting))
-        except (sqlite3.Error, InvalidMessage) as error:
+        except sqlite3.Error as error:
             self._failed(error)
+            return
+        for identity, signer, payload, lasting in rows:
+            try:
+                message = decode(payload)
+            except InvalidMessage as error:
+                self._failed(error)
+                continue
+            if isinstance(message, Withdrawal):
+                verified = Verified(message, message_hash(message), signer)
+                self._take(identity, verified, is_lasting=bool(lasting))
+                self._unsynced.add(identity)
 
     def _write(self, statement: str, rows: list[tuple[object, ...]]) -> bool:
         if self._database is None:
@@ -205,3 +248,13 @@ class Withdrawals:
     def _failed(self, error: Exception) -> None:
         assert self._path is not None
         self._outage.failed(WithdrawalsNotKept(self._path, error), "withdrawals are known until the process ends")
+
+
+def _sync(path: Path) -> None:
+    """Sync what was committed to the database at `path`. It is in SQLite's log, or was synced when it left that."""
+    descriptor = os.open(path.with_name(f"{path.name}-wal"), os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    sync_directory(path.parent)

@@ -101,6 +101,9 @@ class SimulatedDisk:
             self._entries[found.st_ino] = {entry.name: entry.inode() for entry in os.scandir(path)}
         else:
             self.synced[found.st_ino] = path.read_bytes()
+            latest = LogState.of(os.readlink(path).removesuffix(LOG)) if found.st_ino in self.logs else None
+            if latest is not None:
+                self.logs[found.st_ino] = latest
         process = scheduler().process
         if process is not None:
             process.commit()

@@ -122,8 +122,6 @@ class Role:
         is_power_failure = chance.random() < 0.5
         kind = "power-failure" if is_power_failure else "kill"
         market.draw.counts[kind] += 1
-        if is_power_failure:
-            market.steps.power_failed(self.name)
         market.trace(self.name, kind, steps=process.steps, commits=process.commits)
         market.scheduler.call_later(chance.uniform(0.2, 20), self._restart_from_disk, is_power_failure)
 

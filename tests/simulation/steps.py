@@ -209,10 +209,6 @@ class StepAudit:
             if (provider, order.hash.hex()) in self.honoured:
                 self._market.violated("matched-after-withdrawal", order.hash.hex())
 
-    def power_failed(self, role: str) -> None:
-        """A process lost power: a provider perhaps with it the withdrawals that it knew."""
-        self.honoured = {one for one in self.honoured if one[0] != role}
-
     def _balance(self, holder: str) -> int:
         return int.from_bytes(self._call(self._token, BALANCE_OF + holder[2:].lower().rjust(64, "0")))
 

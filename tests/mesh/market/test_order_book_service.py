@@ -176,11 +176,12 @@ async def test_leaving_after_the_session_was_closed_does_not_hang(router: Embedd
 
 
 async def test_queries_beyond_the_rate_are_dropped_and_counted(router: EmbeddedRouter) -> None:
-    book, drops = holding(verified_demand(), verified_offer(cost=1)), Drops()
+    book, drops, withdrawals = holding(verified_demand()), Drops(), Withdrawals()
+    withdrawals.add(verify_message(PERSON.sign(Withdrawal(order="ab" * 32, lighthouse=LIGHTHOUSE, deadline=10))))
     async with (
         network(router) as one,
         network(router) as two,
-        OrderBookService(one.session, MARKET, book, Withdrawals(), replies=Rate(1e-9, 5), drops=drops),
+        OrderBookService(one.session, MARKET, book, withdrawals, replies=Rate(1e-9, 5), drops=drops),
     ):
         await until_answered(two.session, f"aira/{MARKET}/**")
 

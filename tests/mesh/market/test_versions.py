@@ -207,11 +207,11 @@ async def test_no_withdrawal_is_honoured_while_a_reverted_contract_may_come_back
         await until_read(local, provider)
         withdrawal = verify_message(local.withdrawal(demand))
         await until(lambda: provider.settlement.add(verify_message(demand)) is Refusal.DUPLICATE)
-        provider.settlement.withdraw(withdrawal)
+        provider.settlement.withdrawn.add(withdrawal)
         assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
         await local.mine(DEPTH)
         await until_read(local, provider)
-        provider.settlement.withdraw(withdrawal)
+        provider.settlement.withdrawn.add(withdrawal)
         await local.rejection_of(demand)
         assert reasons(local) == ["withdrawn"]
 
@@ -249,7 +249,7 @@ async def test_a_restarted_provider_honours_no_withdrawal_of_what_may_be_mined(
             assert "withdrawn" not in reasons(local)
             await local.mine(DEPTH + 1)
             await until_read(local, provider)
-            provider.settlement.withdraw(verify_message(withdrawal))
+            provider.settlement.withdrawn.add(verify_message(withdrawal))
             await local.rejection_of(demand)
             assert reasons(local).count("withdrawn") == 1
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import secrets
 import sqlite3
 import stat
@@ -75,7 +77,7 @@ def test_a_flood_of_withdrawals_is_refused_but_for_open_orders() -> None:
 
 
 def test_when_there_are_too_many_those_with_the_latest_deadline_are_forgotten() -> None:
-    with Withdrawals(limit=2) as withdrawals:
+    with Withdrawals(limit=2, deadline_limit=FAR) as withdrawals:
         first, never, soon = (withdrawal(deadline=deadline) for deadline in (FAR, FAR, 20))
         assert [withdrawals.add(one) for one in (first, never, soon)] == [True, True, True]
         assert set(withdrawals) == {first, soon}
@@ -83,15 +85,70 @@ def test_when_there_are_too_many_those_with_the_latest_deadline_are_forgotten() 
         assert [withdrawn_id(one) in withdrawals for one in (first, never, soon)] == [True, False, True]
 
 
-def test_a_flood_of_withdrawals_that_end_sooner_makes_no_other_forgotten_that_was_promised(tmp_path: Path) -> None:
+async def test_a_flood_of_withdrawals_that_end_late_leaves_places_for_those_that_end_soon() -> None:
+    with Withdrawals(limit=8, deadline_limit=100) as withdrawals:
+        withdrawals.expire(50)
+        far, soon = ([withdrawal(deadline=deadline) for _ in range(3)] for deadline in (151, 150))
+        assert all(withdrawals.add(one) for one in (*far, *soon))
+        await withdrawals.sync()
+        assert [withdrawals.is_kept(withdrawn_id(one)) for one in far] == [True, True, False]
+        assert [withdrawals.is_kept(withdrawn_id(one)) for one in soon] == [True, True, False]
+
+
+async def test_what_a_power_failure_may_take_back_is_not_promised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, one, synced = tmp_path / "withdrawals.sqlite", withdrawal(), list[str]()
+    fsync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        synced.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+        fsync(descriptor)
+
+    def failed(descriptor: int) -> None:
+        raise OSError(errno.EIO, "the disk is broken")
+
+    with Withdrawals(path) as withdrawals:
+        assert withdrawals.add(one)
+        assert not withdrawals.is_kept(withdrawn_id(one))
+        monkeypatch.setattr(os, "fsync", failed)
+        await withdrawals.sync()
+        assert not withdrawals.is_kept(withdrawn_id(one))
+        assert logged_facts(caplog, "withdrawals-outage")
+        monkeypatch.setattr(os, "fsync", noted)
+        await withdrawals.sync()
+        assert withdrawals.is_kept(withdrawn_id(one))
+        assert synced == [f"{path}-wal", str(tmp_path)]
+    with Withdrawals(path) as withdrawals:
+        assert not withdrawals.is_kept(withdrawn_id(one)), (
+            "an earlier process may have been killed before it synced this"
+        )
+
+
+def test_a_withdrawal_that_can_not_be_read_takes_no_others_along(tmp_path: Path) -> None:
+    path, one = tmp_path / "withdrawals.sqlite", withdrawal()
+    with Withdrawals(path) as withdrawals:
+        withdrawals.add(one)
+    with sqlite3.connect(path) as database:
+        database.execute("INSERT INTO withdrawals VALUES (x'00', '', x'00', 1)")
+    database.close()
+    with Withdrawals(path) as withdrawals:
+        assert set(withdrawals) == {one}
+
+
+async def test_a_flood_of_withdrawals_that_end_sooner_makes_no_other_forgotten_that_was_promised(
+    tmp_path: Path,
+) -> None:
     path, flood = tmp_path / "withdrawals.sqlite", [withdrawal(deadline=9) for _ in range(9)]
     with Withdrawals(path, limit=4) as withdrawals:
         assert sum(withdrawals.add(one) for one in flood) >= 4
+        await withdrawals.sync()
         kept = [withdrawals.is_kept(withdrawn_id(one)) for one in flood]
         assert kept == [True] * 2 + [False] * 7, "half of the places"
         assert len(withdrawals) == 4
         assert withdrawals.add(honest := withdrawal(deadline=20), is_open=True)
         assert withdrawals.add(withdrawal(deadline=20), is_open=True)
+        await withdrawals.sync()
         assert withdrawals.is_kept(withdrawn_id(honest))
 
         assert not any(withdrawals.add(withdrawal(deadline=8)) for _ in range(9))
@@ -100,13 +157,14 @@ def test_a_flood_of_withdrawals_that_end_sooner_makes_no_other_forgotten_that_wa
         assert len(withdrawals) == 4
     with Withdrawals(path, limit=4) as withdrawals:
         assert not withdrawals.add(withdrawal(deadline=7))
+        await withdrawals.sync()
         assert withdrawals.is_kept(withdrawn_id(honest))
         withdrawals.expire(9)
         assert len(withdrawals) == 2
         assert withdrawals.add(withdrawal(deadline=7), is_open=True)
 
 
-def test_withdrawals_of_an_earlier_version_are_promised(tmp_path: Path) -> None:
+async def test_withdrawals_of_an_earlier_version_are_promised(tmp_path: Path) -> None:
     path, before = tmp_path / "withdrawals.sqlite", withdrawal()
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE withdrawals (identity BLOB PRIMARY KEY, signer TEXT, payload BLOB)")
@@ -114,6 +172,7 @@ def test_withdrawals_of_an_earlier_version_are_promised(tmp_path: Path) -> None:
         database.execute("INSERT INTO withdrawals VALUES (?, ?, ?)", row)
     database.close()
     with Withdrawals(path) as withdrawals:
+        await withdrawals.sync()
         assert withdrawals.is_kept(withdrawn_id(before))
 
 
@@ -130,16 +189,19 @@ def test_withdrawals_are_known_without_a_disk(tmp_path: Path, caplog: pytest.Log
     assert outage["code"] == "withdrawals-not-kept"
 
 
-def test_a_withdrawal_that_could_not_be_written_is_written_with_its_next_copy(tmp_path: Path) -> None:
+async def test_a_withdrawal_that_could_not_be_written_is_written_with_its_next_copy(tmp_path: Path) -> None:
     path, one = tmp_path / "withdrawals.sqlite", withdrawal()
     with Withdrawals(path) as withdrawals:
         with sqlite3.connect(path, isolation_level=None) as other:
             other.execute("BEGIN IMMEDIATE")  # nobody else can write
             assert withdrawals.add(one)
+            await withdrawals.sync()
             assert not withdrawals.is_kept(withdrawn_id(one))
             other.execute("ROLLBACK")
         other.close()
         assert withdrawals.add(one)
+        await withdrawals.sync()
         assert withdrawals.is_kept(withdrawn_id(one))
     with Withdrawals(path) as again:
+        await again.sync()
         assert again.is_kept(withdrawn_id(one))
