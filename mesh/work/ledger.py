@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 LISTENER: Final = "listener"
 """The name of the only reader of the chain whose cursor the ledger keeps."""
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
+NAMES_AT_ONCE: Final = 8192
+"""Names in one statement, which may have 32,766 values in SQLite as it is built by default."""
 SPENT_KEPT: Final = 4096
 """Most orders that are kept after they became contracts. A reorganisation replaces only the last blocks."""
 
@@ -150,10 +152,14 @@ class Ledger:
 
     async def holds(self, names: Sequence[str]) -> set[str]:
         """Those of some names that are a job's liability (address), or the identity of a message in the outbox."""
-        marks = ",".join("?" * len(names))
-        statement = f"SELECT liability FROM jobs WHERE liability IN ({marks})"
-        statement += f" UNION SELECT identity FROM outbox WHERE identity IN ({marks})"
-        return {row[0] for row in await self._database.rows(statement, (*names, *names))}
+        held: set[str] = set()
+        for start in range(0, len(names), NAMES_AT_ONCE):
+            some = names[start : start + NAMES_AT_ONCE]
+            marks = ",".join("?" * len(some))
+            statement = f"SELECT liability FROM jobs WHERE liability IN ({marks})"
+            statement += f" UNION SELECT identity FROM outbox WHERE identity IN ({marks})"
+            held |= {row[0] for row in await self._database.rows(statement, (*some, *some))}
+        return held
 
     async def jobs_by_phase(self) -> dict[str, int]:
         """The number of jobs in each phase that has any."""

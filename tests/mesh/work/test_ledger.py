@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from mesh.work import Ledger, Phase
+from mesh.work.ledger import NAMES_AT_ONCE
 from mesh.work.outbox import outgoing
 from tests.mesh.work.ledgers import RESULT, ledger, path
 from tests.mesh.work.samples import liability, message
@@ -40,6 +41,13 @@ async def test_the_promisees_of_the_latest_jobs_are_listed(ledger: Ledger) -> No
     for number, promisee in enumerate(promisees):
         await ledger.add_job(replace(liability(str(number)), promisee=promisee))
     assert await ledger.promisees(2) == promisees[1:]
+
+
+async def test_many_names_are_looked_up(ledger: Ledger) -> None:
+    await ledger.add_job(liability())
+    assert await ledger.holds([str(number) for number in range(NAMES_AT_ONCE)] + [liability().address]) == {
+        liability().address
+    }
 
 
 async def test_unknown_jobs_are_none(ledger: Ledger) -> None:
