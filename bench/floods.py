@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from mesh.network import message_key
 from schemas import ZERO_ADDRESS, Demand, Offer, PresenceKey, Result, RpcKey, Signer, Withdrawal, cid_of_digest, encode
+from schemas.address import checksum_address
 from schemas.selectors import market_selector
 
 if TYPE_CHECKING:
@@ -134,16 +135,35 @@ async def random_signatures(attacker: Attacker) -> None:
     await attacker.put_all(attacker.wire([one()])[0] for _ in itertools.count())
 
 
-@flood
-async def unfunded_pairs(attacker: Attacker) -> None:
-    """Demands and offers that match, by accounts without tokens."""
+def pairs(attacker: Attacker, cost: int) -> list[Demand | Offer]:
+    """Demands and offers that match, by fresh keys."""
     messages = []
     for _ in range(PREPARED // 2):
-        terms = attacker.demand()
+        terms = attacker.demand(cost=cost)
         shared = {name: getattr(terms, name) for name in terms.__struct_fields__ if name != "validator_fee"}
         offer = Offer(**shared | {"nonce": secrets.token_hex(32)}, lighthouse_fee=0)
         messages += [sign(terms), sign(offer)]
-    await attacker.put_again_and_again(attacker.wire(messages))
+    return messages
+
+
+@flood
+async def unfunded_pairs(attacker: Attacker) -> None:
+    """Demands and offers that match, by accounts without tokens."""
+    await attacker.put_again_and_again(attacker.wire(pairs(attacker, cost=1)))
+
+
+@flood
+async def free_pairs(attacker: Attacker) -> None:
+    """Demands and offers that match and cost nothing: the provider creates their contracts, as many as it can."""
+    await attacker.put_again_and_again(attacker.wire(pairs(attacker, cost=0)))
+
+
+@flood
+async def unknown_results(attacker: Attacker) -> None:
+    """Results of fresh keys for contracts that do not exist: each would be a call of the node."""
+    addresses = (checksum_address(secrets.token_bytes(20)) for _ in range(PREPARED))
+    results = (Result(liability=address, result=attacker.objective, success=True) for address in addresses)
+    await attacker.put_again_and_again(attacker.wire(map(sign, results)))
 
 
 @flood

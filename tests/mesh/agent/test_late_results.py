@@ -141,4 +141,4 @@ async def test_a_result_is_brought_again_if_a_pending_transaction_was_in_its_way
         await place.node.mine(SOON)
         async with asyncio.timeout(60):
             assert (await contract.outcome()).success
-    assert attempts[1] - attempts[0] == SOON
+    assert len(attempts) == 2

@@ -182,13 +182,13 @@ async def test_only_the_chosen_topics_are_recorded(place: Place) -> None:
     assert {topic.name for topic in recording.topics} == {"/go", "/led"}
 
 
-async def test_an_agent_without_executor_ignores_liabilities(place: Place) -> None:
+async def test_an_agent_without_executor_does_no_jobs(place: Place) -> None:
     robot = doing_nothing(offering(place.agent("robot", enable_executor=False)))
     async with place.at_work(robot) as person:
         contract = await person.demand(place.save(objective(("/go", Empty()))))
         head = await place.chains["robot"].block_number()
         await until(lambda: robot.parts.chain_head.head >= head)
-        assert await robot.parts.ledger.jobs() == []
+        assert [job.phase for job in await robot.parts.ledger.jobs()] == [Phase.INCOMING]
         assert not (await place.chains["person"].liabilities.get(contract.address)).is_finalized
 
 
