@@ -168,7 +168,8 @@ class Withdrawals:
 
     def is_kept(self, order: bytes) -> bool:
         """Whether the withdrawal of the order with this identity is known until its deadline, whatever fails."""
-        return order in self._known and order not in self._unwritten | self._unsynced and not self._is_brief(order)
+        is_on_disk = order not in self._unwritten and order not in self._unsynced
+        return is_on_disk and order in self._known and not self._is_brief(order)
 
     def expire(self, head: int) -> None:
         """Forget the withdrawals whose deadline is not after block `head`: their orders have expired, too."""
