@@ -45,6 +45,9 @@ BUSY_SECONDS: Final = 100.0
 """How long the failing attempts at one transaction may take in all: the others wait meanwhile."""
 UNDER_WAY: Final = 16
 """Transactions that wait to be mined at the same time, by default: some nodes keep no more of one account."""
+RESERVED: Final = 4
+"""One of so many places is kept for transactions with a priority: one that is worth something need not wait for the
+next block because free contracts have taken all places."""
 QUEUED: Final = 1024
 """Transactions in the queue above which there is no room for others of their priority, or a lower one."""
 SET_ASIDE: Final = 4096
@@ -102,6 +105,7 @@ class TransactionQueue:
         self._turns = Turns(chain, lighthouse, most=under_way)
         self._free = under_way
         """Places among those under way."""
+        self._reserved = under_way // RESERVED
         self._taking_turn = asyncio.Lock()
         self._has_first = False
         self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
@@ -200,6 +204,9 @@ class TransactionQueue:
     def _admit(self) -> None:
         """Let the next one be the first, if there is a place for it."""
         while self._waiting and self._free and not self._has_first:
+            is_worthless = not self._waiting[0][0]
+            if is_worthless and self._free <= self._reserved:
+                return
             *_, waiter = heapq.heappop(self._waiting)
             if not waiter.done():
                 self._free, self._has_first = self._free - 1, True

@@ -12,7 +12,7 @@ import pytest
 from mesh.chain import InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
 from mesh.chain.lighthouses import Lighthouses
 from mesh.market.earnings import EarningsLedger
-from mesh.market.transaction_queue import TransactionQueue
+from mesh.market.transaction_queue import RESERVED, TransactionQueue
 from mesh.retry import RetryPolicy
 from tests.mesh.market.local_market import QUICK, QUICK_RETRY
 from tests.support.waiting import until
@@ -147,6 +147,23 @@ async def test_a_place_that_becomes_free_goes_to_the_highest_priority_then(local
             free[name].set()
 
     assert sent == ["first", "high", "low"]
+
+
+async def test_a_place_is_kept_for_what_is_worth_something(local: LocalMarket) -> None:
+    sent: list[int] = []
+    done = asyncio.Event()
+
+    async def transaction(worth: int) -> None:
+        sent.append(worth)
+        await done.wait()
+
+    async with queue_of(local, under_way=RESERVED) as queue, asyncio.TaskGroup() as tasks:
+        for worth in (*RESERVED * [0], 1):
+            tasks.create_task(queue.send(partial(transaction, worth), priority=worth))
+        await until(lambda: len(sent) == RESERVED)
+        assert sorted(sent) == [*(RESERVED - 1) * [0], 1]
+        done.set()
+    assert len(sent) == RESERVED + 1
 
 
 async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> None:
