@@ -151,7 +151,7 @@ class Provider(Role):
         assert self._chain.account is not None
         await stack.enter_async_context(self._sent_orders)
         versions = OrderVersions(self._chain.node.timing.reorg_depth, self._sent_orders)
-        if self._sent_orders.left:
+        if self._sent_orders.left or self._sent_orders.contracts:
             nonce = await TransactionSender(self._chain.node, self._chain.account).last_nonce()
             versions.restore(nonce, await self._chain.block_number())
         return versions

@@ -70,6 +70,7 @@ class Settlement:
         assert chain.account is not None
         assert channel.address is not None
         self._chain = chain
+        self._account = chain.account.address
         self._lighthouse = channel.address
         self._book = book
         self._queue = queue
@@ -204,7 +205,9 @@ class Settlement:
             if error.reason == ORDER_USED or not await self._set_aside_unfunded(match, reason_of(error), str(error)):
                 await self._not_created(match, at_fault(match, error.reason, error.arguments), error)
         except (NodeUnreachable, RequestRefused, InputError) as error:
-            self._versions.failed(match, None, self.events.head)  # the node may have it
+            left = self._chain.node.pending_transactions(self._account).abandoned  # the node may have one of these
+            nonce = left[-1].nonce if left else None
+            self._versions.failed(match, nonce, self.events.head if nonce is None else None)
             await self._not_created(match, match, error)
         else:
             self._versions.sent(match, created.nonce)
@@ -214,7 +217,7 @@ class Settlement:
                 log.info("created, gas %(gas)d", facts, extra=log_event("contract-created", **facts))
             if not await self.events.is_confirmed(match, created.tx):
                 self._earnings.creation_reverted(created.liability, created.tx)
-                self._versions.failed(match, created.nonce, self.events.head)
+                self._versions.failed(match, created.nonce, None)
             self._put_back(match)
         finally:
             self._versions.ended(match, self.events.head)

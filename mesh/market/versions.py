@@ -48,13 +48,13 @@ def lasting_hash(order: Order) -> str:
 class _Undecided(NamedTuple):
     """A version with which a transaction may still succeed.
 
-    `block` decides once it is deep: the transaction's, or a later one, up to which it was not mined. `nonce` is the
-    transaction's; None if it is not known, or another account's.
+    `block` decides once it is deep: the transaction's, or a later one, at which its nonce was found used; None while it
+    was not. `nonce` is the transaction's; None if it is not known, or another account's.
     """
 
     identity: bytes
     """Empty: several versions."""
-    block: int
+    block: int | None
     nonce: int | None
 
 
@@ -62,7 +62,7 @@ class OrderVersions:
     """The versions of the orders that a provider has seen; the last `limit` of them.
 
     In generation 3 there is one of each. A reorganisation replaces up to `reorg_depth` blocks. `sent` keeps on disk
-    what is undecided, or was a short time ago.
+    what is undecided, or was a short time ago, and which versions became contracts.
     """
 
     def __init__(self, reorg_depth: int, sent: SentOrders | None = None, *, limit: int = LIMIT) -> None:
@@ -85,9 +85,12 @@ class OrderVersions:
 
     def restore(self, nonce: int, head: int) -> None:
         """Take over what an earlier process has left on disk: transactions with nonces up to `nonce`."""
+        for one in self._sent.contracts:
+            key = self._keys[one.identity] = one.lasting, one.signer
+            self._used[key] = one.identity
         for one in self._sent.left:
             key = self._keys[one.identity] = one.lasting, one.signer
-            self._suspect(key, one.identity, head + 1, nonce)
+            self._suspect(key, one.identity, None, nonce)
             self._ended[one.identity] = head
 
     def note(self, order: Verified[Order]) -> bytes | None:
@@ -132,7 +135,7 @@ class OrderVersions:
         for order in orders:
             key, identity = self._key_of(order), order_id(order)
             self._sending[key] = identity
-            kept.append(SentOrder(identity, *key))
+            kept.append(SentOrder(identity, *key, order.message.deadline))
         await self._sent.add(kept)
 
     def ended(self, orders: Iterable[Verified[Order]], head: int) -> None:
@@ -149,14 +152,16 @@ class OrderVersions:
         done = [identity for identity in deep if not self.is_undecided(identity, head)]
         for identity in done:
             del self._ended[identity]
-        await self._sent.remove(done)
+        # In generation 3 there are no other versions, and no signer in the key.
+        contracts = {one for one in done if (key := self._key(one))[1] and self._used.get(key) == one}
+        await self._sent.remove(done, contracts=contracts, head=head)
 
     def sent(self, orders: Iterable[Verified[Order]], nonce: int) -> None:
         """The account's transaction with this nonce had these orders, and was mined."""
         self._nonces.update((order_id(order), nonce) for order in orders)
 
-    def failed(self, orders: Iterable[Verified[Order]], nonce: int | None, block: int) -> None:
-        """The account's transaction with these orders failed or vanished, in a block or before it.
+    def failed(self, orders: Iterable[Verified[Order]], nonce: int | None, block: int | None) -> None:
+        """The account's transaction with these orders failed in a block or before it, or vanished (None).
 
         `nonce` is its nonce, None if it is not known.
         """
@@ -177,32 +182,37 @@ class OrderVersions:
         for key, one in list(self._undecided.items()):
             is_lost = mined == pending == one.nonce
             if one.nonce is not None and one.nonce >= mined and not is_lost:
-                self._undecided[key] = one._replace(block=head + 1)
+                self._undecided[key] = one._replace(block=None)
+            elif one.block is None:  # mined in this block, or in one before that was not looked at
+                self._undecided[key] = one._replace(block=head)
             elif not self._is_open(one, head):
                 del self._undecided[key]
 
     def reorganised(self, last: int, head: int) -> None:
         """The blocks after `last`, up to `head`, were replaced: their transactions are mined again in later ones."""
         for key, undecided in list(self._undecided.items()):
-            if undecided.block > last:
-                self._undecided[key] = undecided._replace(block=max(undecided.block, head + 1))
+            if undecided.block is not None and undecided.block > last:
+                block = max(undecided.block, head + 1) if undecided.nonce is None else None
+                self._undecided[key] = undecided._replace(block=block)
 
     def free(self, liability: str, head: int) -> None:
         """A reorganisation of the blocks up to `head` reverted the contract at an address."""
         for key in self._contracts.pop(liability, ()):
             if (identity := self._used.pop(key, None)) is not None:
-                self._suspect(key, identity, head + 1, self._nonces.get(identity))
+                nonce = self._nonces.get(identity)
+                self._suspect(key, identity, head + 1 if nonce is None else None, nonce)
 
-    def _suspect(self, key: _Key, identity: bytes, block: int, nonce: int | None) -> None:
+    def _suspect(self, key: _Key, identity: bytes, block: int | None, nonce: int | None) -> None:
         """A transaction with this version of an order may still succeed; see `_Undecided`."""
         before = self._undecided.get(key)
-        if before is not None and before.identity != identity and self._is_open(before, block):
+        if before is not None and before.identity != identity and (block is None or self._is_open(before, block)):
             nonces = [one for one in (before.nonce, nonce) if one is not None]
-            identity, block, nonce = b"", max(before.block, block), max(nonces, default=None)
+            block = None if block is None or before.block is None else max(before.block, block)
+            identity, nonce = b"", max(nonces, default=None)
         self._undecided[key] = _Undecided(identity, block, nonce)
 
     def _is_open(self, undecided: _Undecided, head: int) -> bool:
-        return undecided.block + self._depth > head
+        return undecided.block is None or undecided.block + self._depth > head
 
     def _key_of(self, order: Verified[Order]) -> _Key:
         identity = order_id(order)

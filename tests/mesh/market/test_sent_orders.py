@@ -15,8 +15,8 @@ from tests.support.disks import file_size_limit
 if TYPE_CHECKING:
     from pathlib import Path
 
-FIRST = SentOrder(b"1" * 52, "aa" * 32, "0xA")
-SECOND = SentOrder(b"2" * 52, "", "")
+FIRST = SentOrder(b"1" * 52, "aa" * 32, "0xA", 9)
+SECOND = SentOrder(b"2" * 52, "", "", 9)
 
 
 async def test_orders_are_there_after_a_restart_until_they_are_removed(tmp_path: Path) -> None:
@@ -38,6 +38,20 @@ async def test_orders_are_there_after_a_restart_until_they_are_removed(tmp_path:
     assert path.stat().st_mode & 0o777 == 0o600
 
 
+async def test_contracts_are_known_until_their_deadline(tmp_path: Path) -> None:
+    path, late = tmp_path / "sent.sqlite", SentOrder(b"3" * 52, "bb" * 32, "0xB", 2**256 - 1)
+    async with SentOrders(path) as sent:
+        await sent.add([FIRST, SECOND, late])
+        await sent.remove([FIRST.identity, SECOND.identity], contracts={FIRST.identity}, head=FIRST.deadline - 1)
+    async with SentOrders(path) as sent:
+        assert sent.contracts == (FIRST,)
+        assert sent.left == (late._replace(deadline=2**63 - 1),)
+        await sent.remove([late.identity], contracts={late.identity}, head=FIRST.deadline)
+    async with SentOrders(path) as sent:
+        assert [one.identity for one in sent.contracts] == [late.identity]
+        assert sent.left == ()
+
+
 async def test_without_a_path_nothing_is_kept() -> None:
     async with SentOrders() as sent:
         await sent.add([FIRST])
@@ -46,7 +60,7 @@ async def test_without_a_path_nothing_is_kept() -> None:
 
 
 async def test_many_writes_at_once(tmp_path: Path) -> None:
-    orders = [SentOrder(os.urandom(52), "", "") for _ in range(64)]
+    orders = [SentOrder(os.urandom(52), "", "", 9) for _ in range(64)]
     async with SentOrders(tmp_path / "sent.sqlite") as sent:
         await asyncio.gather(*(sent.add([order]) for order in orders))
         await asyncio.gather(*(sent.remove([order.identity]) for order in orders[1:]))
@@ -68,7 +82,7 @@ async def test_a_full_disk_is_reported_and_what_was_kept_stays(tmp_path: Path) -
     async with SentOrders(path) as sent:
         await sent.add([FIRST])
         with file_size_limit(1 << 16), pytest.raises(TransactionsNotKept):
-            await sent.add([SentOrder(os.urandom(52), "", "") for _ in range(4000)])
+            await sent.add([SentOrder(os.urandom(52), "", "", 9) for _ in range(4000)])
         await sent.add([SECOND])
     async with SentOrders(path) as sent:
         assert set(sent.left) == {FIRST, SECOND}

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tests.support.market import Place
 
 OBJECTIVE = cid_of_bytes(b"nobody's objective")
-SENT = SentOrder(b"\1" * 52, "lasting", PERSON.address)
+SENT = SentOrder(b"\1" * 52, "lasting", PERSON.address, 9)
 
 
 async def files_at(place: Place) -> ProviderFiles:
