@@ -150,6 +150,7 @@ async def test_a_place_that_becomes_free_goes_to_the_highest_priority_then(local
 
 
 async def test_a_place_is_kept_for_what_is_worth_something(local: LocalMarket) -> None:
+    await local.create_lighthouse(timeout_blocks=10, provider=RESERVED)
     sent: list[int] = []
     done = asyncio.Event()
 
