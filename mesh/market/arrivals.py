@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from mesh.flood import FairQueue
 
@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from mesh.market.settlement import Settlement
     from mesh.market.transaction_queue import TransactionQueue
     from mesh.network import Subscription
-    from schemas import Result, Verified
+    from schemas import Result, SignedMessage, Verified
+
+M = TypeVar("M", bound="SignedMessage")
 
 CHECKED: Final = 512
 """Orders whose makers' funds are asked for at once."""
@@ -27,6 +29,26 @@ RESULTS_OF_SIGNER: Final = 64
 """Results of one signer that wait for that …"""
 RESULTS: Final = 4096
 """… and results in all."""
+
+
+class _Waiting(Generic[M]):
+    """Messages that wait, with the subscriptions that they came from: those of `known` signers go first."""
+
+    def __init__(self, known: KnownSenders, drops: Drops, *, per_sender: int, total: int) -> None:
+        self._known = known
+        self._drops = drops
+        self._queue: FairQueue[tuple[Verified[M], Subscription[Any]]] = FairQueue(per_sender=per_sender, total=total)
+
+    def put(self, message: Verified[M], source: Subscription[Any]) -> None:
+        """Let a message wait; what is dropped for it is counted, and taken when it is sent again."""
+        is_known = message.signer in self._known
+        for dropped, subscription in self._queue.put(message.signer, (message, source), priority=int(is_known)):
+            self._drops.count("queue-full", dropped.signer)
+            subscription.forget(dropped)
+
+    async def get(self, limit: int) -> list[tuple[Verified[M], Subscription[Any]]]:
+        """Wait for the next messages, `limit` of them at most."""
+        return await self._queue.get_batch(limit)
 
 
 class OrderArrivals:
@@ -48,18 +70,15 @@ class OrderArrivals:
         self._settlement = settlement
         self._transactions = queue
         self._worth = worth
-        self._known = known
         self._drops = drops
-        self._arrived: FairQueue[tuple[Verified[Order], Subscription[Any]]] = FairQueue(
-            per_sender=WAITING, total=WAITING
-        )
-        self._held: FairQueue[tuple[Verified[Order], Subscription[Any]]] = FairQueue(per_sender=WAITING, total=WAITING)
+        self._arrived: _Waiting[Order] = _Waiting(known, drops, per_sender=WAITING, total=WAITING)
+        self._held: _Waiting[Order] = _Waiting(known, drops, per_sender=WAITING, total=WAITING)
 
     async def take(self, orders: Subscription[Any]) -> None:
         """Take the open orders of other providers, then those that are published, until cancelled."""
         await orders.recall()
         async for order in orders:
-            self._put(self._arrived, order, orders)
+            self._arrived.put(order, orders)
 
     async def run(self) -> None:
         """Pass on what was taken, until cancelled."""
@@ -69,19 +88,19 @@ class OrderArrivals:
 
     async def _pass_arrived(self) -> None:
         while True:
-            batch = await self._arrived.get_batch(CHECKED)
+            batch = await self._arrived.get(CHECKED)
             await asyncio.sleep(0)  # the transactions of the batch before enter the queue
             settled = []
             for order, orders in batch:
                 if self._transactions.has_room_for(self._worth(order.message)):
                     settled.append(order)
                 else:
-                    self._put(self._held, order, orders)
+                    self._held.put(order, orders)
             await self._pass(settled)
 
     async def _pass_held(self) -> None:
         while True:
-            batch = await self._held.get_batch(CHECKED)
+            batch = await self._held.get(CHECKED)
             await self._transactions.has_room()
             await self._pass([order for order, _ in batch])
 
@@ -95,17 +114,6 @@ class OrderArrivals:
             else:
                 self._settlement.add(order)
 
-    def _put(
-        self,
-        queue: FairQueue[tuple[Verified[Order], Subscription[Any]]],
-        order: Verified[Order],
-        orders: Subscription[Any],
-    ) -> None:
-        is_known = order.signer in self._known
-        for dropped, subscription in queue.put(order.signer, (order, orders), priority=int(is_known)):
-            self._drops.count("queue-full", dropped.signer)
-            subscription.forget(dropped)
-
 
 class ResultArrivals:
     """Takes results from a subscription (`take`), and passes them to `settlement`.
@@ -116,27 +124,20 @@ class ResultArrivals:
 
     def __init__(self, settlement: Settlement, *, known: KnownSenders, drops: Drops) -> None:
         self._settlement = settlement
-        self._known = known
-        self._drops = drops
-        self._unknown: FairQueue[tuple[Verified[Result], Subscription[Result]]] = FairQueue(
-            per_sender=RESULTS_OF_SIGNER, total=RESULTS
-        )
+        self._unknown: _Waiting[Result] = _Waiting(known, drops, per_sender=RESULTS_OF_SIGNER, total=RESULTS)
 
     async def take(self, results: Subscription[Result]) -> None:
         """Take what is published, until cancelled."""
         async for result in results:
-            if result.message.liability in self._settlement.events.open:
-                await self._settlement.results.add(result)
-                continue
-            is_known = result.signer in self._known
-            for dropped, subscription in self._unknown.put(result.signer, (result, results), priority=int(is_known)):
-                self._drops.count("queue-full", dropped.signer)
-                subscription.forget(dropped)
+            if (liability := self._settlement.events.open.get(result.message.liability)) is not None:
+                await self._settlement.results.settle(result, liability)
+            else:
+                self._unknown.put(result, results)
 
     async def run(self) -> None:
         """Look up the contracts of the others, until cancelled."""
         while True:
-            batch = [result for result, _ in await self._unknown.get_batch(LOOKED_UP)]
+            batch = [result for result, _ in await self._unknown.get(LOOKED_UP)]
             found = await self._settlement.events.liabilities([result.message.liability for result in batch])
             for result in batch:
                 await self._settlement.results.settle(result, found.get(result.message.liability))
