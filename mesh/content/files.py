@@ -186,7 +186,16 @@ def is_locked(path: Path) -> bool:
 
 def sync_directory(directory: Path) -> None:
     """Sync the names of the directory to the disk: a rename is durable only after this."""
-    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    _sync(directory, os.O_DIRECTORY)
+
+
+def sync_file(path: Path) -> None:
+    """Sync what was written to a file, by whomever."""
+    _sync(path, 0)
+
+
+def _sync(path: Path, flags: int) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | flags)
     try:
         os.fsync(descriptor)
     finally:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import sqlite3
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from typing import TYPE_CHECKING, Final, Self
 
-from mesh.content.files import sync_directory
+from mesh.content.files import sync_directory, sync_file
 from mesh.errors import AiraError
 from mesh.flood import Rate, RateLimiter
 from mesh.outage_log import OutageLog
@@ -253,9 +252,5 @@ class Withdrawals:
 
 def _sync(path: Path) -> None:
     """Sync what was committed to the database at `path`. It is in SQLite's log, or was synced when it left that."""
-    descriptor = os.open(path.with_name(f"{path.name}-wal"), os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    sync_file(path.with_name(f"{path.name}-wal"))
     sync_directory(path.parent)

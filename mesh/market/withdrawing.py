@@ -1,4 +1,4 @@
-"""Honouring withdrawals: a withdrawn order leaves the book, and its maker is told once that is promised."""
+"""What a provider does with a withdrawal: the order leaves the book, and its maker is told that it is not matched."""
 
 from __future__ import annotations
 
