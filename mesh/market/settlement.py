@@ -206,8 +206,7 @@ class Settlement:
                 await self._not_created(match, at_fault(match, error.reason, error.arguments), error)
         except (NodeUnreachable, RequestRefused, InputError) as error:
             left = self._chain.node.pending_transactions(self._account).abandoned  # the node may have one of these
-            nonce = left[-1].nonce if left else None
-            self._versions.failed(match, nonce, self.events.head if nonce is None else None)
+            self._versions.vanished(match, left[-1].nonce if left else None, self.events.head)
             await self._not_created(match, match, error)
         else:
             self._versions.sent(match, created.nonce)
@@ -217,7 +216,7 @@ class Settlement:
                 log.info("created, gas %(gas)d", facts, extra=log_event("contract-created", **facts))
             if not await self.events.is_confirmed(match, created.tx):
                 self._earnings.creation_reverted(created.liability, created.tx)
-                self._versions.failed(match, created.nonce, None)
+                self._versions.vanished(match, created.nonce, self.events.head)
             self._put_back(match)
         finally:
             self._versions.ended(match, self.events.head)

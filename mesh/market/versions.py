@@ -90,7 +90,7 @@ class OrderVersions:
             self._used[key] = one.identity
         for one in self._sent.left:
             key = self._keys[one.identity] = one.lasting, one.signer
-            self._suspect(key, one.identity, None, nonce)
+            self._wait(key, one.identity, nonce, head)
             self._ended[one.identity] = head
 
     def note(self, order: Verified[Order]) -> bytes | None:
@@ -160,13 +160,18 @@ class OrderVersions:
         """The account's transaction with this nonce had these orders, and was mined."""
         self._nonces.update((order_id(order), nonce) for order in orders)
 
-    def failed(self, orders: Iterable[Verified[Order]], nonce: int | None, block: int | None) -> None:
-        """The account's transaction with these orders failed in a block or before it, or vanished (None).
+    def failed(self, orders: Iterable[Verified[Order]], nonce: int, block: int) -> None:
+        """The account's transaction with these orders and this nonce failed, in a block or before it."""
+        for order in orders:
+            self._suspect(self._key_of(order), order_id(order), block, nonce)
+
+    def vanished(self, orders: Iterable[Verified[Order]], nonce: int | None, head: int) -> None:
+        """The account's transaction with these orders is not mined at block `head`, and may be later.
 
         `nonce` is its nonce, None if it is not known.
         """
         for order in orders:
-            self._suspect(self._key_of(order), order_id(order), block, nonce)
+            self._wait(self._key_of(order), order_id(order), nonce, head)
 
     def need_count(self) -> bool:
         """Whether `counted` must be called at the next block."""
@@ -199,8 +204,11 @@ class OrderVersions:
         """A reorganisation of the blocks up to `head` reverted the contract at an address."""
         for key in self._contracts.pop(liability, ()):
             if (identity := self._used.pop(key, None)) is not None:
-                nonce = self._nonces.get(identity)
-                self._suspect(key, identity, head + 1 if nonce is None else None, nonce)
+                self._wait(key, identity, self._nonces.get(identity), head + 1)
+
+    def _wait(self, key: _Key, identity: bytes, nonce: int | None, block: int) -> None:
+        """A transaction with this version is not mined; if its `nonce` is not known, `block` decides."""
+        self._suspect(key, identity, block if nonce is None else None, nonce)
 
     def _suspect(self, key: _Key, identity: bytes, block: int | None, nonce: int | None) -> None:
         """A transaction with this version of an order may still succeed; see `_Undecided`."""
