@@ -135,15 +135,16 @@ async def random_signatures(attacker: Attacker) -> None:
     await attacker.put_all(attacker.wire([one()])[0] for _ in itertools.count())
 
 
+def offer_of(terms: Demand) -> Offer:
+    """An unsigned offer that matches a demand."""
+    shared = {name: getattr(terms, name) for name in terms.__struct_fields__ if name != "validator_fee"}
+    return Offer(**shared | {"nonce": secrets.token_hex(32)}, lighthouse_fee=0)
+
+
 def pairs(attacker: Attacker, cost: int) -> list[Demand | Offer]:
     """Demands and offers that match, by fresh keys."""
-    messages = []
-    for _ in range(PREPARED // 2):
-        terms = attacker.demand(cost=cost)
-        shared = {name: getattr(terms, name) for name in terms.__struct_fields__ if name != "validator_fee"}
-        offer = Offer(**shared | {"nonce": secrets.token_hex(32)}, lighthouse_fee=0)
-        messages += [sign(terms), sign(offer)]
-    return messages
+    demands = [attacker.demand(cost=cost) for _ in range(PREPARED // 2)]
+    return [sign(message) for demand in demands for message in (demand, offer_of(demand))]
 
 
 @flood
@@ -169,11 +170,7 @@ async def unknown_results(attacker: Attacker) -> None:
 @flood
 async def free_offers(attacker: Attacker) -> None:
     """Offers of fresh keys that cost nothing and match nothing, more than an order book holds."""
-    offers = []
-    for _ in range(4 * PREPARED):
-        terms = attacker.demand()
-        shared = {name: getattr(terms, name) for name in terms.__struct_fields__ if name != "validator_fee"}
-        offers.append(sign(Offer(**shared, lighthouse_fee=0)))
+    offers = (sign(offer_of(attacker.demand())) for _ in range(4 * PREPARED))
     await attacker.put_again_and_again(attacker.wire(offers))
 
 
