@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from sys import intern
-from typing import TYPE_CHECKING, ClassVar, Final, Literal, NoReturn, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, NoReturn, TypeAlias, TypeVar, final
 
 from msgspec import Struct
 from msgspec.structs import force_setattr, replace
@@ -25,7 +25,15 @@ from schemas.address import parse_address, parse_address_or_name
 from schemas.cid import parse_cid
 from schemas.errors import InvalidAddress, InvalidCid, InvalidMessage
 from schemas.keys import MarketKind  # msgspec reads the annotations
-from schemas.message_fields import are_canonical, check_uint256, hex_digits, set_address, set_hash, set_signature
+from schemas.message_fields import (
+    are_canonical,
+    are_uint256,
+    check_uint256,
+    hex_digits,
+    set_address,
+    set_hash,
+    set_signature,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -87,7 +95,8 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
         """The generation of the message format: 5 if the order has a sender, else 3."""
         return 3 if self.sender is None else 5
 
-    def __post_init__(self) -> None:
+    def _check(self, fee_field: str, fee: int) -> None:
+        """Check all fields, and bring them to their canonical form."""
         try:
             model, token, lighthouse, validator = _market_fields(
                 self.model, self.token, self.lighthouse, self.validator
@@ -101,8 +110,9 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
         force_setattr(self, "token", token)
         force_setattr(self, "lighthouse", lighthouse)
         force_setattr(self, "validator", validator)
-        check_uint256("cost", self.cost)
-        check_uint256("deadline", self.deadline)
+        if not are_uint256(self.cost, self.deadline, fee):
+            for field, value in (("cost", self.cost), ("deadline", self.deadline), (fee_field, fee)):
+                check_uint256(field, value)
         nonce, signature = self.nonce, self.signature
         is_long = self.sender is None and len(signature) == 130
         if is_long and isinstance(nonce, str) and len(nonce) == 64 and are_canonical(nonce, signature):
@@ -124,6 +134,7 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
             force_setattr(self, "nonce", digits)
 
 
+@final
 class Demand(_Order, frozen=True, kw_only=True):
     """A promisee's order: it pays `cost` of `token` for doing `objective` by `model` before `deadline`.
 
@@ -137,10 +148,10 @@ class Demand(_Order, frozen=True, kw_only=True):
     validator_fee: int
 
     def __post_init__(self) -> None:
-        _Order.__post_init__(self)
-        check_uint256("validatorFee", self.validator_fee)
+        self._check("validatorFee", self.validator_fee)
 
 
+@final
 class Offer(_Order, frozen=True, kw_only=True):
     """A promisor's order: it does `objective` by `model` for `cost` of `token`.
 
@@ -153,10 +164,10 @@ class Offer(_Order, frozen=True, kw_only=True):
     lighthouse_fee: int
 
     def __post_init__(self) -> None:
-        _Order.__post_init__(self)
-        check_uint256("lighthouseFee", self.lighthouse_fee)
+        self._check("lighthouseFee", self.lighthouse_fee)
 
 
+@final
 class Withdrawal(_Message, frozen=True, kw_only=True, rename={"order": "withdraws"}):
     """A maker's statement that its order must not become a contract any more.
 
@@ -184,6 +195,7 @@ class Withdrawal(_Message, frozen=True, kw_only=True, rename={"order": "withdraw
         set_signature(self, self.signature)
 
 
+@final
 class Result(_Message, frozen=True, kw_only=True):
     """A promisor's report: `result` is the CID of the recording, `success` whether the job was done.
 

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from schemas.address import ZERO_ADDRESS, checksum_address, keccak256
 from schemas.errors import InputError, InvalidMessage, InvalidRecord
 from schemas.message_fields import SIGNATURE_SIZE, hex_digits
-from schemas.messages import Demand, Offer, OrderFeedback, SignedMessage, TransactionFeedback
+from schemas.messages import OrderFeedback, SignedMessage, TransactionFeedback
 from schemas.records import Record
 from schemas.secp256k1 import CONTEXT, ORDER, ffi, is_private_key, lib, point_of, public_key, sign_recoverable
 from schemas.wire import decode, message_hash
@@ -263,10 +263,9 @@ def is_word(text: str) -> bool:
 
 
 def _check_sender(message: SignedMessage, signer: str) -> None:
-    if isinstance(message, (Demand, Offer)) and message.sender is not None and message.sender != signer:
-        raise InvalidMessage(
-            "sender", f"the order names {message.sender} as its sender, but the key is that of {signer}"
-        )
+    sender = getattr(message, "sender", None)
+    if sender is not None and sender != signer:
+        raise InvalidMessage("sender", f"the order names {sender} as its sender, but the key is that of {signer}")
 
 
 @lru_cache(maxsize=_CACHED)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from schemas import InputError, InvalidCid, cid_of_digest, format_cid, parse_cid
+from schemas import InputError, InvalidCid, cid, cid_of_digest, format_cid, parse_cid
 from schemas.cid import decode_base58, encode_base58, parse_ahead
 
 EMPTY_FILE = "QmbFMke1KXqnYyBBWxB74N4c5SBnJMVAiMNRcGu6x1AwQH"
@@ -64,7 +64,7 @@ def test_parsing_ahead_changes_nothing(texts: list[str]) -> None:
 
 
 def _parsed(text: str) -> bytes | None:
-    parse_cid.cache_clear()
+    cid._parse.cache_clear()
     with suppress(InvalidCid):
         return parse_cid(text)
     return None
