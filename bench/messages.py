@@ -48,10 +48,12 @@ BAR: Final = 0.70
 PROGRESS_KEY: Final = "aira/bench/progress"
 EVERY: Final = 256
 """Messages between two progress reports of the receiver."""
-INTERLUDE: Final = 1024
-"""Messages between two measurements of `EVERY` bare recoveries."""
-REST: Final = 0.1
-"""Seconds before such a measurement."""
+INTERLUDE: Final = 512
+"""Messages between two measurements of bare recoveries."""
+BARE: Final = 128
+"""Recoveries in each of them."""
+REST: Final = 0.15
+"""Seconds before such a measurement: the pump has verified all that is in flight by then."""
 PREFIX: Final = b"\x19Ethereum Signed Message:\n32"
 
 
@@ -86,7 +88,7 @@ async def _publish(endpoint: str, count: int, ready: Any) -> None:
 
 async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, float]:
     """Verified messages, and bare recoveries, per second of this process's time."""
-    received, latest, bare = 0, deque[Demand](maxlen=EVERY), 0.0
+    received, latest, bare = 0, deque[Demand](maxlen=BARE), 0.0
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
         Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
@@ -113,7 +115,7 @@ async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, float]:
         statistics = demands.statistics()
     assert not statistics.invalid, statistics
     assert not statistics.dropped, statistics
-    return received / seconds, received // INTERLUDE * EVERY / bare
+    return received / seconds, received // INTERLUDE * BARE / bare
 
 
 def recover_bare(demands: Iterable[Demand]) -> float:
