@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from schemas.loading import on_demand
 
 if TYPE_CHECKING:
-    from mesh.network.channel import Channel, Subscription
+    from mesh.network.channel import Channel
     from mesh.network.connecting import NotAdmitted
     from mesh.network.endpoints import Endpoints, free_endpoint
     from mesh.network.presence import PresentAgents
@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     from mesh.network.readings import Reading, ReadingSubscription
     from mesh.network.services import ServiceFailed, Services, call
     from mesh.network.session import Network, NetworkChange
+    from mesh.network.subscription import Subscription
     from mesh.network.tls import Tls
     from mesh.network.validation import MessageValidator, ValidationStatistics, message_key
 
 _NAMES: Final = {
-    "mesh.network.channel": "Channel Subscription",
+    "mesh.network.channel": "Channel",
     "mesh.network.connecting": "NotAdmitted",
     "mesh.network.endpoints": "Endpoints free_endpoint",
     "mesh.network.presence": "PresentAgents",
@@ -27,6 +28,7 @@ _NAMES: Final = {
     "mesh.network.readings": "Reading ReadingSubscription",
     "mesh.network.services": "ServiceFailed Services call",
     "mesh.network.session": "Network NetworkChange",
+    "mesh.network.subscription": "Subscription",
     "mesh.network.tls": "Tls",
     "mesh.network.validation": "MessageValidator ValidationStatistics message_key",
 }

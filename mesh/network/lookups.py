@@ -1,4 +1,4 @@
-"""What validation asks the chain: ENS names, whose addresses are kept for a while, and validators of orders."""
+"""What validation knows of the market and asks its chain: ENS names, deadlines, and validators of orders."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeVar
 from mesh.clock import SYSTEM_CLOCK
 from mesh.errors import InvalidMessage
 from mesh.flood import BoundedDict
-from schemas import SignedMessage, names_in
+from schemas import ZERO_ADDRESS, Demand, Offer, Result, SignedMessage, Withdrawal, names_in
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=SignedMessage)
 
+AMBIGUOUS_NONCE: Final = "00" * 12
+"""No nonce of generation 3 may start like this: the contracts would read it as a generation-5 order."""
 KEPT: Final = 60.0
 """Seconds for which the address of a name is used."""
 FAILURE_KEPT: Final = 10.0
@@ -50,6 +52,37 @@ class ValidatorCheck(Protocol):
 
     async def is_safe(self, validator: str) -> bool:
         """The same, asked. Raises `ChainError`."""
+
+
+class MarketRules:
+    """What the orders and withdrawals of a market must fit; parameters as of `MessageValidator`. Thread-safe."""
+
+    def __init__(self, address: str | None, head: Callable[[], int], validators: ValidatorCheck | None) -> None:
+        self._address = address
+        self._head = head
+        self._validators = validators
+
+    def check(self, order: SignedMessage) -> bool:
+        """Whether nothing has to be asked about its validator. Raises `InvalidMessage` for what can't be used."""
+        if type(order) is Result:  # so written, because an `isinstance` that fails is slow
+            return True
+        if type(order) is not Withdrawal and order.sender is None and str(order.nonce).startswith(AMBIGUOUS_NONCE):
+            raise InvalidMessage("nonce", "the contracts would take it for the sender of a generation-5 order")
+        if (head := self._head()) and order.deadline <= head:
+            raise InvalidMessage("deadline", f"block {order.deadline} has passed")
+        if self._address is not None and order.lighthouse != self._address:
+            raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
+        if self._validators is None or type(order) is Withdrawal or order.validator == ZERO_ADDRESS:
+            return True
+        is_safe = self._validators.known(order.validator)
+        if is_safe is False:
+            raise InvalidMessage("validator", f"{order.validator} is a lighthouse, or could become one")
+        return is_safe is not None
+
+    async def ask(self, message: SignedMessage) -> None:
+        """Ask about the validator of an order, so that `check` knows it afterwards. Raises `AiraError`."""
+        if self._validators is not None and isinstance(message, Demand | Offer):
+            await self._validators.is_safe(message.validator)
 
 
 class NameCache:

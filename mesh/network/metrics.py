@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from mesh.flood import Drops
-    from mesh.network.channel import Subscription
     from mesh.network.session import Network
+    from mesh.network.subscription import Subscription
     from mesh.network.validation import ValidationStatistics
 
 

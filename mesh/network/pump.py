@@ -13,6 +13,7 @@ import logging
 import threading
 from collections import deque
 from contextlib import suppress
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 
 import zenoh
@@ -35,7 +36,9 @@ RING_CAPACITY: Final = 8192
 """Samples that the ring holds before it drops the oldest."""
 RING_BYTES: Final = 8 * 1024 * 1024
 """Bytes of payloads that the ring holds before it drops the oldest."""
-BATCH: Final = 256
+TOGETHER: Final = 64
+"""Samples that are taken out of Zenoh's queue together; each may keep 64 KiB alive."""
+BATCH: Final = 512
 """Samples converted for one call into the loop, at most."""
 BATCHES_IN_FLIGHT: Final = 2
 """Batches between the pump's thread and the consumer, at most."""
@@ -45,14 +48,17 @@ RESENT_QUEUE: Final = 2048
 """The same for what is sent again; while it is full, Zenoh drops the oldest."""
 SLOT_WAIT: Final = 0.002
 """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
+LONGEST_SLOT_WAIT: Final = 0.016
+"""The same while Zenoh's queue stays empty, at most."""
 
 
 class Pump(Generic[T]):
     """An async iterator over the converted samples on `selector`: `async with Pump(session, selector, convert)`.
 
     `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, pass two functions
-    instead: `copy` takes what is needed out of a sample, and `convert_all` makes items of up to `BATCH` copies and
-    yields some of them every few milliseconds, so that the thread can empty Zenoh's queue in between. They run on the
+    instead: `copy_all` takes what is needed out of some samples (None to skip one), and `convert_all` makes items of up
+    to `BATCH` copies and yields some of them every few milliseconds, so that the thread can empty Zenoh's queue in
+    between. They run on the
     pump's thread; the iterator raises what they raise. Items arrive in order, except copies, and what `ReceiveRing`
     takes out of order in a flood. `capacity` and `capacity_bytes` bound the ring. Samples of more than `payload_limit`
     bytes are refused. `drops` counts what is dropped or refused. `declare` declares another subscriber than a plain
@@ -68,7 +74,7 @@ class Pump(Generic[T]):
         selector: str,
         convert: Callable[[zenoh.Sample], T | None] | None = None,
         *,
-        copy: Callable[[zenoh.Sample], Any] | None = None,
+        copy_all: Callable[[list[zenoh.Sample]], list[Any]] | None = None,
         convert_all: Callable[[list[Any]], Iterable[list[T]]] | None = None,
         capacity: int = RING_CAPACITY,
         capacity_bytes: int = RING_BYTES,
@@ -82,7 +88,8 @@ class Pump(Generic[T]):
         self._declare = session.declare_subscriber if declare is None else declare
         self.selector: Final = selector
         """The key expression that is subscribed to."""
-        self._copy: Any = copy if convert is None else convert
+        self._convert = convert
+        self._copy_all = copy_all or self._convert_each
         self._convert_all: Callable[[list[Any]], Iterable[list[T]]] = convert_all or (lambda copies: (copies,))
         self._payload_limit = payload_limit
         self._drops = Drops() if drops is None else drops
@@ -162,7 +169,7 @@ class Pump(Generic[T]):
         if self._payload_limit is not None and len(sample.payload) > self._payload_limit:
             self._drops.count("too-large")
             return None
-        return self._copy(sample)
+        return next(iter(self._copy_all([sample])), None)
 
     def feed(self, copies: list[Any]) -> None:
         """Convert and deliver what `copy` returned, beside the ring, on any thread, without waiting."""
@@ -181,9 +188,10 @@ class Pump(Generic[T]):
 
     def _run(self, loop: asyncio.AbstractEventLoop, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         try:
+            wait = SLOT_WAIT
             while not self._stopping:
-                self._take(queue, wait=True)
-                if self._ring and self._slots.acquire(timeout=SLOT_WAIT):
+                wait = SLOT_WAIT if self._take(queue, wait=True) else min(2 * wait, LONGEST_SLOT_WAIT)
+                if self._ring and self._slots.acquire(timeout=wait):
                     self._deliver_batch(loop, queue)
         except zenoh.ZError:  # the queue was closed, which ends the thread
             if not self._stopping:
@@ -196,36 +204,48 @@ class Pump(Generic[T]):
                 while True:
                     queue.recv()
 
-    def _take(self, queue: zenoh.handlers.Handler[zenoh.Sample], *, wait: bool) -> None:
-        """Move samples from Zenoh's queue into the ring; `wait` for one when both are empty."""
+    def _take(self, queue: zenoh.handlers.Handler[zenoh.Sample], *, wait: bool) -> int:
+        """Move samples from Zenoh's queue into the ring; `wait` for one when both are empty. Returns how many came."""
         if self._copy_failure is not None:
             if wait and not self._ring:
                 raise self._copy_failure
-            return
-        ring, limit = self._ring, self._payload_limit
-        sample = queue.recv() if wait and not ring else queue.try_recv()
-        dropped = received = refused = 0
+            return 0
+        sample = queue.recv() if wait and not self._ring else queue.try_recv()
+        taken = 0
         while sample is not None:
-            received += 1
-            size = len(sample.payload)
-            if limit is not None and size > limit:
-                refused += 1
-            else:
-                try:
-                    copied = self._copy(sample)
-                except Exception as error:  # raised once the samples before it are converted
-                    self._copy_failure = error
-                    break
-                dropped += 0 if copied is None else ring.append(copied, size)
-            sample = queue.try_recv() if received < RING_CAPACITY else None
-        sending.received(self._session)
+            samples = [sample, *islice(iter(queue.try_recv, None), TOGETHER - 1)]
+            self._store(samples)
+            taken += len(samples)
+            is_more = len(samples) == TOGETHER and taken < RING_CAPACITY and self._copy_failure is None
+            sample = queue.try_recv() if is_more else None
+        if taken:
+            sending.received(self._session)
+        return taken
+
+    def _store(self, samples: list[zenoh.Sample]) -> None:
+        """Copy samples into the ring. Each step is taken for all, because its code is in the CPU's caches then."""
+        received, limit = len(samples), self._payload_limit
+        sizes = [len(sample.payload) for sample in samples]
+        if limit is not None and max(sizes) > limit:
+            samples = [sample for sample, size in zip(samples, sizes, strict=True) if size <= limit]
+            sizes = [size for size in sizes if size <= limit]
+            self._drops.count("too-large", number=received - len(samples))
+        dropped = self._ring.extend(self._copy_all(samples), sizes)
         with self._lock:
             self.received += received
             self.dropped += dropped
         if dropped:
             self._drops.count("overflow", number=dropped)
-        if refused:
-            self._drops.count("too-large", number=refused)
+
+    def _convert_each(self, samples: list[zenoh.Sample]) -> list[T | None]:
+        """What `convert` makes of samples. An error is raised once the samples before it are converted."""
+        assert self._convert is not None, "a pump needs `convert` or `copy_all`"
+        converted: list[T | None] = []
+        try:
+            converted.extend(map(self._convert, samples))
+        except Exception as error:
+            self._copy_failure = error
+        return converted
 
     def _deliver_batch(self, loop: asyncio.AbstractEventLoop, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Convert up to a batch of samples, emptying Zenoh's queue in between, and pass them to the loop."""

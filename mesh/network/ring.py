@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.flood import forget_oldest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 REMEMBERED: Final = 65_536
 """Items that the ring remembers, at most; half of them at least."""
@@ -16,7 +19,8 @@ IN_ORDER: Final = 2048
 
 
 class _Lane(deque[tuple[Any, int]]):
-    """Items with their sizes in bytes; the oldest are dropped beyond the bounds, but never the last one.
+    """Items with their sizes in bytes, and their total `size`. The oldest are trimmed beyond the bounds, but never the
+    last one.
 
     While more than `in_order` wait, the newest go first.
     """
@@ -28,10 +32,8 @@ class _Lane(deque[tuple[Any, int]]):
         self._in_order = in_order
         self.size = 0
 
-    def add(self, item: Any, size: int) -> int:
-        """Add an item; returns how many were dropped for it."""
-        self.append((item, size))
-        self.size += size
+    def trim(self) -> int:
+        """Drop what is beyond the bounds; returns how many."""
         before = len(self)
         while len(self) > self._capacity or (self.size > self._capacity_bytes and len(self) > 1):
             self.size -= self.popleft()[1]
@@ -67,16 +69,21 @@ class ReceiveRing:
     def __len__(self) -> int:
         return sum(map(len, self._lanes))
 
-    def append(self, item: Any, size: int) -> int:
-        """Add an item of `size` bytes; returns how many were dropped for it."""
-        if not self._second_chance:
-            return self._lanes[0].add(item, size)
-        copies, number = self._copies, hash(item)
-        lane = copies.pop(number, 0)
-        copies[number] = lane + 1 if lane < COPIES - 1 else lane
-        if len(copies) > REMEMBERED:
-            forget_oldest(copies, REMEMBERED)
-        return self._lanes[lane].add(item, size)
+    def extend(self, items: Iterable[Any], sizes: Iterable[int]) -> int:
+        """Add items of these sizes in bytes, except None; returns how many were dropped for them."""
+        number, copies, lanes, second_chance = 0, self._copies, self._lanes, self._second_chance
+        for item, size in zip(items, sizes, strict=False):  # there are fewer items if the conversion of one failed
+            if item is None:
+                continue
+            if second_chance:
+                key = hash(item)
+                number = copies.pop(key, 0)
+                copies[key] = number + 1 if number < COPIES - 1 else number
+            lane = lanes[number]
+            lane.append((item, size))
+            lane.size += size
+        forget_oldest(copies, REMEMBERED)
+        return sum([lane.trim() for lane in lanes])
 
     def take(self, number: int) -> list[Any]:
         """Remove up to `number` items."""

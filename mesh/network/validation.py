@@ -10,27 +10,15 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final, Generic
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 import msgspec
 
 from mesh.clock import SYSTEM_CLOCK
 from mesh.errors import AiraError, InvalidMessage
 from mesh.flood import forget_oldest
-from mesh.network.lookups import M, NameCache, Unresolved
-from schemas import (
-    ZERO_ADDRESS,
-    Demand,
-    Offer,
-    Result,
-    SignedMessage,
-    Verified,
-    Withdrawal,
-    decode,
-    message_hash,
-    names_in,
-    resolve_names,
-)
+from mesh.network.lookups import M, MarketRules, NameCache, Unresolved
+from schemas import SignedMessage, Verified, decode, message_hash, names_in, resolve_names
 from schemas.keys import market_key
 from schemas.signing import SignedDigest, recover_keys, signed_digest, verify_recovered
 from schemas.wire import parse_cids_ahead
@@ -44,13 +32,15 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-AMBIGUOUS_NONCE: Final = "00" * 12
-"""No nonce of generation 3 may start like this: the contracts would read it as a generation-5 order."""
+T = TypeVar("T")
+U = TypeVar("U")
+
 DEDUPLICATION_LIMIT: Final = 65_536
 """Accepted messages that a validator remembers, to drop duplicates."""
 SLICE: Final = 128
 """Signatures verified at a time: some seven milliseconds."""
 _DOT, _BACKSLASH = b".\\"
+_UNSIGNED: Final[SignedDigest] = (b"", b"", 0)
 
 
 def message_key(lighthouse: str, message: SignedMessage) -> str:
@@ -69,19 +59,25 @@ class ValidationStatistics(msgspec.Struct, frozen=True, kw_only=True):
     dropped: int
 
 
-class _Prepared(msgspec.Struct, Generic[M], frozen=True, gc=False):
+class _Candidate(msgspec.Struct, Generic[M], gc=False):
     """A message whose signature is not checked yet. `identity` is the same for copies, `fingerprint` for equal bytes.
 
-    `is_complete`: the chain need not be asked about it.
+    `is_complete`: the chain need not be asked about it. What follows `fingerprint` is filled in step by step.
     """
 
     message: M
     key: str
     fingerprint: int
-    hash: bytes
-    identity: int
-    is_complete: bool
-    signed: SignedDigest
+    hash: bytes = b""
+    identity: int = 0
+    is_complete: bool = False
+    signed: SignedDigest = _UNSIGNED
+
+
+def _sign(candidate: _Candidate[M]) -> _Candidate[M]:
+    """Check the form of the signature, and hash what was signed."""
+    candidate.signed = signed_digest(candidate.hash, candidate.message.signature)
+    return candidate
 
 
 class MessageValidator(Generic[M]):
@@ -93,8 +89,9 @@ class MessageValidator(Generic[M]):
     Thread-safe, except `complete`.
 
     A message is a duplicate if its hash and signature equal those of one of the last accepted messages
-    (`deduplication_limit` at most, half of that at least) that were not forgotten since; equal generation-3 terms from
-    two signers are two messages. A copy with the same bytes is recognized before it is decoded. Consumers hold a
+    (`deduplication_limit` at most, half of that at least) that were not forgotten since, or of one that is checked
+    together with it; equal generation-3 terms from two signers are two messages. A copy of an accepted message with the
+    same bytes is recognized before it is decoded. Consumers hold a
     message until the chain has confirmed its effect, or `forget` it, and then the sender's next copy gets through.
     """
 
@@ -113,10 +110,8 @@ class MessageValidator(Generic[M]):
     ) -> None:
         self.kind: type[M] = kind
         self._lighthouse = lighthouse
-        self._address = address
-        self._head = head
+        self._rules = MarketRules(address, head, validators)
         self._names = None if resolver is None else NameCache(resolver)
-        self._validators = validators
         self._blocked = blocked
         self._lock = threading.Lock()
         self._clock = clock
@@ -129,81 +124,105 @@ class MessageValidator(Generic[M]):
         self._duplicate = 0
         self._accepted = 0
 
-    def is_copy(self, payload: bytes) -> bool:
-        """Whether an accepted message had the same bytes: a duplicate, which is counted, and need not be checked."""
+    def without_copies(self, received: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes] | None]:
+        """Keys and payloads; None instead of one whose bytes an accepted message had: a duplicate, which is counted."""
         if self._forgetting:
             self._forget_due()
-        if hash(payload) not in self._seen:
-            return False
-        self._count_duplicate()
-        return True
+        seen = self._seen
+        new = [None if hash(each[1]) in seen else each for each in received]
+        if copies := sum([each is None for each in new]):
+            self._count_duplicates(copies)
+        return new
 
     def check_all(self, received: Iterable[tuple[str, bytes]]) -> Iterator[list[Verified[M] | Unresolved[M]]]:
         """The verified or `Unresolved` messages of keys and payloads, some every few milliseconds; others are counted.
 
-        All are decoded before signatures are verified: each is twice as fast while its code stays in the CPU's caches.
+        Each step is taken for all before the next one: a step is faster while its code stays in the CPU's caches.
         """
         received = list(received)
         parse_cids_ahead((payload for _, payload in received), self.kind)
-        prepared = [each for key, payload in received if (each := self._prepare(key, payload)) is not None]
-        for start in range(0, len(prepared), SLICE):
-            yield self._verify_all(prepared[start : start + SLICE])
+        decoded = self._passing(self._decode, received)
+        candidates = [each for each in decoded if type(each) is _Candidate]
+        if len(candidates) < len(decoded):
+            yield [each for each in decoded if type(each) is Unresolved]
+        candidates = self._distinct(self._passing(self._hash, candidates))
+        for start in range(0, len(candidates), SLICE):
+            yield self._verify_all(candidates[start : start + SLICE])
 
-    def _prepare(self, key: str, payload: bytes) -> _Prepared[M] | Unresolved[M] | None:
-        """Everything but the signature."""
-        fingerprint = hash(payload)
-        if fingerprint in self._seen:
-            self._count_duplicate()
-            return None
-        try:
-            message = decode(payload, self.kind)
-            if not isinstance(message, self.kind):
-                raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self.kind.__name__}")
-            # A name has a dot, which JSON may write with a backslash.
-            if (_DOT in payload or _BACKSLASH in payload) and (names := names_in(message)):
-                if self._names is None:
-                    raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
-                if (addresses := self._names.known(names)) is None:
-                    return Unresolved(message, key, fingerprint)
-                message = resolve_names(message, addresses)
-            return self._hashed(message, key, fingerprint)
-        except InvalidMessage as error:
-            self.reject(error.reason)
-            return None
+    def _passing(self, step: Callable[[T], U | None], items: Iterable[T]) -> list[U]:
+        """What a step makes of items, without those that it rejects, which are counted, or leaves out."""
+        passed: list[U] = []
+        for item in items:
+            try:
+                if (found := step(item)) is not None:
+                    passed.append(found)
+            except InvalidMessage as error:
+                self.reject(error.reason)
+        return passed
 
-    def _verify_all(self, prepared: list[_Prepared[M] | Unresolved[M]]) -> list[Verified[M] | Unresolved[M]]:
-        """Verify signatures: that of each message once, even if copies of it come together."""
-        seen = self._seen
-        signed = {
-            each.identity: each.signed for each in prepared if type(each) is _Prepared and each.identity not in seen
-        }
-        keys = dict(zip(signed, recover_keys(signed.values()), strict=True))
+    def _decode(self, received: tuple[str, bytes]) -> _Candidate[M] | Unresolved[M] | None:
+        """The message in a payload, without names; None for a copy of an accepted message."""
+        key, payload = received
+        if (fingerprint := hash(payload)) in self._seen:
+            self._count_duplicates(1)
+            return None
+        message = decode(payload, self.kind)
+        if not isinstance(message, self.kind):
+            raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self.kind.__name__}")
+        # A name has a dot, which JSON may write with a backslash.
+        if (_DOT in payload or _BACKSLASH in payload) and (names := names_in(message)):
+            if self._names is None:
+                raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
+            if (addresses := self._names.known(names)) is None:
+                return Unresolved(message, key, fingerprint)
+            message = resolve_names(message, addresses)
+        return _Candidate(message, key, fingerprint)
+
+    def _hash(self, candidate: _Candidate[M]) -> _Candidate[M]:
+        """Check that the message fits its key and its market, and hash it."""
+        message = candidate.message
+        if candidate.key != message_key(self._lighthouse, message):
+            raise InvalidMessage("key", f"the message does not belong on {candidate.key}")
+        candidate.is_complete = self._rules.check(message)
+        candidate.hash = digest = message_hash(message)
+        candidate.identity = hash((digest, message.signature))
+        return candidate
+
+    def _distinct(self, candidates: list[_Candidate[M]]) -> list[_Candidate[M]]:
+        """Those that are no copies of others or of accepted messages, with what their keys are recovered from."""
+        new: dict[int, _Candidate[M]] = {}
+        for candidate in candidates:
+            if candidate.identity not in self._seen:
+                new.setdefault(candidate.identity, candidate)
+        self._count_duplicates(len(candidates) - len(new))
+        return self._passing(_sign, new.values())
+
+    def _verify_all(self, candidates: list[_Candidate[M]]) -> list[Verified[M] | Unresolved[M]]:
+        """Verify the signatures of `_distinct` candidates."""
+        keys = recover_keys([each.signed for each in candidates])
         with self._lock:
-            verified = [found for each in prepared if (found := self._verify(each, keys)) is not None]
-            forget_oldest(seen, self._remembered)
+            pairs = zip(candidates, keys, strict=True)
+            verified = [found for each, key in pairs if (found := self._verify(each, key)) is not None]
+            forget_oldest(self._seen, self._remembered)
         return verified
 
-    def _verify(
-        self, prepared: _Prepared[M] | Unresolved[M], keys: Mapping[int, bytes]
-    ) -> Verified[M] | Unresolved[M] | None:
-        """A message whose key was recovered, unless one like it was accepted before. Call it with the lock."""
-        if isinstance(prepared, Unresolved):
-            return prepared
-        identity, seen = prepared.identity, self._seen
-        if (key := keys.get(identity)) is None or identity in seen:
+    def _verify(self, candidate: _Candidate[M], key: bytes) -> Verified[M] | Unresolved[M] | None:
+        """A message whose key was recovered, unless one like it was accepted meanwhile. Call it with the lock."""
+        identity, seen = candidate.identity, self._seen
+        if identity in seen:
             self._duplicate += 1
             return None
         try:
-            verified = verify_recovered(prepared.message, prepared.hash, key)
+            verified = verify_recovered(candidate.message, candidate.hash, key)
         except InvalidMessage as error:
             self._invalid[error.reason] += 1
             return None
         if verified.signer in self._blocked:
             self._invalid["blocked"] += 1
             return None
-        if not prepared.is_complete:
-            return Unresolved(prepared.message, prepared.key, prepared.fingerprint, verified.signer)
-        seen[identity], seen[prepared.fingerprint] = prepared.fingerprint, identity
+        if not candidate.is_complete:
+            return Unresolved(candidate.message, candidate.key, candidate.fingerprint, verified.signer)
+        seen[identity], seen[candidate.fingerprint] = candidate.fingerprint, identity
         self._accepted += 1
         return verified
 
@@ -215,8 +234,8 @@ class MessageValidator(Generic[M]):
                 unresolved = outcome
                 addresses = await self._answers(unresolved.message)
                 message = resolve_names(unresolved.message, addresses)
-                prepared = self._hashed(message, unresolved.key, unresolved.fingerprint)
-                outcome = next(iter(self._verify_all([prepared])), None)
+                candidate = self._hash(_Candidate(message, unresolved.key, unresolved.fingerprint))
+                outcome = next(iter(self._verify_all(self._distinct([candidate]))), None)
         except InvalidMessage as error:
             self.reject(error.reason)
             return None
@@ -229,8 +248,8 @@ class MessageValidator(Generic[M]):
     async def _answers(self, message: SignedMessage) -> dict[str, str]:
         """The addresses of a message's names; if it has none, its validator is known afterwards. Raises `AiraError`."""
         names = names_in(message)
-        if not names and self._validators is not None and isinstance(message, Demand | Offer):
-            await self._validators.is_safe(message.validator)
+        if not names:
+            await self._rules.ask(message)
         return {} if self._names is None else await self._names.addresses(names)
 
     def reject(self, reason: str) -> None:
@@ -269,32 +288,6 @@ class MessageValidator(Generic[M]):
                 dropped=dropped,
             )
 
-    def _hashed(self, message: M, key: str, fingerprint: int) -> _Prepared[M]:
-        """A message without names, checked and hashed."""
-        if key != message_key(self._lighthouse, message):
-            raise InvalidMessage("key", f"the message does not belong on {key}")
-        digest = message_hash(message)
-        identity, is_complete = hash((digest, message.signature)), self._check_order(message)
-        signed = signed_digest(digest, message.signature)
-        return _Prepared(message, key, fingerprint, digest, identity, is_complete, signed)
-
-    def _check_order(self, order: SignedMessage) -> bool:
-        """Raise `InvalidMessage` for an order that can't be used; False if the chain has to be asked, too."""
-        if isinstance(order, Result):
-            return True
-        if isinstance(order, (Demand, Offer)) and order.sender is None and str(order.nonce).startswith(AMBIGUOUS_NONCE):
-            raise InvalidMessage("nonce", "the contracts would take it for the sender of a generation-5 order")
-        if (head := self._head()) and order.deadline <= head:
-            raise InvalidMessage("deadline", f"block {order.deadline} has passed")
-        if self._address is not None and order.lighthouse != self._address:
-            raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
-        if self._validators is None or isinstance(order, Withdrawal) or order.validator == ZERO_ADDRESS:
-            return True
-        is_safe = self._validators.known(order.validator)
-        if is_safe is False:
-            raise InvalidMessage("validator", f"{order.validator} is a lighthouse, or could become one")
-        return is_safe is not None
-
-    def _count_duplicate(self) -> None:
+    def _count_duplicates(self, number: int) -> None:
         with self._lock:
-            self._duplicate += 1
+            self._duplicate += number

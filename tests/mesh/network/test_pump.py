@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,10 @@ LAST = -1
 
 def number(sample: zenoh.Sample) -> int:
     return int(sample.payload.to_bytes())
+
+
+def numbers_of(samples: list[zenoh.Sample]) -> list[int]:
+    return list(map(number, samples))
 
 
 def put(session: zenoh.Session, *numbers: int) -> None:
@@ -140,7 +145,7 @@ async def test_expensive_conversions_get_copies_in_batches(here: zenoh.Session, 
         for value in copies:
             yield [value] if value % 2 else []
 
-    async with Pump(here, KEY, copy=number, convert_all=convert_all) as numbers:
+    async with Pump(here, KEY, copy_all=numbers_of, convert_all=convert_all) as numbers:
         await until_heard(there, KEY)
         put(there, *range(2000))
 
@@ -157,7 +162,7 @@ async def test_a_flood_of_what_is_sent_again_does_not_hold_up_other_keys(
         is_over.wait()
         yield copies
 
-    flooded = Pump(here, KEY, copy=number, convert_all=convert_all, resent=True)
+    flooded = Pump(here, KEY, copy_all=numbers_of, convert_all=convert_all, resent=True)
     async with flooded, Pump(here, "test/elsewhere", number) as others:
         await until_heard(there, KEY)
         await until_heard(there, "test/elsewhere")
@@ -276,11 +281,20 @@ async def test_no_thread_is_left_when_the_subscription_fails(here: zenoh.Session
 async def test_an_error_of_the_conversion_is_raised_after_the_samples_before_it(
     here: zenoh.Session, there: zenoh.Session
 ) -> None:
-    async with Pump(here, KEY, number) as numbers:
+    everything: list[zenoh.Sample] = []
+
+    def number_when_all_are_there(sample: zenoh.Sample) -> int:
+        value = number(sample)
+        while len(everything) < 4:
+            time.sleep(0.001)
+        return value
+
+    async with Pump(here, KEY, number_when_all_are_there) as numbers:
+        here.declare_subscriber(KEY, everything.append)
         await until_heard(there, KEY)
-        put(there, 1)
-        assert await take(numbers, 1) == [1]
+        put(there, 1, 2, 3)
         there.put(KEY, b"no number")
+        assert await take(numbers, 3) == [1, 2, 3]
 
         for _ in range(2):
             with pytest.raises(ValueError, match="no number"):

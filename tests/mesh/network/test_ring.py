@@ -15,7 +15,7 @@ def ring(capacity: int = 4, capacity_bytes: int = 1000, *, second_chance: bool =
 
 
 def fill(waiting: ReceiveRing, *items: Any, size: int = 1) -> int:
-    return sum(waiting.append(item, size) for item in items)
+    return waiting.extend(items, [size] * len(items))
 
 
 def test_the_oldest_are_dropped_beyond_the_number_and_the_bytes() -> None:
@@ -53,7 +53,7 @@ def test_an_honest_message_passes_any_flood_of_new_ones_with_its_second_copy() -
     waiting, passed = ring(64), []
     for number in range(1000):
         if number in (100, 120):
-            waiting.append("honest", 1)
+            fill(waiting, "honest")
         fill(waiting, *((number, each) for each in range(100)))
         passed += waiting.take(20)
 
@@ -64,7 +64,7 @@ def test_an_honest_message_passes_a_flood_of_second_copies_with_its_third() -> N
     waiting, passed = ring(64), []
     for number in range(1000):
         if number in (100, 110, 130):
-            waiting.append("honest", 1)
+            fill(waiting, "honest")
         for _ in range(2):
             fill(waiting, *((number, each) for each in range(50)))
         passed += waiting.take(20)
@@ -110,7 +110,7 @@ def test_nothing_is_lost_but_what_is_counted_and_the_bounds_hold(steps: list[Any
     for step in steps:
         if isinstance(step, tuple):
             added += 1
-            dropped += waiting.append(*step)
+            dropped += waiting.extend(*zip(step, strict=True))
         else:
             taken += len(waiting.take(step))
         assert len(waiting) <= 8

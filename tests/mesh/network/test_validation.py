@@ -187,17 +187,17 @@ def test_a_forgotten_message_is_accepted_once_more() -> None:
 def test_a_message_that_is_forgotten_later_is_a_duplicate_until_then() -> None:
     clock = SetClock()
     checked, message = validator(clock=clock), demand()
-    accepted, payload = check(checked, message), encode(message)
+    accepted, received = check(checked, message), (message_key(MARKET, message), encode(message))
     assert accepted is not None
 
     checked.forget(accepted, after=5.0)
     clock.pass_by(4 * SECOND)
-    assert checked.is_copy(payload)
+    assert checked.without_copies([received]) == [None]
     clock.pass_by(SECOND)
 
-    assert not checked.is_copy(payload)
+    assert checked.without_copies([received]) == [received]
     assert check(checked, message) == accepted
-    assert checked.is_copy(payload)
+    assert checked.without_copies([received]) == [None]
     assert checked.statistics(received=0, dropped=0).duplicate == 2
 
 
@@ -261,9 +261,18 @@ def test_the_signature_of_a_message_that_comes_twice_at_once_is_verified_once(mo
     assert len(recovered) == len(messages)
     assert checked.statistics(received=0, dropped=0).duplicate == 2
 
+    other_bytes = encode(messages[0]).replace(b",", b" ,")
+    assert not any(checked.check_all([(message_key(MARKET, messages[0]), other_bytes)]))
+    assert len(recovered) == len(messages), "that of a later copy in other bytes isn't verified, either"
+    received = message_key(MARKET, messages[0]), payloads[0]
+    assert checked.without_copies([received]) == [None], "the first copy is the one that is recognized"
 
-def test_each_copy_of_an_invalid_message_is_counted() -> None:
+
+def test_copies_of_an_invalid_message_that_come_together_are_duplicates() -> None:
     checked, message = validator(), msgspec.structs.replace(demand(), signature="00" * 64 + "1b")
 
-    assert not any(checked.check_all([(message_key(MARKET, message), encode(message))] * 3))
-    assert checked.statistics(received=0, dropped=0).invalid == {"signature": 3}
+    for _ in range(2):
+        assert not any(checked.check_all([(message_key(MARKET, message), encode(message))] * 3))
+    counts = checked.statistics(received=0, dropped=0)
+    assert counts.invalid == {"signature": 2}
+    assert counts.duplicate == 4
