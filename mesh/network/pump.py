@@ -58,14 +58,13 @@ class Pump(Generic[T]):
     `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, pass two functions
     instead: `copy_all` takes what is needed out of some samples (None to skip one), and `convert_all` makes items of up
     to `BATCH` copies and yields some of them every few milliseconds, so that the thread can empty Zenoh's queue in
-    between. They run on the
-    pump's thread; the iterator raises what they raise. Items arrive in order, except copies, and what `ReceiveRing`
-    takes out of order in a flood. `capacity` and `capacity_bytes` bound the ring. Samples of more than `payload_limit`
-    bytes are refused. `drops` counts what is dropped or refused. `declare` declares another subscriber than a plain
-    one, of a selector and a handler. With `resent` (senders repeat what has no effect) a flood never stops the
-    session for samples on other keys: Zenoh's queue drops the oldest instead, which are not counted. Leaving
-    `async with` ends the subscription, the thread and the iteration; undelivered samples are lost. There is one
-    consumer. Raises `ClosedError` before it is entered.
+    between. They run on the pump's thread; the iterator raises what they raise. Items arrive in order, except copies,
+    and what `ReceiveRing` takes out of order in a flood. `capacity` and `capacity_bytes` bound the ring. Samples of
+    more than `payload_limit` bytes are refused. `drops` counts what is dropped or refused. `declare` declares another
+    subscriber than a plain one, of a selector and a handler. With `resent` (senders repeat what has no effect) a flood
+    never stops the session for samples on other keys: Zenoh's queue drops the oldest instead, which are not counted.
+    Leaving `async with` ends the subscription, the thread and the iteration; undelivered samples are lost. There is
+    one consumer. Raises `ClosedError` before it is entered.
     """
 
     def __init__(
