@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from zenoh import CongestionControl
 
-from common import ADDRESS, LIGHTHOUSE, SPAWN, arguments, router, show, signed_demands
+from common import ADDRESS, LIGHTHOUSE, SPAWN, arguments, process, router, show, signed_demands
 from mesh.network import Channel, Endpoints, Network, message_key
 from schemas import Demand, encode, keccak256, message_hash
 
@@ -43,6 +43,8 @@ else:
 
 WINDOW: Final = 1024
 """Most messages in flight; Zenoh's queue holds twice as many."""
+ROUNDS: Final = 3
+"""The one with the median ratio counts: the speed of a busy machine changes within one, too."""
 BAR: Final = 0.70
 """The least ratio; the exit status is 1 below it."""
 PROGRESS_KEY: Final = "aira/bench/progress"
@@ -52,8 +54,8 @@ INTERLUDE: Final = 512
 """Messages between two measurements of bare recoveries."""
 BARE: Final = 128
 """Recoveries in each of them."""
-REST: Final = 0.15
-"""Seconds before such a measurement: the pump has verified all that is in flight by then."""
+REST: Final = 0.03
+"""Seconds in which the process must be idle before such a measurement."""
 PREFIX: Final = b"\x19Ethereum Signed Message:\n32"
 
 
@@ -104,8 +106,7 @@ async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, float]:
             if received % EVERY == 0:
                 network.session.put(PROGRESS_KEY, str(received + 1))
             if received % INTERLUDE == 0:
-                time.sleep(REST)  # noqa: ASYNC251  # the pump verifies what it may, and then waits for this thread
-                before = time.process_time()
+                before = rest()
                 bare += recover_bare(latest)
                 apart += time.process_time() - before
             if received == count - 1:
@@ -116,6 +117,15 @@ async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, float]:
     assert not statistics.invalid, statistics
     assert not statistics.dropped, statistics
     return received / seconds, received // INTERLUDE * BARE / bare
+
+
+def rest() -> float:
+    """Block this thread until the pump has verified what it may; the process's time when the pump began to wait."""
+    while True:
+        before = time.process_time()
+        time.sleep(REST)
+        if time.process_time() - before < REST / 10:
+            return before
 
 
 def recover_bare(demands: Iterable[Demand]) -> float:
@@ -136,17 +146,23 @@ def compact(demand: Demand) -> tuple[bytes, bytes]:
 def main() -> None:
     """Run the benchmark."""
     options = arguments("verified messages per second, compared with bare recoveries", count=20_000)
-    ready, core = SPAWN.Event(), min(os.sched_getaffinity(0))
-    with router() as (endpoint, _):
-        publisher = SPAWN.Process(target=publish, args=(endpoint, options.count, ready))
-        publisher.start()
-        os.sched_setaffinity(0, {core})
-        rate, bare = asyncio.run(receive(endpoint, options.count, ready))
-        publisher.join()
-    ratio = rate / bare
-    results = {"verified_per_second": round(rate), "bare_per_second": round(bare), "ratio": round(ratio, 3)}
-    show(results | {"bar": BAR}, as_json=options.json)
-    sys.exit(ratio < BAR)
+    rounds = sorted((measure(options.count) for _ in range(ROUNDS)), key=lambda rates: rates[0] / rates[1])
+    ratios = [round(rate / bare, 3) for rate, bare in rounds]
+    rate, bare = rounds[ROUNDS // 2]
+    results = {"verified_per_second": round(rate), "bare_per_second": round(bare), "ratio": ratios[ROUNDS // 2]}
+    show(results | {"ratios": ratios, "bar": BAR}, as_json=options.json)
+    sys.exit(rate / bare < BAR)
+
+
+def measure(count: int) -> tuple[float, float]:
+    """What `receive` returns, for a publisher and a router of its own."""
+    ready, cores = SPAWN.Event(), os.sched_getaffinity(0)
+    with router() as (endpoint, _), process(publish, endpoint, count, ready):
+        os.sched_setaffinity(0, {min(cores)})
+        try:
+            return asyncio.run(receive(endpoint, count, ready))
+        finally:
+            os.sched_setaffinity(0, cores)
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ RESENT_QUEUE: Final = 2048
 """The same for what is sent again; while it is full, Zenoh drops the oldest."""
 SLOT_WAIT: Final = 0.002
 """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
-LONGEST_SLOT_WAIT: Final = 0.016
+LONGEST_SLOT_WAIT: Final = 0.032
 """The same while Zenoh's queue stays empty, at most."""
 
 

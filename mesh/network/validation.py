@@ -10,6 +10,7 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 import msgspec
@@ -109,7 +110,7 @@ class MessageValidator(Generic[M]):
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self.kind: type[M] = kind
-        self._lighthouse = lighthouse
+        self._key = partial(market_key, lighthouse, kind.kind)
         self._rules = MarketRules(address, head, validators)
         self._names = None if resolver is None else NameCache(resolver)
         self._blocked = blocked
@@ -181,7 +182,7 @@ class MessageValidator(Generic[M]):
     def _hash(self, candidate: _Candidate[M]) -> _Candidate[M]:
         """Check that the message fits its key and its market, and hash it."""
         message = candidate.message
-        if candidate.key != message_key(self._lighthouse, message):
+        if candidate.key != self._key(message.key_model):
             raise InvalidMessage("key", f"the message does not belong on {candidate.key}")
         candidate.is_complete = self._rules.check(message)
         candidate.hash = digest = message_hash(message)
