@@ -46,9 +46,9 @@ ZENOH_QUEUE: Final = 512
 """Samples in Zenoh's own queue; each may keep 64 KiB alive. While it is full, Zenoh stops reading from the router."""
 RESENT_QUEUE: Final = 2048
 """The same for what is sent again; while it is full, Zenoh drops the oldest."""
-SLOT_WAIT: Final = 0.002
+SLOT_WAIT: Final = 0.008
 """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
-LONGEST_SLOT_WAIT: Final = 0.032
+LONGEST_SLOT_WAIT: Final = 0.064
 """The same while Zenoh's queue stays empty, at most."""
 
 

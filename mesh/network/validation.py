@@ -11,7 +11,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Final, Generic
 
 import msgspec
 
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from mesh.network.lookups import Resolver, ValidatorCheck
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
-U = TypeVar("U")
 
 DEDUPLICATION_LIMIT: Final = 65_536
 """Accepted messages that a validator remembers, to drop duplicates."""
@@ -75,12 +72,6 @@ class _Candidate(msgspec.Struct, Generic[M], gc=False):
     signed: SignedDigest = _UNSIGNED
 
 
-def _sign(candidate: _Candidate[M]) -> _Candidate[M]:
-    """Check the form of the signature, and hash what was signed."""
-    candidate.signed = signed_digest(candidate.hash, candidate.message.signature)
-    return candidate
-
-
 class MessageValidator(Generic[M]):
     """Verifies the messages of one kind, and counts those that it rejects.
 
@@ -91,7 +82,7 @@ class MessageValidator(Generic[M]):
 
     A message is a duplicate if its hash and signature equal those of one of the last accepted messages
     (`deduplication_limit` at most, half of that at least) that were not forgotten since, or of one that is checked
-    together with it; equal generation-3 terms from two signers are two messages. A copy of an accepted message with the
+    with it; equal generation-3 terms from two signers are two messages. A copy of an accepted message with the
     same bytes is recognized before it is decoded. Consumers hold a
     message until the chain has confirmed its effect, or `forget` it, and then the sender's next copy gets through.
     """
@@ -142,64 +133,62 @@ class MessageValidator(Generic[M]):
         """
         received = list(received)
         parse_cids_ahead((payload for _, payload in received), self.kind)
-        decoded = self._passing(self._decode, received)
+        decoded = self._decode_all(received)
         candidates = [each for each in decoded if type(each) is _Candidate]
         if len(candidates) < len(decoded):
             yield [each for each in decoded if type(each) is Unresolved]
-        candidates = self._distinct(self._passing(self._hash, candidates))
+        candidates = self._hash_all(candidates)
         for start in range(0, len(candidates), SLICE):
             yield self._verify_all(candidates[start : start + SLICE])
 
-    def _passing(self, step: Callable[[T], U | None], items: Iterable[T]) -> list[U]:
-        """What a step makes of items, without those that it rejects, which are counted, or leaves out."""
-        passed: list[U] = []
-        for item in items:
+    def _decode_all(self, received: list[tuple[str, bytes]]) -> list[_Candidate[M] | Unresolved[M]]:
+        """The messages in payloads; those with names that are known have their addresses instead."""
+        seen, kind, decoded = self._seen, self.kind, list[_Candidate[M] | Unresolved[M]]()
+        for key, payload in received:
+            if (fingerprint := hash(payload)) in seen:
+                self._count_duplicates(1)
+                continue
             try:
-                if (found := step(item)) is not None:
-                    passed.append(found)
+                message = decode(payload, kind)
+                if not isinstance(message, kind):
+                    raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {kind.__name__}")
+                # A name has a dot, which JSON may write with a backslash.
+                if (_DOT in payload or _BACKSLASH in payload) and (names := names_in(message)):
+                    if self._names is None:
+                        raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
+                    if (addresses := self._names.known(names)) is None:
+                        decoded.append(Unresolved(message, key, fingerprint))
+                        continue
+                    message = resolve_names(message, addresses)
             except InvalidMessage as error:
                 self.reject(error.reason)
-        return passed
+            else:
+                decoded.append(_Candidate(message, key, fingerprint))
+        return decoded
 
-    def _decode(self, received: tuple[str, bytes]) -> _Candidate[M] | Unresolved[M] | None:
-        """The message in a payload, without names; None for a copy of an accepted message."""
-        key, payload = received
-        if (fingerprint := hash(payload)) in self._seen:
-            self._count_duplicates(1)
-            return None
-        message = decode(payload, self.kind)
-        if not isinstance(message, self.kind):
-            raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self.kind.__name__}")
-        # A name has a dot, which JSON may write with a backslash.
-        if (_DOT in payload or _BACKSLASH in payload) and (names := names_in(message)):
-            if self._names is None:
-                raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
-            if (addresses := self._names.known(names)) is None:
-                return Unresolved(message, key, fingerprint)
-            message = resolve_names(message, addresses)
-        return _Candidate(message, key, fingerprint)
-
-    def _hash(self, candidate: _Candidate[M]) -> _Candidate[M]:
-        """Check that the message fits its key and its market, and hash it."""
-        message = candidate.message
-        if candidate.key != self._key(message.key_model):
-            raise InvalidMessage("key", f"the message does not belong on {candidate.key}")
-        candidate.is_complete = self._rules.check(message)
-        candidate.hash = digest = message_hash(message)
-        candidate.identity = hash((digest, message.signature))
-        return candidate
-
-    def _distinct(self, candidates: list[_Candidate[M]]) -> list[_Candidate[M]]:
-        """Those that are no copies of others or of accepted messages, with what their keys are recovered from."""
-        new: dict[int, _Candidate[M]] = {}
+    def _hash_all(self, candidates: list[_Candidate[M]]) -> list[_Candidate[M]]:
+        """Those that fit their keys and their market and are no copies: hashed, and ready for their recovery."""
+        seen, check, new = self._seen, self._rules.check, dict[int, _Candidate[M]]()
         for candidate in candidates:
-            if candidate.identity not in self._seen:
-                new.setdefault(candidate.identity, candidate)
-        self._count_duplicates(len(candidates) - len(new))
-        return self._passing(_sign, new.values())
+            message = candidate.message
+            try:
+                if candidate.key != self._key(message.key_model):
+                    raise InvalidMessage("key", f"the message does not belong on {candidate.key}")
+                candidate.is_complete = check(message)
+                candidate.hash = digest = message_hash(message)
+                candidate.identity = identity = hash((digest, message.signature))
+                if identity in seen or identity in new:
+                    self._count_duplicates(1)
+                    continue
+                candidate.signed = signed_digest(digest, message.signature)
+            except InvalidMessage as error:
+                self.reject(error.reason)
+            else:
+                new[identity] = candidate
+        return list(new.values())
 
     def _verify_all(self, candidates: list[_Candidate[M]]) -> list[Verified[M] | Unresolved[M]]:
-        """Verify the signatures of `_distinct` candidates."""
+        """Verify signatures."""
         keys = recover_keys([each.signed for each in candidates])
         with self._lock:
             pairs = zip(candidates, keys, strict=True)
@@ -235,8 +224,8 @@ class MessageValidator(Generic[M]):
                 unresolved = outcome
                 addresses = await self._answers(unresolved.message)
                 message = resolve_names(unresolved.message, addresses)
-                candidate = self._hash(_Candidate(message, unresolved.key, unresolved.fingerprint))
-                outcome = next(iter(self._verify_all(self._distinct([candidate]))), None)
+                candidate = _Candidate(message, unresolved.key, unresolved.fingerprint)
+                outcome = next(iter(self._verify_all(self._hash_all([candidate]))), None)
         except InvalidMessage as error:
             self.reject(error.reason)
             return None

@@ -268,11 +268,16 @@ def test_the_signature_of_a_message_that_comes_twice_at_once_is_verified_once(mo
     assert checked.without_copies([received]) == [None], "the first copy is the one that is recognized"
 
 
-def test_copies_of_an_invalid_message_that_come_together_are_duplicates() -> None:
-    checked, message = validator(), msgspec.structs.replace(demand(), signature="00" * 64 + "1b")
+def test_each_copy_of_an_invalid_message_is_counted() -> None:
+    checked = validator()
+    no_key, upper_half = (
+        msgspec.structs.replace(demand(), signature=signature) for signature in ("00" * 64 + "1b", "ff" * 64 + "1b")
+    )
 
-    for _ in range(2):
-        assert not any(checked.check_all([(message_key(MARKET, message), encode(message))] * 3))
+    assert not any(checked.check_all([(message_key(MARKET, no_key), encode(no_key))] * 3))
     counts = checked.statistics(received=0, dropped=0)
-    assert counts.invalid == {"signature": 2}
-    assert counts.duplicate == 4
+    assert (counts.invalid, counts.duplicate) == ({"signature": 1}, 2), "copies of it are not recovered"
+
+    assert not any(checked.check_all([(message_key(MARKET, upper_half), encode(upper_half))] * 3))
+    counts = checked.statistics(received=0, dropped=0)
+    assert (counts.invalid, counts.duplicate) == ({"signature": 4}, 2)
