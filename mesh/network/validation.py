@@ -82,9 +82,9 @@ class MessageValidator(Generic[M]):
 
     A message is a duplicate if its hash and signature equal those of one of the last accepted messages
     (`deduplication_limit` at most, half of that at least) that were not forgotten since, or of one that is checked
-    with it; equal generation-3 terms from two signers are two messages. A copy of an accepted message with the
-    same bytes is recognized before it is decoded. Consumers hold a
-    message until the chain has confirmed its effect, or `forget` it, and then the sender's next copy gets through.
+    with it; equal generation-3 terms from two signers are two messages. A copy of an accepted message with the same
+    bytes is recognized before it is decoded. Consumers hold a message until the chain has confirmed its effect, or
+    `forget` it, and then the sender's next copy gets through.
     """
 
     def __init__(
