@@ -163,12 +163,8 @@ class Pump(Generic[T]):
 
     def copy(self, sample: zenoh.Sample) -> Any | None:
         """What `feed` takes of a sample from elsewhere (a query's reply), on any thread; None if it is refused."""
-        with self._lock:
-            self.received += 1
-        if self._payload_limit is not None and len(sample.payload) > self._payload_limit:
-            self._drops.count("too-large")
-            return None
-        return next(iter(self._copy_all([sample])), None)
+        copies, _ = self._copies([sample])
+        return next(iter(copies), None)
 
     def feed(self, copies: list[Any]) -> None:
         """Convert and deliver what `copy` returned, beside the ring, on any thread, without waiting."""
@@ -213,7 +209,10 @@ class Pump(Generic[T]):
         taken = 0
         while sample is not None:
             samples = [sample, *islice(iter(queue.try_recv, None), TOGETHER - 1)]
-            self._store(samples)
+            if dropped := self._ring.extend(*self._copies(samples)):
+                with self._lock:
+                    self.dropped += dropped
+                self._drops.count("overflow", number=dropped)
             taken += len(samples)
             is_more = len(samples) == TOGETHER and taken < RING_CAPACITY and self._copy_failure is None
             sample = queue.try_recv() if is_more else None
@@ -221,20 +220,20 @@ class Pump(Generic[T]):
             sending.received(self._session)
         return taken
 
-    def _store(self, samples: list[zenoh.Sample]) -> None:
-        """Copy samples into the ring. Each step is taken for all, because its code is in the CPU's caches then."""
+    def _copies(self, samples: list[zenoh.Sample]) -> tuple[list[Any], list[int]]:
+        """Copies of samples, and their sizes in bytes, without those that are too large; on any thread.
+
+        Each step is taken for all, because its code is in the CPU's caches then.
+        """
         received, limit = len(samples), self._payload_limit
+        with self._lock:
+            self.received += received
         sizes = [len(sample.payload) for sample in samples]
         if limit is not None and max(sizes) > limit:
             samples = [sample for sample, size in zip(samples, sizes, strict=True) if size <= limit]
             sizes = [size for size in sizes if size <= limit]
             self._drops.count("too-large", number=received - len(samples))
-        dropped = self._ring.extend(self._copy_all(samples), sizes)
-        with self._lock:
-            self.received += received
-            self.dropped += dropped
-        if dropped:
-            self._drops.count("overflow", number=dropped)
+        return self._copy_all(samples), sizes
 
     def _convert_each(self, samples: list[zenoh.Sample]) -> list[T | None]:
         """What `convert` makes of samples. An error is raised once the samples before it are converted."""
