@@ -10,7 +10,6 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Final, Generic
 
 import msgspec
@@ -38,7 +37,6 @@ DEDUPLICATION_LIMIT: Final = 65_536
 SLICE: Final = 128
 """Signatures verified at a time: some seven milliseconds."""
 _DOT, _BACKSLASH = b".\\"
-_UNSIGNED: Final[SignedDigest] = (b"", b"", 0)
 
 
 def message_key(lighthouse: str, message: SignedMessage) -> str:
@@ -57,19 +55,19 @@ class ValidationStatistics(msgspec.Struct, frozen=True, kw_only=True):
     dropped: int
 
 
-class _Candidate(msgspec.Struct, Generic[M], gc=False):
+class _Candidate(msgspec.Struct, Generic[M], frozen=True, gc=False):
     """A message whose signature is not checked yet. `identity` is the same for copies, `fingerprint` for equal bytes.
 
-    `is_complete`: the chain need not be asked about it. What follows `fingerprint` is filled in step by step.
+    `is_complete`: the chain need not be asked about it.
     """
 
     message: M
     key: str
     fingerprint: int
-    hash: bytes = b""
-    identity: int = 0
-    is_complete: bool = False
-    signed: SignedDigest = _UNSIGNED
+    hash: bytes
+    identity: int
+    is_complete: bool
+    signed: SignedDigest
 
 
 class MessageValidator(Generic[M]):
@@ -101,7 +99,7 @@ class MessageValidator(Generic[M]):
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self.kind: type[M] = kind
-        self._key = partial(market_key, lighthouse, kind.kind)
+        self._lighthouse = lighthouse
         self._rules = MarketRules(address, head, validators)
         self._names = None if resolver is None else NameCache(resolver)
         self._blocked = blocked
@@ -133,17 +131,16 @@ class MessageValidator(Generic[M]):
         """
         received = list(received)
         parse_cids_ahead((payload for _, payload in received), self.kind)
-        decoded = self._decode_all(received)
-        candidates = [each for each in decoded if type(each) is _Candidate]
-        if len(candidates) < len(decoded):
-            yield [each for each in decoded if type(each) is Unresolved]
-        candidates = self._hash_all(candidates)
+        decoded, unresolved = self._decode_all(received)
+        if unresolved:
+            yield [*unresolved]
+        candidates = self._hash_all(decoded)
         for start in range(0, len(candidates), SLICE):
             yield self._verify_all(candidates[start : start + SLICE])
 
-    def _decode_all(self, received: list[tuple[str, bytes]]) -> list[_Candidate[M] | Unresolved[M]]:
-        """The messages in payloads; those with names that are known have their addresses instead."""
-        seen, kind, decoded = self._seen, self.kind, list[_Candidate[M] | Unresolved[M]]()
+    def _decode_all(self, received: list[tuple[str, bytes]]) -> tuple[list[tuple[M, str, int]], list[Unresolved[M]]]:
+        """The messages in payloads, with addresses for names, their keys and fingerprints; and those to ask about."""
+        seen, kind, decoded, unresolved = self._seen, self.kind, list[tuple[M, str, int]](), list[Unresolved[M]]()
         for key, payload in received:
             if (fingerprint := hash(payload)) in seen:
                 self._count_duplicates(1)
@@ -157,34 +154,32 @@ class MessageValidator(Generic[M]):
                     if self._names is None:
                         raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
                     if (addresses := self._names.known(names)) is None:
-                        decoded.append(Unresolved(message, key, fingerprint))
+                        unresolved.append(Unresolved(message, key, fingerprint))
                         continue
                     message = resolve_names(message, addresses)
             except InvalidMessage as error:
                 self.reject(error.reason)
             else:
-                decoded.append(_Candidate(message, key, fingerprint))
-        return decoded
+                decoded.append((message, key, fingerprint))
+        return decoded, unresolved
 
-    def _hash_all(self, candidates: list[_Candidate[M]]) -> list[_Candidate[M]]:
+    def _hash_all(self, decoded: list[tuple[M, str, int]]) -> list[_Candidate[M]]:
         """Those that fit their keys and their market and are no copies: hashed, and ready for their recovery."""
         seen, check, new = self._seen, self._rules.check, dict[int, _Candidate[M]]()
-        for candidate in candidates:
-            message = candidate.message
+        for message, key, fingerprint in decoded:
             try:
-                if candidate.key != self._key(message.key_model):
-                    raise InvalidMessage("key", f"the message does not belong on {candidate.key}")
-                candidate.is_complete = check(message)
-                candidate.hash = digest = message_hash(message)
-                candidate.identity = identity = hash((digest, message.signature))
+                if key != message_key(self._lighthouse, message):
+                    raise InvalidMessage("key", f"the message does not belong on {key}")
+                is_complete, digest = check(message), message_hash(message)
+                identity = hash((digest, message.signature))
                 if identity in seen or identity in new:
                     self._count_duplicates(1)
                     continue
-                candidate.signed = signed_digest(digest, message.signature)
+                signed = signed_digest(digest, message.signature)
             except InvalidMessage as error:
                 self.reject(error.reason)
             else:
-                new[identity] = candidate
+                new[identity] = _Candidate(message, key, fingerprint, digest, identity, is_complete, signed)
         return list(new.values())
 
     def _verify_all(self, candidates: list[_Candidate[M]]) -> list[Verified[M] | Unresolved[M]]:
@@ -224,8 +219,8 @@ class MessageValidator(Generic[M]):
                 unresolved = outcome
                 addresses = await self._answers(unresolved.message)
                 message = resolve_names(unresolved.message, addresses)
-                candidate = _Candidate(message, unresolved.key, unresolved.fingerprint)
-                outcome = next(iter(self._verify_all(self._hash_all([candidate]))), None)
+                candidates = self._hash_all([(message, unresolved.key, unresolved.fingerprint)])
+                outcome = next(iter(self._verify_all(candidates)), None)
         except InvalidMessage as error:
             self.reject(error.reason)
             return None
