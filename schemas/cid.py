@@ -61,7 +61,7 @@ def _parse(text: str) -> bytes:
 def parse_ahead(texts: Iterable[str]) -> None:
     """Parse new CIDs together: until the next call, `parse_cid` looks them up. Wrong ones are left to it.
 
-    They don't get into its cache, which holds the CIDs that come again.
+    They stay out of its cache, which is for CIDs that come again.
     """
     global _ahead
     texts = [text for text in texts if len(text) == CID_LENGTH]

@@ -67,7 +67,7 @@ def decode(payload: bytes, likely: type[Any] | None = None) -> Message:
             _explain(payload, kind, str(error))
         raise InvalidMessage("not-json", str(error)) from None
     count = _FIELD_COUNTS[kind]
-    # So written, because an `isinstance` that fails takes as long as all of this.
+    # Not `isinstance`, which is slow when it fails.
     if (type(message) is Demand or type(message) is Offer) and message.sender is None:
         count -= 1
     if getattr(message, "signature", None) == "":

@@ -1,4 +1,4 @@
-"""What a provider does with a withdrawal: the order leaves the book, and its maker is told that it is not matched."""
+"""How a provider handles withdrawals: it takes the order out of its book, and confirms the withdrawal to the maker."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class MarketRules:
 
     def check(self, order: SignedMessage) -> bool:
         """Whether nothing has to be asked about its validator. Raises `InvalidMessage` for what can't be used."""
-        if type(order) is Result:  # so written, because an `isinstance` that fails is slow
+        if type(order) is Result:  # not `isinstance`, which is slow when it fails
             return True
         if type(order) is not Withdrawal and order.sender is None and str(order.nonce).startswith(AMBIGUOUS_NONCE):
             raise InvalidMessage("nonce", "the contracts would take it for the sender of a generation-5 order")
