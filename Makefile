@@ -30,7 +30,8 @@ help: ## this list
 setup: $(INSTALLED) ## the virtual environment with everything in it
 
 define NEEDS_PYTHON
-[ -n "$(PYTHON)" ] || { echo "Python 3.11 or later is needed, and python3 is: $$(python3 --version 2>&1)" >&2; exit 1; }
+$(or $(PYTHON),false) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+	{ echo "Python 3.11 or later is needed, and $(or $(PYTHON),python3) is: $$($(or $(PYTHON),python3) --version 2>&1)" >&2; exit 1; }
 endef
 
 # The lock lists every package, so nothing is resolved: older pips would take a newer version of a package with extras.

@@ -24,13 +24,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for the daemons 
 
 from bridges.ipfs import Daemon, IpfsError
 from bridges.ipfs.service import IpfsBridge
-from mesh.background import Background
+from mesh.base.background import Background
 from mesh.content import Exchange, Store
 from mesh.network import Channel, Endpoints, Network
 from mesh.settings import Settings
 from mesh.watching import status_of
 from schemas import Result, Signer, encode
-from schemas.selectors import market_selector
+from schemas.keys import market_selector
 from schemas.status import BridgeStatus
 from tests.support.ipfs import JsIpfs
 from tests.support.waiting import until_found

@@ -28,7 +28,7 @@ from bridges.serial.line import PortName, SerialLine
 from common import arguments, show
 from mesh.errors import AiraError
 from mesh.network import Endpoints, free_endpoint
-from mesh.running import fail
+from mesh.role.running import fail
 from schemas.payloads import String
 
 if TYPE_CHECKING:

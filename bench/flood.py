@@ -36,14 +36,14 @@ from common import SPAWN, installed_anvil, router
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # `peers` finds anvil
 
 from mesh import Agent
-from mesh.demo.lamp import write_objective
-from mesh.devchain.development import serve_chain
+from mesh.dev.demo import write_objective
+from mesh.dev.development import serve_chain
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
 
 if TYPE_CHECKING:
-    from mesh.devchain.development import DevelopmentChain
+    from mesh.dev.development import DevelopmentChain
     from schemas import Demand, Verified
 
 MODEL: Final = cid_of_bytes(b"what the robot of the benchmark can do")
@@ -84,6 +84,7 @@ class Place:
             keyfile_password_file=f"{self.keys}/password",
             data_dir=f"{self.folder}/{role}",
             playback="at-once",
+            free_contracts=1_000_000,
         )
 
 
@@ -230,9 +231,17 @@ async def _start(stack: AsyncExitStack, target: Any, arguments: tuple[Any, ...],
 
 def _start_provider(place: Place) -> subprocess.Popen[bytes]:
     settings = place.settings("provider")
-    names = ("connect", "web3_http_provider", "ens_contract", "lighthouse_contract", "keyfile", "keyfile_password_file")
+    names = (
+        "connect",
+        "web3_http_provider",
+        "ens_contract",
+        "lighthouse_contract",
+        "keyfile",
+        "keyfile_password_file",
+        "free_contracts",
+    )
     values = {name: getattr(settings, name) for name in (*names, "data_dir")} | {"connect": place.endpoint}
-    options = [word for name, value in values.items() for word in (f"--{name.replace('_', '-')}", value)]
+    options = [word for name, value in values.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     words = [sys.executable, "-m", "mesh", "provider", *options, "--log-level", "error"]
     return subprocess.Popen(words, stdout=subprocess.DEVNULL)
 

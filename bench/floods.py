@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from mesh.network import message_key
 from schemas import ZERO_ADDRESS, Demand, Offer, PresenceKey, Result, RpcKey, Signer, Withdrawal, cid_of_digest, encode
 from schemas.address import checksum_address
-from schemas.selectors import market_selector
+from schemas.keys import market_selector
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable

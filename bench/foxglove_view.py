@@ -16,14 +16,12 @@ from typing import Any, Final
 
 import websockets
 
-from bridges.foxglove.front import FoxgloveFront
-from bridges.foxglove.options import FoxgloveOptions
-from bridges.foxglove.server import FoxgloveServer
+from bridges.foxglove.server import FoxgloveFront, FoxgloveOptions, FoxgloveServer
 from bridges.foxglove.sources import show_job
 from common import SPAWN, arguments, process, router, show
-from mesh.flood import Drops
+from mesh.base.flood import Drops
 from mesh.network import Endpoints, Network
-from schemas.agent_keys import LiabilityTopicKey
+from schemas.keys import LiabilityTopicKey
 
 ROBOT: Final = "0x" + "11" * 20
 JOB: Final = "0x" + "22" * 20
@@ -91,9 +89,9 @@ def serve(endpoint: str, urls: Any) -> None:
 async def _serve(endpoint: str, urls: Any) -> None:
     front = FoxgloveFront(FoxgloveOptions(port=0), Drops())
     network = Network(Endpoints(connect=(endpoint,)))
-    async with network, front, FoxgloveServer(front, "bench", front.drops) as server:
+    async with network, front, FoxgloveServer(front, "bench") as server:
         urls.put(front.url)
-        await show_job(server, network.session, ROBOT, JOB, drops=front.drops)
+        await show_job(server, network.session, ROBOT, JOB)
 
 
 async def watch(url: str, encoding: str, seconds: int, view: int) -> dict[str, Any]:

@@ -26,8 +26,8 @@ from common import SPAWN, arguments, show
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for the sites of the tests
 
-from mesh.identity import Member
-from mesh.identity.routers import router_endpoints
+from mesh.ops.identity import Member
+from mesh.ops.identity.routers import router_endpoints
 from tests.support.sites import Site
 
 HANDSHAKE: Final = 10.0

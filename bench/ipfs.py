@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any, Final
 ROOT: Final = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # for the daemons of the tests
 
-from bridges.ipfs import ChannelBridge, Daemon, RelayJournal, RelayValidator  # noqa: E402
+from bridges.ipfs import BridgeParts, ChannelBridge, Daemon, RelayJournal, RelayValidator  # noqa: E402
 from bridges.ipfs.daemon import PUBLISH_INTERVAL  # noqa: E402
 from common import ADDRESS, LIGHTHOUSE, arguments, router, show, signed_demands  # noqa: E402
-from mesh.background import Background  # noqa: E402
-from mesh.network import Channel, Endpoints, Network  # noqa: E402
+from mesh.base.background import Background  # noqa: E402
+from mesh.network import Channel, Endpoints, MarketRules, Network  # noqa: E402
 from peers.catalog import PeerMissing, locate  # noqa: E402
 from schemas import Demand, encode  # noqa: E402
 from tests.support.ipfs import JsIpfs, Kubo  # noqa: E402
@@ -146,10 +146,13 @@ async def over_bridge(
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         person = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         channel = await stack.enter_async_context(Channel(person.session, LIGHTHOUSE, address=ADDRESS))
-        journal = stack.enter_context(RelayJournal(folder / "journal.sqlite"))
-        bridge = ChannelBridge(
-            network, here, RelayValidator(LIGHTHOUSE, address=lambda: ADDRESS), journal, lighthouse=LIGHTHOUSE
+        parts = BridgeParts(
+            network=network,
+            daemon=here,
+            validator=RelayValidator(MarketRules(LIGHTHOUSE, address=ADDRESS)),
+            journal=stack.enter_context(RelayJournal(folder / "journal.sqlite")),
         )
+        bridge = ChannelBridge(parts)
         await stack.enter_async_context(bridge)
         tasks = await stack.enter_async_context(Background())
         tasks.start(listen(there, LIGHTHOUSE, receiver, ready), "receiver")

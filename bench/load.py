@@ -26,16 +26,16 @@ from one_router import TIMEOUT, seconds_of  # noqa: E402
 
 from common import SPAWN, arguments, router, show, signed_demands  # noqa: E402
 from mesh import Agent  # noqa: E402
-from mesh.background import Background  # noqa: E402
+from mesh.base.background import Background  # noqa: E402
 from mesh.chain import Account, Node  # noqa: E402
-from mesh.composition import chain_of, provider_of  # noqa: E402
-from mesh.demo.lamp import write_objective  # noqa: E402
-from mesh.devchain import EmbeddedChain  # noqa: E402
-from mesh.devchain.anvil import find_anvil, serve_anvil  # noqa: E402
-from mesh.devchain.development import deploy_market  # noqa: E402
-from mesh.market.provider import Provider  # noqa: E402
-from mesh.market.transaction_queue import UNDER_WAY  # noqa: E402
+from mesh.dev import EmbeddedChain  # noqa: E402
+from mesh.dev.anvil import find_anvil, serve_anvil  # noqa: E402
+from mesh.dev.demo import write_objective  # noqa: E402
+from mesh.dev.development import deploy_market  # noqa: E402
+from mesh.market.provider import Provider, ProviderOptions, provider_of  # noqa: E402
+from mesh.market.transactions import UNDER_WAY  # noqa: E402
 from mesh.network import Channel, Endpoints, Network  # noqa: E402
+from mesh.role.composition import chain_of  # noqa: E402
 from mesh.settings import Settings  # noqa: E402
 from peers.catalog import locate  # noqa: E402
 from schemas import cid_of_bytes  # noqa: E402
@@ -43,7 +43,7 @@ from schemas import cid_of_bytes  # noqa: E402
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-    from mesh.devchain.development import DevelopmentMarket
+    from mesh.dev.development import DevelopmentMarket
     from schemas import Demand, Verified
 
 PROFILE: Final = "BENCH_PROFILE"
@@ -68,10 +68,11 @@ async def _orders(endpoint: str, count: int) -> dict[str, float]:
         )
         publishing.start()
         assert await asyncio.to_thread(ready.wait, TIMEOUT)
+        options = ProviderOptions(free_contracts=1_000_000)
         async with (
             chain,
             Network(Endpoints(connect=(endpoint,))) as network,
-            Provider(network.session, chain, market.deployment.lighthouse_name) as provider,
+            Provider(network.session, chain, market.deployment.lighthouse_name, options) as provider,
             Background() as tasks,
         ):
             tasks.start(provider.run(), "provider")
@@ -208,7 +209,7 @@ def run(role: str, settings: Settings, keys: Sequence[bytes], number: int, pipe:
 
 async def _provide(settings: Settings, keys: Sequence[bytes], number: int, pipe: Any) -> None:
     async with (
-        chain_of(settings, Account.from_key(keys[0])) as chain,
+        chain_of(settings, Account(keys[0])) as chain,
         Network(Endpoints(connect=settings.connect)) as network,
         await provider_of(settings, network.session, chain) as provider,
         Background() as tasks,
@@ -222,7 +223,7 @@ async def _work(settings: Settings, keys: Sequence[bytes], number: int, pipe: An
     async with AsyncExitStack() as stack:
         for which in range(number):
             own = replace(settings, data_dir=f"{settings.data_dir}/{which}")
-            robot = Agent(_model(which), settings=own, account=Account.from_key(secrets.token_bytes(32)))
+            robot = Agent(_model(which), settings=own, account=Account(secrets.token_bytes(32)))
             await stack.enter_async_context(_offering(robot))
         pipe.send("ready")
         await asyncio.to_thread(pipe.recv)
@@ -241,7 +242,7 @@ def _offering(robot: Agent) -> Agent:
 
 
 async def _demand(settings: Settings, keys: Sequence[bytes], number: int, pipe: Any) -> None:
-    async with Agent(settings=settings, account=Account.from_key(keys[2])) as person:
+    async with Agent(settings=settings, account=Account(keys[2])) as person:
         objective = Path(settings.data_dir) / "objective.mcap"
         await asyncio.to_thread(write_objective, objective)
         pipe.send("ready")

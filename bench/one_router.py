@@ -21,7 +21,7 @@ from zenoh import CongestionControl
 from common import ADDRESS, LIGHTHOUSE, SPAWN, router, signed_demands
 from mesh.network import Channel, Endpoints, Network, message_key
 from schemas import Demand, cid_of_bytes, encode
-from schemas.selectors import market_selector
+from schemas.keys import market_selector
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

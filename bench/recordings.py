@@ -8,26 +8,24 @@ import os
 import statistics
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 from mcap.writer import Writer
 from zenoh import CongestionControl
 
 from common import SPAWN, process, router
+from mesh.agent.jobs import JobRecordings, JobRun
+from mesh.agent.ledger import Ledger
 from mesh.network import Endpoints, Network
-from mesh.recording import Recorder, RecordingAbout, open_objective, play
-from mesh.settings import Settings
-from mesh.work import Ledger
-from mesh.work.playbacks import Playbacks
+from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, open_objective, play
 from schemas import ZERO_ADDRESS, Liability, cid_of_bytes
 from schemas.payloads import JSON
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.recording import Played
-    from mesh.work.job import Job
-    from mesh.work.run import JobRun
+    from mesh.agent.handlers import Job
+    from mesh.recording import Pace, Played
 
 ROUNDS: Final = 3
 KEY: Final = "aira/bench/topic"
@@ -90,10 +88,10 @@ def measure_job(folder: Path, seconds: int) -> dict[str, float]:
     with router() as (endpoint, _):
         late, rate = float("inf"), 0.0
         for number in range(ROUNDS):
-            times = asyncio.run(_work(endpoint, folder / f"job-{number}", path, "recorded"))
+            times = asyncio.run(_work(endpoint, folder / f"job-{number}", path, RecordedTimes()))
             expected = (moment - times[0] - step / HERTZ for step, moment in enumerate(times))
             late = min(late, statistics.quantiles(expected, n=100)[98])
-            times = asyncio.run(_work(endpoint, folder / f"at-once-{number}", path, "at-once"))
+            times = asyncio.run(_work(endpoint, folder / f"at-once-{number}", path, AtOnce()))
             rate = max(rate, count / (times[-1] - times[0]))
     return {"p99_ms": round(late * 1e3, 3), "messages_per_s": round(rate)}
 
@@ -180,7 +178,7 @@ async def _play(path: Path) -> list[float]:
     return late
 
 
-async def _work(endpoint: str, folder: Path, path: Path, pace: Literal["recorded", "at-once"]) -> list[float]:
+async def _work(endpoint: str, folder: Path, path: Path, pace: Pace) -> list[float]:
     """When the handler of a job got each message of the objective at `path`."""
     times: list[float] = []
     objective = await asyncio.to_thread(open_objective, path)
@@ -189,16 +187,13 @@ async def _work(endpoint: str, folder: Path, path: Path, pace: Literal["recorded
         times.append(time.perf_counter())
 
     async with Network(Endpoints(connect=(endpoint,))) as network, Ledger(folder / "ledger.sqlite") as ledger:
-        playbacks = Playbacks(network.session, ZERO_ADDRESS, ledger, Settings(playback=pace), folder)
         await ledger.add_job(LIABILITY)
         (job,) = await ledger.jobs()
-        async with asyncio.TaskGroup() as tasks:
-
-            async def work(run: JobRun) -> None:
-                await playbacks.play_and_save(run, handle)
-
-            await playbacks.begin(job, objective, play=work, tasks=tasks)
-        await playbacks.suspend(LIABILITY.address)
+        recorder = await JobRecordings(folder, ZERO_ADDRESS).open(LIABILITY)
+        run = JobRun(network.session, ZERO_ADDRESS, job, recorder, objective=objective, pace=pace)
+        run.open()
+        await run.play_and_save(handle, ledger)
+        await run.suspend(ledger)
     return times
 
 

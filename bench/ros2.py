@@ -24,8 +24,8 @@ from bridges.ros2 import Robot, RosQos
 from common import ADDRESS, SPAWN, arguments, process, router, show
 from mesh.network import Endpoints, Network
 from mesh.recording import Recorder, RecordingAbout
-from mesh.ros import RosTypes
-from schemas.agent_keys import DeviceTopicKey
+from mesh.recording.ros import RosTypes
+from schemas.keys import DeviceTopicKey
 from schemas.payloads import Payload, PayloadType
 
 if TYPE_CHECKING:

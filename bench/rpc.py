@@ -37,10 +37,11 @@ sys.path.insert(0, str(ROOT))  # `peers` finds anvil
 from common import SPAWN, arguments, router  # noqa: E402
 from mesh import Agent  # noqa: E402
 from mesh.chain import Account, Chain  # noqa: E402
-from mesh.composition import chain_of, provider_of  # noqa: E402
-from mesh.devchain.anvil import find_anvil, serve_anvil  # noqa: E402
-from mesh.devchain.development import ROLES, deploy_market  # noqa: E402
+from mesh.dev.anvil import find_anvil, serve_anvil  # noqa: E402
+from mesh.dev.development import ROLES, deploy_market  # noqa: E402
+from mesh.market.provider import provider_of  # noqa: E402
 from mesh.network import Endpoints, Network  # noqa: E402
+from mesh.role.composition import chain_of  # noqa: E402
 from mesh.settings import Settings  # noqa: E402
 from peers.catalog import locate  # noqa: E402
 from schemas import cid_of_bytes  # noqa: E402
@@ -163,7 +164,7 @@ class CountingProxy:
 async def run_provider(settings: Settings, key: bytes, pipe: Any) -> None:
     """The provider's process."""
     async with (
-        chain_of(settings, Account.from_key(key)) as chain,
+        chain_of(settings, Account(key)) as chain,
         Network(Endpoints(connect=settings.connect)) as network,
         await provider_of(settings, network.session, chain) as provider,
     ):
@@ -173,7 +174,7 @@ async def run_provider(settings: Settings, key: bytes, pipe: Any) -> None:
 
 async def run_robot(settings: Settings, key: bytes, pipe: Any) -> None:
     """The robot's process: it offers to do what is demanded."""
-    robot = Agent(MODEL, settings=settings, account=Account.from_key(key))
+    robot = Agent(MODEL, settings=settings, account=Account(key))
 
     @robot.on("*")
     async def play(job: Any, message: Any) -> None:
@@ -191,7 +192,7 @@ async def run_robot(settings: Settings, key: bytes, pipe: Any) -> None:
 async def run_person(settings: Settings, key: bytes, pipe: Any) -> None:
     """The person's process: it demands a job on request, and waits for its end."""
     objective = Path(settings.data_dir) / "objective.mcap"
-    async with Agent(MODEL, settings=settings, account=Account.from_key(key)) as person, asyncio.timeout(None):
+    async with Agent(MODEL, settings=settings, account=Account(key)) as person, asyncio.timeout(None):
         pipe.send("ready")
         while await asyncio.to_thread(pipe.recv):
             write_objective(objective)
@@ -261,6 +262,7 @@ async def market_of(case: Case) -> AsyncIterator[tuple[Market, Chain]]:
                 ens_contract=market.deployment.ens,
                 lighthouse_contract=market.deployment.lighthouse_name,
                 playback="at-once",
+                free_contracts=1_000_000,
             )
             await asyncio.to_thread(Path(settings.data_dir).mkdir)
             pipes[role], theirs = SPAWN.Pipe()

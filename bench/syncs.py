@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rpc import SETTLE_SECONDS, Case, market_of
 
 from common import arguments, show
-from mesh.devchain.development import ROLES
+from mesh.dev.development import ROLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,8 +36,7 @@ WHAT: Final = {
     "pins": re.compile(r"/\.pins"),
     "content": re.compile(r"/content"),
     "transactions": re.compile(r"/transactions/"),
-    "sent orders": re.compile(r"/sent-orders-"),
-    "withdrawals": re.compile(r"/withdrawals-"),
+    "provider": re.compile(r"/provider-"),
 }
 """What was synced, by its path; the first that fits."""
 

@@ -28,7 +28,7 @@ from common import SPAWN, arguments, installed_anvil, router, show, unsigned_dem
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # `tests` has the browser, `peers` finds it
 
-from mesh.devchain.development import serve_chain
+from mesh.dev.development import serve_chain
 from mesh.network import Endpoints, Network, message_key
 from mesh.settings import Settings
 from peers.catalog import locate
@@ -38,7 +38,7 @@ from tests.web.browser import Browser
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from mesh.devchain.development import DevelopmentChain
+    from mesh.dev.development import DevelopmentChain
 
 PACE: Final = 1000
 """Orders a second."""

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from mesh.errors import AiraError, InvalidKey
-from mesh.log_context import log_event
+from mesh.base.log_context import log_event
+from mesh.errors import AiraError, InvalidKey, public_text
 from mesh.telemetry.logs import LogService
-from schemas.agent_keys import EventKey, parse_agent_key
-from schemas.logs import ReadLogs
+from schemas.keys import EventKey, parse_agent_key
+from schemas.status import ReadLogs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PRESENT: Final = "/present"
-"""The topic of the liveliness token, which exists as long as the device answers."""
 ABOUT: Final = "/about"
 """The topic on which the process reports which device it serves."""
 LOG: Final = "/log"
@@ -31,6 +29,31 @@ CONNECTION: Final = "/aira/device"
 """The topic of a job, followed by the device's name, that records when the device was absent and present."""
 PUT_BY_EDGE: Final = b"edge"
 """What the attachment of everything that such a process puts begins with."""
+
+
+class DeviceTopic(msgspec.Struct, frozen=True):
+    """A topic of a device by its name in the mesh. `flow` is as the device sees it: says, hears, serves or asks."""
+
+    name: str
+    flow: str
+    type: str = ""
+
+
+class DeviceAbout(msgspec.Struct, frozen=True, kw_only=True):
+    """What a device's process replies on `/about`: the device, how it is reached, the job it works for, its topics."""
+
+    name: str = ""
+    version: str = ""
+    present: bool
+    port: str = ""
+    job: str = ""
+    topics: tuple[DeviceTopic, ...]
+    counters: dict[str, int] = {}
+
+    def reply(self, query: zenoh.Query) -> None:
+        """Reply to a query with it."""
+        with query:
+            query.reply(str(query.key_expr), msgspec.json.encode(self), encoding="application/json")
 
 
 class JobTracker:
@@ -83,7 +106,7 @@ def answer_log_queries(session: zenoh.Session, key: str, role: str) -> Iterator[
                 payload = b"{}" if query.payload is None else query.payload.to_bytes()
                 answer = service.read(ReadLogs.decode(payload)).encode()
             except AiraError as error:
-                query.reply_err(msgspec.json.encode({"error": str(error), "hint": error.hint}))
+                query.reply_err(msgspec.json.encode({"error": public_text(error), "hint": public_text(error.hint)}))
             else:
                 query.reply(key, answer, encoding="application/json")
 

@@ -19,7 +19,14 @@ const wanted = {
   "src/Liability.sol": { Liability: suite },
   "src/Jury.sol": { Jury: suite },
   "src/Multicall.sol": { Multicall: suite },
-  "fixtures/Tokens.sol": { FeeToken: tests, SilentToken: tests, RefusingToken: tests, HookedToken: tests },
+  "fixtures/Tokens.sol": {
+    FeeToken: tests,
+    SilentToken: tests,
+    RefusingToken: tests,
+    HookedToken: tests,
+    BlockingToken: tests,
+    HeavyToken: tests,
+  },
   "fixtures/Crowd.sol": { Crowd: tests },
   "fixtures/Validators.sol": { OneSigner: tests, BrokenValidator: tests },
 };
@@ -31,7 +38,8 @@ const settings = {
   // Nothing in the bytecode that depends on comments or on where the sources lie.
   metadata: { appendCBOR: false, bytecodeHash: "none" },
 };
-const outputSelection = { "*": { "*": ["abi", "evm.bytecode.object", "evm.deployedBytecode.object"] } };
+const deployed = ["evm.deployedBytecode.object", "evm.deployedBytecode.immutableReferences"];
+const outputSelection = { "*": { "*": ["abi", "evm.bytecode.object", ...deployed] } };
 
 function input(folders, settings) {
   const sources = {};
@@ -59,6 +67,10 @@ function artifact(contractName, contract) {
       abi: contract.abi,
       bytecode: `0x${contract.evm.bytecode.object}`,
       deployedBytecode: `0x${contract.evm.deployedBytecode.object}`,
+      // Where the constructor writes each immutable: one list of offsets each, in bytes of the deployed code.
+      immutables: Object.values(contract.evm.deployedBytecode.immutableReferences ?? {}).map((places) =>
+        places.map((place) => place.start),
+      ),
       compiler,
     },
     null,

@@ -75,7 +75,10 @@ class Unit:
         return given
 
     def hint(self) -> str:
-        return f"write 1.5 for one and a half {self.symbol}, or the smallest unit: 1500000{self.smallest}"
+        """Two ways to write one amount; a token without decimals has no half."""
+        if not self.decimals:
+            return f"two {self.symbol} are 2, or 2{self.smallest}"
+        return f"one and a half {self.symbol} is 1.5, or {15 * 10**self.decimals // 10}{self.smallest}"
 
 
 XRT: Final = Unit("XRT", 9, "wn")

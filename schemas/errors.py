@@ -6,7 +6,7 @@ content are in `mesh.errors`.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 
 class AiraError(Exception):
@@ -16,17 +16,23 @@ class AiraError(Exception):
     for programs, which stays the same when the sentences change.
     """
 
-    code: ClassVar[str] = "error"
+    code: str = "error"
 
     def __init_subclass__(cls, *, code: str = "", **options: Any) -> None:
-        """A class has a code of its own: `class FeeTooHigh(ChainError, code="fee-too-high")`."""
+        """A class has a code of its own: `class FeeTooHigh(ChainError, code="fee-too-high")`.
+
+        An error that nobody catches apart from others of its class has its code without a class of its own:
+        `ConfigurationError("…", code="files-missing")`.
+        """
         super().__init_subclass__(**options)
         if code:
             cls.code = code
 
-    def __init__(self, message: str, *, hint: str = "") -> None:
+    def __init__(self, message: str, *, hint: str = "", code: str = "") -> None:
         super().__init__(message)
         self.hint = hint
+        if code:
+            self.code = code
 
 
 class InputError(AiraError, ValueError, code="input-error"):

@@ -1,12 +1,17 @@
-"""The messages of a market: Demand, Offer, Withdrawal and Result, and the feedback of generation 5.
+"""The messages of a market: what they are, the JSON that travels, the hash that is signed, and what the contracts take.
 
 Every message object is well-formed: the constructors check each field, bring it to its canonical form (addresses in
 EIP-55, ENS names and hexadecimal digits in lower case and without `0x`) and raise `InvalidMessage` for what is wrong.
 They don't verify the signature; `schemas.signing` does. A message is hashed with addresses only: collect its ENS names
 with `names_in`, look them up on a chain, and replace them with `resolve_names`.
 
-To add a kind of message: its class here, in `MESSAGE_TYPES`; what its hash covers in `schemas.wire`; its key in
-`schemas.keys`; its selector in `schemas.selectors`; who may publish it in `mesh.identity.roster`.
+Reading JSON is strict: unknown, repeated and missing fields, fractions where integers belong, and texts that are not
+quite addresses, names or hashes are rejected with a reason. Writing is canonical: compact, no `0x` on nonces and
+signatures. Hashes and contract bytes are Solidity's `abi.encodePacked` and `abi.encode`, written out field by field.
+
+To add a kind of message: its class here, in `MESSAGE_TYPES`, and what its hash covers, in `_PACKERS`; its key and its
+row of `KINDS` in `schemas.keys`, which say who may publish it and whether the bridge to IPFS relays it. Then a channel
+can publish it and subscribe to it.
 
 Amounts are integers of at most 256 bits: `cost` in the token's smallest unit, fees in wn (10^-9 XRT), `deadline` is a
 block number (the order is valid while `block.number < deadline`). Source: the wire format of the legacy network.
@@ -15,28 +20,87 @@ block number (the order is valid while `block.number < deadline`). Source: the w
 from __future__ import annotations
 
 from functools import lru_cache
+from struct import Struct as Layout
 from sys import intern
-from typing import TYPE_CHECKING, ClassVar, Final, Literal, NoReturn, TypeAlias, TypeVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, TypeAlias, TypeVar, final
 
+import msgspec
 from msgspec import Struct
 from msgspec.structs import force_setattr, replace
 
-from schemas.address import parse_address, parse_address_or_name
-from schemas.cid import parse_cid
+from schemas.address import address_bytes, keccak256, parse_address, parse_address_or_name
+from schemas.cid import CID_LENGTH, parse_ahead, parse_cid
+from schemas.decoding import InvalidData, decode_json
 from schemas.errors import InvalidAddress, InvalidCid, InvalidMessage
 from schemas.keys import MarketKind  # msgspec reads the annotations
-from schemas.message_fields import (
-    are_canonical,
-    are_uint256,
-    check_uint256,
-    hex_digits,
-    set_address,
-    set_hash,
-    set_signature,
-)
+from schemas.records import MAX_UINT256
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterable, Mapping
+
+
+SIGNATURE_SIZE: Final = 65
+
+
+def set_address(message: Struct, field: str, text: str) -> None:
+    # The cached text replaces the equal one, so that an address in a million open orders is in memory once.
+    canonical = parse_address_or_name(text)
+    if canonical is not text:
+        force_setattr(message, field, canonical)
+
+
+def check_uint256(field: str, value: int) -> None:
+    if type(value) is not int:
+        raise InvalidMessage("field", f"{field}: expected an integer")
+    if not 0 <= value <= MAX_UINT256:
+        raise InvalidMessage("range", f"{field}: expected an integer from 0 to 2^256-1")
+
+
+def are_uint256(first: int, second: int, third: int) -> bool:
+    """Whether `check_uint256` accepts three values: one check for all is the fastest."""
+    return type(first) is type(second) is type(third) is int and not (first | second | third) >> 256
+
+
+def set_signature(message: Struct, text: str) -> None:
+    if not text:
+        return
+    digits = hex_digits(text, SIGNATURE_SIZE)
+    if digits is None:
+        raise InvalidMessage("signature", "a signature is 130 hexadecimal digits, r, s and v")
+    if digits != text:
+        force_setattr(message, "signature", digits)
+
+
+def set_hash(message: Struct, field: str, text: str) -> None:
+    digits = hex_digits(text, 32)
+    if digits is None:
+        raise InvalidMessage("hash", f"{field}: expected 64 hexadecimal digits")
+    if digits != text:
+        force_setattr(message, field, digits)
+
+
+def are_canonical(*digits: str) -> bool:
+    """Whether texts are hexadecimal digits as `hex_digits` returns them: one check for all is the fastest."""
+    joined = "".join(digits)
+    try:
+        return bytes.fromhex(joined).hex() == joined
+    except ValueError:
+        return False
+
+
+def hex_digits(text: str, size: int) -> str | None:
+    """The canonical hexadecimal digits of `size` bytes, or None if `text` is something else."""
+    if text[:2] == "0x":
+        text = text[2:]
+    if len(text) != 2 * size:
+        return None
+    try:
+        raw = bytes.fromhex(text)
+    except ValueError:
+        return None
+    # bytes.fromhex() skips blanks, so a text with blanks among its characters is too short here.
+    return raw.hex() if len(raw) == size else None
+
 
 _CACHED: Final = 8192
 _NO_NAMES: Final[frozenset[str]] = frozenset()
@@ -48,7 +112,7 @@ def _market_fields(model: str, token: str, lighthouse: str, validator: str) -> t
     parse_cid(model)
     token, lighthouse, validator = (parse_address_or_name(text) for text in (token, lighthouse, validator))
     if validator == lighthouse:
-        # With the two exchanged, an offer is a demand with the same signature: see mesh/chain/validators.py.
+        # With the two exchanged, an offer is a demand with the same signature: see mesh/chain/_validators.py.
         raise InvalidMessage("validator", "the lighthouse can't be the validator")
     return intern(model), token, lighthouse, validator
 
@@ -62,6 +126,10 @@ class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, om
     """The field on the wire by which a reader recognizes the kind."""
     address_fields: ClassVar[tuple[str, ...]] = ()
     """The fields that hold an address or an ENS name."""
+    is_of_lighthouse: ClassVar[bool] = False
+    """Whether it has a `lighthouse` and a `deadline`, which a market checks."""
+    is_order: ClassVar[bool] = False
+    """Whether it has a nonce and a validator besides, which a market checks, too."""
 
     @property
     def key_model(self) -> str:
@@ -73,6 +141,8 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
     """The fields that a Demand and an Offer have in common."""
 
     address_fields: ClassVar[tuple[str, ...]] = ("token", "lighthouse", "validator", "sender")
+    is_of_lighthouse: ClassVar[bool] = True
+    is_order: ClassVar[bool] = True
 
     model: str
     objective: str
@@ -87,7 +157,6 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
 
     @property
     def key_model(self) -> str:
-        """The model's CID."""
         return self.model
 
     @property
@@ -179,6 +248,7 @@ class Withdrawal(_Message, frozen=True, kw_only=True, rename={"order": "withdraw
     kind: ClassVar[MarketKind] = "withdrawal"
     mark: ClassVar[str] = "withdraws"
     address_fields: ClassVar[tuple[str, ...]] = ("lighthouse",)
+    is_of_lighthouse: ClassVar[bool] = True
 
     order: str
     lighthouse: str
@@ -301,3 +371,263 @@ def _raise_invalid(message: Struct, error: InvalidCid | InvalidAddress) -> NoRet
     field = next(name for name in message.__struct_fields__ if getattr(message, name) == error.text)
     reason = "cid" if isinstance(error, InvalidCid) else "address"
     raise InvalidMessage(reason, f"{field}: {error}") from error
+
+
+MAX_MESSAGE_SIZE: Final = 16_384
+"""The longest payload, in bytes, that is decoded. Real messages have about 700."""
+
+_TYPE_OF_MARK: Final[dict[str, type[Message]]] = {kind.mark: kind for kind in MESSAGE_TYPES}
+_MARKS: Final = tuple((f'"{mark}"'.encode(), kind) for mark, kind in _TYPE_OF_MARK.items())
+_FIELDS: Final = {kind: msgspec.structs.fields(kind) for kind in MESSAGE_TYPES}
+_FIELD_COUNTS: Final = {kind: len(fields) for kind, fields in _FIELDS.items()}
+_NEW_CIDS: Final[dict[type[Any], bytes]] = {Demand: b'"objective":"', Offer: b'"objective":"', Result: b'"result":"'}
+"""What stands before the CID of a message that no other message has."""
+_FEW: Final = 8
+"""Fewer CIDs are as fast one by one."""
+_ENCODER: Final = msgspec.json.Encoder()
+
+_WORD: Final = 32
+_ABI_HEAD: Final = 10 * _WORD
+_MAX_UINT64: Final = 2**64 - 1
+_SMALL_ORDER: Final = Layout(">34s34s20s24xQ20s20s24xQ24xQ")
+"""What the hash of an order covers up to its nonce, if no number has more than 64 bits: in one step, so faster."""
+_TWELVE_ZEROS: Final = bytes(12)
+_WITHDRAWAL_TYPE: Final = keccak256(b"Withdrawal(bytes32 order,address lighthouse,uint256 deadline)")
+"""The first word of what a withdrawal's signature covers; no order and no Result begins like this."""
+
+
+def decode(payload: bytes, likely: type[Any] | None = None) -> Message:
+    """The message in `payload`, checked and in canonical form; its signature is present, but not verified.
+
+    It is decoded sooner if it is of the `likely` kind. Raises `InvalidMessage` and nothing else, whatever the bytes
+    are. Its `reason` is one of `too-large`, `not-json`, `unknown-kind`, `unknown-field`, `duplicate-field`, `field`
+    (missing or of the wrong type), `address`, `cid`, `nonce`, `range`, `hash`, `validator` (an order's lighthouse) and
+    `signature`.
+    """
+    if len(payload) > MAX_MESSAGE_SIZE:
+        raise InvalidMessage("too-large", f"it has {len(payload)} bytes; the limit is {MAX_MESSAGE_SIZE}")
+    kind: type[Message] = likely or _type_of(payload)
+    try:
+        message = decode_json(payload, kind)
+    except InvalidData as error:
+        if likely is not None:
+            return decode(payload)
+        if error.reason == "type":
+            _explain(payload, kind, str(error))
+        raise InvalidMessage("not-json", str(error)) from None
+    count = _FIELD_COUNTS[kind]
+    # Not `isinstance`, which is slow when it fails.
+    if (type(message) is Demand or type(message) is Offer) and message.sender is None:
+        count -= 1
+    if getattr(message, "signature", None) == "":
+        _explain(payload, kind, "the signature is empty", reason="signature")
+    # The decoder takes the last of repeated fields. No value of a well-formed message contains a colon, so there is
+    # one colon per field; any more belong to repeated fields.
+    if payload.count(b":") != count:
+        _explain(payload, kind, "a field is repeated", reason="duplicate-field")
+    return message
+
+
+def parse_cids_ahead(payloads: Iterable[bytes], likely: type[Any]) -> None:
+    """Parse together what is new in each payload, its CID: `decode` of those of the `likely` kind is faster then."""
+    mark = _NEW_CIDS.get(likely)
+    if mark is None:
+        return
+    starts = [(payload, payload.find(mark) + len(mark)) for payload in payloads]
+    texts = [payload[start : start + CID_LENGTH] for payload, start in starts if start >= len(mark)]
+    if len(texts) >= _FEW:
+        parse_ahead([text.decode("ascii", "replace") for text in texts])
+
+
+def encode(message: Message) -> bytes:
+    """The compact JSON of a message, with exactly the fields that the legacy network knows.
+
+    Raises `InvalidMessage` (`signature`) if the message should be signed and is not.
+    """
+    if not isinstance(message, TransactionFeedback) and not message.signature:
+        raise InvalidMessage("signature", "the message is not signed; sign it before it travels")
+    return _ENCODER.encode(message)
+
+
+class MessageHash(bytes):
+    """The 32 bytes of a message's hash, which print as hexadecimal digits."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        return self.hex()
+
+    __repr__ = __str__
+
+
+def message_hash(message: Message) -> MessageHash:
+    """The 32-byte hash that names a message and that its signature covers: keccak256 of the packed fields.
+
+    Raises `InvalidMessage`: `unresolved-name` if an address is still an ENS name, `unsigned` for the feedback messages,
+    for which no hash is defined.
+    """
+    pack = _PACKERS.get(type(message))
+    if pack is None:
+        raise InvalidMessage("unsigned", f"what is signed in a {type(message).__name__} is not defined")
+    try:
+        return MessageHash(keccak256(pack(message)))
+    except InvalidAddress as error:
+        raise _unresolved(error) from None
+
+
+def equal_terms(order: Demand | Offer) -> tuple[str, str, str, int, str, int]:
+    """What a demand and an offer of one lighthouse must have in common to match."""
+    return (order.model, order.objective, order.token, order.cost, order.validator, order.generation)
+
+
+def lasting_hash(order: Demand | Offer) -> str:
+    """What all versions of an order share: in generation 5 its hash without the nonce, otherwise its hash."""
+    return message_hash(order if order.generation == 3 else replace(order, nonce=0)).hex()
+
+
+def cancellation_hash(liability: str) -> bytes:
+    """The 32-byte hash that both parties sign to cancel the liability at this address, each with `Signer.sign_hash`.
+
+    It is the keccak256 of the address and the six letters `cancel`: 26 bytes, a length that no message has. Raises
+    `InvalidAddress`.
+    """
+    return keccak256(address_bytes(liability) + b"cancel")
+
+
+def order_abi(order: Order) -> bytes:
+    """The plain `abi.encode` of a signed order's fields: what `createLiability` takes for a demand or an offer.
+
+    Generation 3 carries its nonce in the ninth place, generation 5 its sender, and contracts tell them apart by the
+    twelve zero bytes before an address. Raises `InvalidMessage`: `signature` if the order is not signed,
+    `unresolved-name`, or `nonce` if a generation-3 nonce would be taken for an address.
+    """
+    if not order.signature:
+        raise InvalidMessage("signature", "the order is not signed")
+    try:
+        ninth = _ninth_word(order)
+        model, objective, token, cost, first, second, fee, deadline = _terms(order)
+    except InvalidAddress as error:
+        raise _unresolved(error) from None
+    tails = [_abi_bytes(content) for content in (model, objective, bytes.fromhex(order.signature))]
+    objective_at = _ABI_HEAD + len(tails[0])
+    signature_at = objective_at + len(tails[1])
+    head = (
+        _word(_ABI_HEAD),
+        _word(objective_at),
+        _padded(token),
+        _word(cost),
+        _padded(first),
+        _padded(second),
+        _word(fee),
+        _word(deadline),
+        ninth,
+        _word(signature_at),
+    )
+    return b"".join((*head, *tails))
+
+
+def _type_of(payload: bytes) -> type[Message]:
+    # No value of a well-formed message contains a quotation mark, so a mark that is found is a key. A writer may spell
+    # keys with escapes; then none is found and the object is parsed.
+    for mark, kind in _MARKS:
+        if mark in payload:
+            return kind
+    present = _fields_of(payload)
+    for field, kind in _TYPE_OF_MARK.items():
+        if field in present:
+            return kind
+    raise InvalidMessage("unknown-kind", f"none of {', '.join(_TYPE_OF_MARK)} is present")
+
+
+def _fields_of(payload: bytes) -> dict[str, msgspec.Raw]:
+    try:
+        return decode_json(payload, dict[str, msgspec.Raw])
+    except InvalidData as error:
+        is_list = payload.lstrip().startswith(b"[")
+        raise InvalidMessage("unknown-kind" if is_list or error.reason == "type" else "not-json", str(error)) from None
+
+
+def _explain(payload: bytes, kind: type[Message], detail: str, *, reason: str = "field") -> NoReturn:
+    """Raise `InvalidMessage` with our own reason why `payload` is no message; not on the hot path."""
+    present = _fields_of(payload)
+    if "validatorFee" in present and "lighthouseFee" in present:
+        raise InvalidMessage("unknown-kind", "it has both validatorFee and lighthouseFee")
+    fields = _FIELDS[kind]
+    unknown = present.keys() - {field.encode_name for field in fields}
+    if unknown:
+        raise InvalidMessage("unknown-field", f"a {kind.__name__} has no {', '.join(map(repr, sorted(unknown)))}"[:200])
+    wanted = {field.encode_name for field in fields if field.name != "sender"}
+    if missing := wanted - present.keys():
+        raise InvalidMessage("field", f"{', '.join(sorted(missing))} missing")
+    if bytes(present.get("sender", b"")) == b"null":
+        raise InvalidMessage("field", "sender: expected an address")
+    raise InvalidMessage(reason, detail)
+
+
+def _terms(order: Order) -> tuple[bytes, bytes, bytes, int, bytes, bytes, int, int]:
+    """What a hash and a contract take of an order up to its nonce, in their order: they read an offer as a demand
+    whose lighthouse and validator are exchanged.
+    """
+    first, second = address_bytes(order.lighthouse), address_bytes(order.validator)
+    if isinstance(order, Demand):
+        fee = order.validator_fee
+    else:
+        first, second, fee = second, first, order.lighthouse_fee
+    model, objective, token = parse_cid(order.model), parse_cid(order.objective), address_bytes(order.token)
+    return model, objective, token, order.cost, first, second, fee, order.deadline
+
+
+def _pack_order(message: Order) -> bytes:
+    terms = _terms(message)
+    if message.sender is None:
+        tail = bytes.fromhex(message.nonce)  # type: ignore[arg-type]  # a text in generation 3
+    else:
+        tail = _word(message.nonce) + address_bytes(message.sender)  # type: ignore[arg-type]
+    model, objective, token, cost, first, second, fee, deadline = terms
+    if cost <= _MAX_UINT64 and fee <= _MAX_UINT64 and deadline <= _MAX_UINT64:
+        return _SMALL_ORDER.pack(*terms) + tail
+    return b"".join((model, objective, token, _word(cost), first, second, _word(fee), _word(deadline), tail))
+
+
+def _pack_result(message: Result) -> bytes:
+    return address_bytes(message.liability) + parse_cid(message.result) + (b"\1" if message.success else b"\0")
+
+
+def _pack_withdrawal(message: Withdrawal) -> bytes:
+    lighthouse = _padded(address_bytes(message.lighthouse))
+    return b"".join((_WITHDRAWAL_TYPE, bytes.fromhex(message.order), lighthouse, _word(message.deadline)))
+
+
+_PACKERS: Final[dict[type[Message], Callable[[Any], bytes]]] = {
+    Demand: _pack_order,
+    Offer: _pack_order,
+    Withdrawal: _pack_withdrawal,
+    Result: _pack_result,
+}
+"""What the hash of a message covers, by its type; for the feedback messages it is not defined."""
+
+
+def _ninth_word(order: Order) -> bytes:
+    if order.sender is not None:
+        return _padded(address_bytes(order.sender))
+    nonce = bytes.fromhex(order.nonce)  # type: ignore[arg-type]  # a text in generation 3
+    if nonce.startswith(_TWELVE_ZEROS):
+        raise InvalidMessage("nonce", "twelve leading zero bytes would make a contract take the nonce for a sender")
+    return nonce
+
+
+def _word(value: int) -> bytes:
+    return value.to_bytes(_WORD, "big")
+
+
+def _padded(address: bytes) -> bytes:
+    return _TWELVE_ZEROS + address
+
+
+def _abi_bytes(data: bytes) -> bytes:
+    return _word(len(data)) + data + bytes(-len(data) % _WORD)
+
+
+def _unresolved(error: InvalidAddress) -> InvalidMessage:
+    # An address field of a message holds an address or a name, so a text that is no address is a name.
+    return InvalidMessage("unresolved-name", f"{error.text} has to be resolved to an address first")

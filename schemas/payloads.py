@@ -1,23 +1,28 @@
 """Payloads of topics: their types, in Zenoh's encoding field and in the schemas of recordings, and Python values.
 
-Payloads are carried unchanged; the type says how to decode them. The ROS types of the legacy network's lessons,
-std_msgs/Empty and std_msgs/String, are defined here, those of numbers in `schemas.std_msgs`; of other types only the
-name travels with a message.
+Payloads are carried unchanged; the type says how to decode them. The std_msgs of ROS 1 that the legacy network's
+lessons use are defined here: Empty, String, and those of one number or an array of numbers, which need no more than
+`struct`, as they are little-endian and packed. Of other types only the name travels in Zenoh's encoding; the definition
+travels now and then, in a message's attachment (`SentDefinitions`).
 """
 
 from __future__ import annotations
 
 import math
+import struct
 from struct import Struct as Layout
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import msgspec
 from msgspec import Struct
 
-from schemas import std_msgs
+from schemas.decoding import InvalidData, decode_json
 from schemas.errors import InvalidPayload
 
-_LENGTH: Final = Layout("<I")
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
 _MEDIA_TYPES: Final = {
     "json": "application/json",
     "cdr": "application/cdr",
@@ -27,7 +32,44 @@ _MEDIA_TYPES: Final = {
 _ENCODINGS: Final = {media_type: encoding for encoding, media_type in _MEDIA_TYPES.items()}
 _SCHEMA_ENCODINGS: Final = {"ros1": "ros1msg", "json": "jsonschema", "cdr": "ros2msg", "protobuf": "protobuf"}
 _NO_ENCODINGS: Final = ("", "zenoh/bytes")
-_DECODER: Final = msgspec.json.Decoder()
+
+
+_FORMATS: Final = {
+    "Bool": "?",
+    "Int8": "b",
+    "UInt8": "B",
+    "Int16": "h",
+    "UInt16": "H",
+    "Int32": "i",
+    "UInt32": "I",
+    "Int64": "q",
+    "UInt64": "Q",
+    "Float32": "f",
+    "Float64": "d",
+}
+_ARRAYS: Final = {f"{name}MultiArray": letter for name, letter in _FORMATS.items() if letter != "?"}
+_LAYOUT: Final = f"""\
+MultiArrayLayout layout
+{{}}[] data
+{"=" * 80}
+MSG: std_msgs/MultiArrayLayout
+MultiArrayDimension[] dim
+uint32 data_offset
+{"=" * 80}
+MSG: std_msgs/MultiArrayDimension
+string label
+uint32 size
+uint32 stride
+"""
+_COUNT: Final = Layout("<I")
+_SIZES: Final = Layout("<II")
+_MAX_DIMENSIONS: Final = 32
+
+_NUMBERS: Final = {
+    **{f"std_msgs/{name}": f"{name.lower()} data\n" for name in _FORMATS},
+    **{f"std_msgs/{name}": _LAYOUT.format(name.removesuffix("MultiArray").lower()) for name in _ARRAYS},
+}
+"""The std_msgs of numbers, and their definitions."""
 
 
 class PayloadType(Struct, frozen=True):
@@ -83,15 +125,15 @@ class String(Struct, frozen=True):
             text = self.data.encode()
         except UnicodeEncodeError as error:
             raise InvalidPayload("std_msgs/String", str(error)) from None
-        return _LENGTH.pack(len(text)) + text
+        return _COUNT.pack(len(text)) + text
 
     @classmethod
     def decode(cls, payload: bytes) -> String:
         """The message in a payload. Raises `InvalidPayload` if the length does not fit or the text is not UTF-8."""
-        if len(payload) < _LENGTH.size or _LENGTH.unpack_from(payload)[0] != len(payload) - _LENGTH.size:
+        if len(payload) < _COUNT.size or _COUNT.unpack_from(payload)[0] != len(payload) - _COUNT.size:
             raise InvalidPayload("std_msgs/String", f"its length field does not match its {len(payload)} bytes")
         try:
-            return cls(payload[_LENGTH.size :].decode())
+            return cls(payload[_COUNT.size :].decode())
         except UnicodeDecodeError as error:
             raise InvalidPayload("std_msgs/String", str(error)) from None
 
@@ -101,9 +143,7 @@ STRING: Final = String.type
 JSON: Final = PayloadType("json", "", "jsonschema", b'{"type":"object","properties":{}}')
 RAW: Final = PayloadType("application/octet-stream")
 
-_NUMERIC: Final = {
-    name: PayloadType("ros1", name, "ros1msg", text.encode()) for name, text in std_msgs.DEFINITIONS.items()
-}
+_NUMERIC: Final = {name: PayloadType("ros1", name, "ros1msg", text.encode()) for name, text in _NUMBERS.items()}
 """The ROS types of a number or an array of numbers, by name."""
 _KNOWN: Final = {known.zenoh_encoding: known for known in (EMPTY, STRING, JSON, RAW, *_NUMERIC.values())}
 
@@ -153,7 +193,7 @@ def encode_value(value: object) -> tuple[bytes, PayloadType]:
     if hasattr(type(value), "tolist"):
         return encode_value(_plain(value))
     name = _numeric_type(value)
-    return (_encode_json(value), JSON) if name is None else (_encode_numeric(name, value), _NUMERIC[name])
+    return (_encode_json(value), JSON) if name is None else (_encode_numbers(name, value), _NUMERIC[name])
 
 
 def encode_as(value: object, kind: PayloadType) -> bytes | None:
@@ -163,14 +203,14 @@ def encode_as(value: object, kind: PayloadType) -> bytes | None:
     """
     name = kind.schema_name
     if kind.encoding == "ros1" and name in _NUMERIC:
-        return _encode_numeric(name, value)
+        return _encode_numbers(name, value)
     if kind in (STRING, EMPTY):
         payload, found = encode_value(value)
         if found != kind:
             raise InvalidPayload(name, f"it is a {found.schema_name or found.encoding}")
         return payload
     if kind.encoding == "json":
-        return _encode_json(value.data if isinstance(value, String) else None if isinstance(value, Empty) else value)
+        return _encode_json(_unwrapped(value))
     return None
 
 
@@ -185,16 +225,25 @@ def decode_value(payload: bytes, kind: PayloadType) -> Any:
         case "ros1", STRING.schema_name:
             return String.decode(payload)
         case "ros1", name if name in _NUMERIC:
-            try:
-                return std_msgs.decode(name, payload)
-            except ValueError as error:
-                raise InvalidPayload(name, str(error)) from None
+            return _decode_numbers(name, payload)
         case "json", _:
             try:
-                return _DECODER.decode(payload)
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                return decode_json(payload)
+            except InvalidData as error:
                 raise InvalidPayload("json", str(error)) from None
     return payload
+
+
+def plain_value(payload: bytes, kind: PayloadType) -> Any:
+    """The value of a payload as it was given to be sent: a text for std_msgs/String, None for std_msgs/Empty.
+
+    Otherwise as `decode_value`.
+    """
+    return _unwrapped(decode_value(payload, kind))
+
+
+def _unwrapped(value: Any) -> Any:
+    return value.data if isinstance(value, String) else None if isinstance(value, Empty) else value
 
 
 def _numeric_type(value: object) -> str | None:
@@ -207,15 +256,8 @@ def _numeric_type(value: object) -> str | None:
         case float():
             return "std_msgs/Float64"
         case list() | tuple():
-            return std_msgs.array_type(value)
+            return _array_type(value)
     return None
-
-
-def _encode_numeric(name: str, value: Any) -> bytes:
-    try:
-        return std_msgs.encode(name, value)
-    except ValueError as error:
-        raise InvalidPayload(name, str(error)) from None
 
 
 def _plain(value: Any) -> Any:
@@ -249,3 +291,114 @@ def _check_finite(value: object, path: str = "") -> None:
         case list() | tuple() | set() | frozenset():
             for number, member in enumerate(value):
                 _check_finite(member, f"{path}[{number}]")
+
+
+def _encode_numbers(type_name: str, value: Any) -> bytes:
+    """The payload of a number, or of a list of numbers, nested as its array has dimensions."""
+    name = type_name.removeprefix("std_msgs/")
+    try:
+        if name in _FORMATS:
+            return struct.pack(f"<{_FORMATS[name]}", value)
+        shape, numbers = _flattened(value)
+        return _dimensions(shape) + struct.pack(f"<I{len(numbers)}{_ARRAYS[name]}", len(numbers), *numbers)
+    except (struct.error, OverflowError, TypeError, ValueError) as error:
+        raise InvalidPayload(type_name, str(error)) from None
+
+
+def _decode_numbers(type_name: str, payload: bytes) -> Any:
+    """The number, or the list of numbers, in a payload."""
+    name = type_name.removeprefix("std_msgs/")
+    try:
+        if name in _FORMATS:
+            return struct.unpack(f"<{_FORMATS[name]}", payload)[0]
+        return _decode_array(_ARRAYS[name], payload)
+    except (struct.error, ValueError) as error:
+        raise InvalidPayload(type_name, str(error)) from None
+
+
+def _array_type(value: Sequence[Any]) -> str | None:
+    """The type of a list or tuple of numbers, or of rows of them that are equally long; None for anything else."""
+    try:
+        shape, numbers = _flattened(value)
+    except ValueError:
+        return None
+    kinds = {type(number) for number in numbers}
+    if not kinds <= {int, float} or (not numbers and len(shape) > 1):
+        return None
+    return "std_msgs/Int64MultiArray" if kinds == {int} else "std_msgs/Float64MultiArray"
+
+
+def _flattened(value: Any) -> tuple[list[int], list[Any]]:
+    """The sizes of an array's dimensions, and its elements. Raises `ValueError` if its rows are not alike."""
+    shape, elements = [len(value)], list(value)
+    while elements and all(isinstance(one, list | tuple) for one in elements):
+        if len({len(one) for one in elements}) > 1 or len(shape) == _MAX_DIMENSIONS:
+            raise ValueError("its rows differ in length, or it has too many dimensions")
+        shape.append(len(elements[0]))
+        elements = [number for row in elements for number in row]
+    return shape, elements
+
+
+def _dimensions(shape: list[int]) -> bytes:
+    """The layout of an array; one of one dimension has none."""
+    if len(shape) == 1:
+        shape = []
+    no_label, no_offset = _COUNT.pack(0), _COUNT.pack(0)
+    parts = [no_label + _SIZES.pack(size, math.prod(shape[number:])) for number, size in enumerate(shape)]
+    return _COUNT.pack(len(shape)) + b"".join(parts) + no_offset
+
+
+def _decode_array(number: str, payload: bytes) -> list[Any]:
+    offset, shape = _COUNT.size, list[int]()
+    (dimensions,) = _COUNT.unpack_from(payload)
+    if dimensions > _MAX_DIMENSIONS:
+        raise ValueError(f"it has {dimensions} dimensions")
+    for _ in range(dimensions):
+        offset += _COUNT.size + _COUNT.unpack_from(payload, offset)[0]  # the label
+        size, _ = _SIZES.unpack_from(payload, offset)
+        offset += _SIZES.size
+        shape.append(size)
+    _, count = _SIZES.unpack_from(payload, offset)  # after the offset of the data, which is for readers
+    numbers = list(struct.unpack(f"<{count}{number}", payload[offset + _SIZES.size :]))
+    if math.prod(shape) == count:  # other senders may state no sizes, or wrong ones
+        for size in reversed(shape[1:]):
+            numbers = [numbers[start : start + size] for start in range(0, len(numbers), size)]
+    return numbers
+
+
+REPEAT_SECONDS: Final = 5.0
+"""Seconds after which a definition travels again: what carried it may be lost, and listeners come later."""
+LONGEST_DEFINITION: Final = 64 << 10
+"""Bytes of the longest definition that travels."""
+REMEMBERED_TOPICS: Final = 4096
+_DEFINED_ENCODINGS: Final = frozenset({"ros1msg", "ros2msg", "ros2idl", "jsonschema", "protobuf"})
+
+
+def defined_by(attachment: bytes, type: PayloadType) -> PayloadType | None:
+    """The type with the definition in an attachment; None if there is none."""
+    _, _, text = attachment.partition(b"\n")
+    encoding, _, definition = text.partition(b"\n")
+    schema_encoding = encoding[:16].decode(errors="replace")
+    if not type.schema_name or not 0 < len(definition) <= LONGEST_DEFINITION:
+        return None
+    if schema_encoding not in _DEFINED_ENCODINGS:
+        return None
+    return PayloadType(type.encoding, type.schema_name, schema_encoding, definition)
+
+
+class SentDefinitions:
+    """When the definition of a topic's type was sent last: it goes with the first message, and then now and again."""
+
+    def __init__(self) -> None:
+        self._sent: dict[str, float] = {}
+
+    def attachment(self, mark: bytes, key: str, type: PayloadType, now: float) -> bytes:
+        """The attachment of a message on a key, at `now` (seconds on a monotonic clock): with the definition or not."""
+        if now - self._sent.get(key, -REPEAT_SECONDS) < REPEAT_SECONDS:
+            return mark
+        if len(self._sent) >= REMEMBERED_TOPICS:
+            self._sent.clear()
+        self._sent[key] = now
+        if not type.schema_data or len(type.schema_data) > LONGEST_DEFINITION:
+            return mark
+        return b"\n".join((mark, type.schema_encoding.encode(), type.schema_data))

@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias
 import msgspec
 from msgspec.structs import force_setattr
 
+from schemas.decoding import InvalidData, decode_json
 from schemas.errors import InvalidRecord
-from schemas.message_fields import MAX_UINT256
 
+MAX_UINT256: Final = 2**256 - 1
 MAX_RECORD_SIZE: Final = 65_536
 """The longest record, in bytes, that is decoded."""
 
 _MAX_TOTAL: Final = 2**53
+_LARGEST: Final = 2**64
 _MAX_DIGITS: Final = len(str(MAX_UINT256))
 
 if TYPE_CHECKING:
@@ -51,13 +53,11 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if len(payload) > MAX_RECORD_SIZE:
             raise InvalidRecord(cls.__name__, f"it has {len(payload)} bytes; the limit is {MAX_RECORD_SIZE}")
         try:
-            record: Self = _decoder(cls).decode(payload)
-        except msgspec.ValidationError as error:
-            if isinstance(error.__cause__, InvalidRecord):
-                raise error.__cause__ from None
-            raise InvalidRecord(cls.__name__, _one_line(error)) from None
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise InvalidRecord(cls.__name__, _one_line(error)) from None
+            record = decode_json(payload, cls, _read_amount)
+        except InvalidData as error:
+            raise InvalidRecord(cls.__name__, str(error)) from None
+        if not _has_usual_numbers(record):
+            raise InvalidRecord(cls.__name__, "a number is beyond 2^64")
         return record
 
 
@@ -101,9 +101,20 @@ def _amount_fields(kind: type[Record]) -> tuple[str, ...]:
     return tuple(field.name for field in msgspec.structs.fields(kind) if field.type is UInt256)
 
 
-@lru_cache(maxsize=128)
-def _decoder(kind: type[Any]) -> msgspec.json.Decoder[Any]:
-    return msgspec.json.Decoder(kind, dec_hook=_read_amount)
+def _has_usual_numbers(value: Any) -> bool:
+    """Whether no number but an amount is so large that a program that calculates with it or prints it fails."""
+    match value:
+        case UInt256() | bool():
+            return True
+        case int() | float():
+            return -_LARGEST <= value <= _LARGEST
+        case msgspec.Struct():
+            return all(_has_usual_numbers(getattr(value, name)) for name in value.__struct_fields__)
+        case dict():
+            return all(map(_has_usual_numbers, value.values()))
+        case list() | tuple():
+            return all(map(_has_usual_numbers, value))
+    return True
 
 
 def _read_amount(_kind: type[Any], value: Any) -> UInt256:
@@ -112,13 +123,4 @@ def _read_amount(_kind: type[Any], value: Any) -> UInt256:
     return UInt256(value)
 
 
-def _one_line(error: Exception) -> str:
-    """The text of an error, which may quote its input, in one line."""
-    return str(error)[:200].encode("unicode_escape").decode()
-
-
-def _write_amount(value: UInt256) -> str:
-    return str(int(value))
-
-
-_ENCODER: Final = msgspec.json.Encoder(enc_hook=_write_amount)
+_ENCODER: Final = msgspec.json.Encoder(enc_hook=lambda amount: str(int(amount)))

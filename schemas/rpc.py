@@ -1,26 +1,135 @@
 """The services of an agent, queryables under `aira/agent/{address}/rpc/`: their requests and replies.
 
 The fields have the names they had in the legacy stack's ROS services. Amounts are in wei (`eth_balance`) or in the
-smallest unit of the agent's token, which is XRT (wn) unless its settings name another.
+smallest unit of the agent's token, which is XRT (wn) unless its settings name another. Those of market messages have
+the names that messages have on the wire: the agent that is asked signs and publishes one, or publishes one already
+signed; addresses may be ENS names, and a model may be given by its name.
+
 `SERVICES` maps a service to its request and reply; an error is Zenoh's error reply with one line of text.
 """
 
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self
 
-from schemas.logs import LogsRead, ReadLogs
-from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
-from schemas.records import Liability, Record, UInt256  # msgspec reads the annotations
-from schemas.status import Status
+import msgspec
+
+from schemas.errors import InvalidMessage
+from schemas.messages import Demand, Offer, Result
+from schemas.records import (
+    MAX_UINT256,
+    Liability,  # msgspec reads the annotations
+    Record,
+    UInt256,
+)
+from schemas.status import LogsRead, ReadLogs, Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from schemas.messages import SignedMessage
 
-class StartLiability(Record, frozen=True):
-    """Start to play the objective of the liability at `address`."""
+
+_MAX_DIGITS: Final = len(str(MAX_UINT256))
+
+
+class _MessageRequest(Record, frozen=True, kw_only=True):
+    """A request about a message of the market, whose fields it has."""
+
+    kind: ClassVar[type[Any]]
+    """The message's class."""
+
+    @classmethod
+    def of(cls, message: SignedMessage) -> Self:
+        """The request to publish a signed message."""
+        fields = msgspec.structs.asdict(message)
+        return cls(**fields | ({"nonce": str(fields["nonce"])} if "nonce" in fields else {}))
+
+    def message(self) -> Any:
+        """The signed message to be published. Raises `InvalidMessage`."""
+        nonce = getattr(self, "nonce", "")
+        return self.unsigned(**({"nonce": _count(nonce)} if getattr(self, "sender", None) is not None else {}))
+
+    def unsigned(self, **added: Any) -> Any:
+        """The message with these further fields, to be signed. Raises `InvalidMessage`."""
+        fields = msgspec.structs.asdict(self)
+        plain = {name: int(value) if isinstance(value, UInt256) else value for name, value in fields.items()}
+        return self.kind(**plain | added)
+
+
+class _OrderRequest(_MessageRequest, frozen=True, kw_only=True, rename="camel"):
+    """The fields that requests for a Demand and for an Offer share."""
+
+    model: str
+    objective: str
+    token: str
+    cost: UInt256
+    lighthouse: str
+    validator: str
+    deadline: UInt256
+
+
+class SignDemand(_OrderRequest, frozen=True, kw_only=True, rename="camel"):
+    """Sign and publish a Demand; the agent adds nonce, sender (generation 5) and signature."""
+
+    kind: ClassVar = Demand
+    validator_fee: UInt256
+
+
+class SignOffer(_OrderRequest, frozen=True, kw_only=True, rename="camel"):
+    """Sign and publish an Offer; the agent adds nonce, sender (generation 5) and signature."""
+
+    kind: ClassVar = Offer
+    lighthouse_fee: UInt256
+
+
+class SignResult(_MessageRequest, frozen=True, kw_only=True):
+    """Sign and publish a Result."""
+
+    kind: ClassVar = Result
+    liability: str
+    result: str
+    success: bool
+
+
+class SendDemand(SignDemand, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
+    """Publish a signed Demand. `nonce` is 64 hexadecimal digits, or decimal digits if there is a `sender`."""
+
+    nonce: str
+    sender: str | None = None
+    signature: str
+
+
+class SendOffer(SignOffer, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
+    """Publish a signed Offer. `nonce` is 64 hexadecimal digits, or decimal digits if there is a `sender`."""
+
+    nonce: str
+    sender: str | None = None
+    signature: str
+
+
+class SendResult(SignResult, frozen=True, kw_only=True):
+    """Publish a signed Result."""
+
+    signature: str
+
+
+class Published(Record, frozen=True):
+    """The message was published; `hash` is its hash, 64 hexadecimal digits."""
+
+    hash: str
+
+
+def _count(nonce: str) -> int:
+    if not (nonce.isascii() and nonce.isdigit() and len(nonce) <= _MAX_DIGITS):
+        raise InvalidMessage("nonce", "the nonce of a generation-5 order is a number in decimal digits")
+    return int(nonce)
+
+
+class LiabilityRequest(Record, frozen=True):
+    """Read the record of the liability at `address`; or play its objective: from the start, from the start again, or on
+    from where it stopped."""
 
     address: str
 
@@ -30,24 +139,6 @@ class FinishLiability(Record, frozen=True):
 
     address: str
     success: bool
-
-
-class RestartLiability(Record, frozen=True):
-    """Play the objective of the liability at `address` again from the start."""
-
-    address: str
-
-
-class ResumeLiability(Record, frozen=True):
-    """Continue to play the objective of the liability at `address` where it stopped."""
-
-    address: str
-
-
-class ReadLiability(Record, frozen=True):
-    """Request the record of the liability at `address`."""
-
-    address: str
 
 
 class Done(Record, frozen=True):
@@ -158,11 +249,11 @@ class Service(NamedTuple):
 
 SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
     {
-        "start": Service(StartLiability, Done),
+        "start": Service(LiabilityRequest, Done),
         "finish": Service(FinishLiability, Nothing),
-        "restart": Service(RestartLiability, Done),
-        "resume": Service(ResumeLiability, Done),
-        "read": Service(ReadLiability, LiabilityRead),
+        "restart": Service(LiabilityRequest, Done),
+        "resume": Service(LiabilityRequest, Done),
+        "read": Service(LiabilityRequest, LiabilityRead),
         "status": Service(Nothing, Status),
         "logs": Service(ReadLogs, LogsRead),
         "sign/demand": Service(SignDemand, Published),

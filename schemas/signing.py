@@ -5,12 +5,19 @@ else; addresses and CIDs, which repeat between messages, are cached.
 
 Every signature has twins (v as 0/1, high s) that other readers accept. Here only one form is valid, so a message can't
 travel under two texts.
+
+Everything that signs or verifies calls libsecp256k1 here. `lib` and `ffi` are the bindings of coincurve; on Python 3.14
+and later, for which coincurve has no builds, those of btclib-secp256k1. Both give libsecp256k1's own functions. This is
+the one place that imports a private module of coincurve: its public recovery allocates three objects for each message,
+takes 15 % longer, and would put the verification of messages below its bar.
 """
 
 from __future__ import annotations
 
 import re
+import sys
 import threading
+from enum import StrEnum
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeAlias, TypeVar
 
@@ -19,14 +26,72 @@ from msgspec.structs import replace
 
 from schemas.address import ZERO_ADDRESS, checksum_address, keccak256
 from schemas.errors import InputError, InvalidMessage, InvalidRecord
-from schemas.message_fields import SIGNATURE_SIZE, hex_digits
-from schemas.messages import OrderFeedback, SignedMessage, TransactionFeedback
+from schemas.messages import (
+    SIGNATURE_SIZE,
+    OrderFeedback,
+    SignedMessage,
+    TransactionFeedback,
+    decode,
+    hex_digits,
+    message_hash,
+)
 from schemas.records import Record
-from schemas.secp256k1 import CONTEXT, ORDER, ffi, is_private_key, lib, point_of, public_key, sign_recoverable
-from schemas.wire import decode, message_hash
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    ffi: Any
+    lib: Any
+    CONTEXT: Any
+elif sys.version_info >= (3, 14):
+    from btclib_secp256k1 import ffi, lib
+    from btclib_secp256k1.context import ctx
+
+    CONTEXT = ctx
+else:
+    from coincurve._libsecp256k1 import ffi, lib
+    from coincurve.context import GLOBAL_CONTEXT
+
+    CONTEXT = GLOBAL_CONTEXT.ctx
+
+
+ORDER: Final = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD0364141
+"""The number of points of the curve. Private keys are smaller, and at least 1."""
+
+_UNCOMPRESSED: Final = 2
+"""`SECP256K1_EC_UNCOMPRESSED`, which one of the bindings lacks."""
+
+
+def is_private_key(secret: bytes) -> bool:
+    """Whether these are 32 bytes of a number from 1 to `ORDER` less one."""
+    return len(secret) == 32 and 0 < int.from_bytes(secret, "big") < ORDER
+
+
+def public_key(secret: bytes) -> bytes:
+    """The public key of a private key, as libsecp256k1 holds it: 64 bytes whose order depends on the machine."""
+    key = ffi.new("secp256k1_pubkey *")
+    if not lib.secp256k1_ec_pubkey_create(CONTEXT, key, secret):
+        raise ValueError("not a private key")
+    return bytes(ffi.buffer(key))
+
+
+def point_of(key: bytes) -> bytes:
+    """The 64 bytes of x and y of a public key, which is given as libsecp256k1 holds it."""
+    source, text, size = ffi.new("secp256k1_pubkey *"), ffi.new("unsigned char[65]"), ffi.new("size_t *", 65)
+    ffi.memmove(source, key, len(key))
+    lib.secp256k1_ec_pubkey_serialize(CONTEXT, text, size, source, _UNCOMPRESSED)
+    return bytes(ffi.buffer(text)[1:])
+
+
+def sign_recoverable(digest: bytes, secret: bytes) -> bytes:
+    """The signature of 32 bytes: r, s (the lower one), and the recovery id from 0 to 3; deterministic (RFC 6979)."""
+    signature = ffi.new("secp256k1_ecdsa_recoverable_signature *")
+    if not lib.secp256k1_ecdsa_sign_recoverable(CONTEXT, signature, digest, secret, ffi.NULL, ffi.NULL):
+        raise ValueError("not a private key")
+    compact, recovery_id = ffi.new("unsigned char[64]"), ffi.new("int *")
+    lib.secp256k1_ecdsa_recoverable_signature_serialize_compact(CONTEXT, compact, recovery_id, signature)
+    return bytes(ffi.buffer(compact)) + bytes((recovery_id[0],))
+
 
 _M = TypeVar("_M", bound=SignedMessage)
 _M_co = TypeVar("_M_co", bound=SignedMessage, covariant=True)
@@ -193,7 +258,6 @@ class SignedRecord(Record, frozen=True, kw_only=True):
 
     @property
     def signer(self) -> str:
-        """The author's address."""
         address: str = getattr(self, self.author)
         return address
 
@@ -219,10 +283,33 @@ class _Statement(SignedRecord, frozen=True, kw_only=True):
     """For people."""
 
 
+class Refusal(StrEnum):
+    """Why a provider refuses an order, as published to its sender."""
+
+    EXPIRED = "expired"
+    """Its deadline has passed."""
+    DUPLICATE = "duplicate"
+    """It is in the book already."""
+    LIGHTHOUSE = "lighthouse"
+    """It names another lighthouse."""
+    FULL = "full"
+    """The book is full; try again later."""
+    WITHDRAWN = "withdrawn"
+    """Its maker has withdrawn it."""
+    REPLACED = "replaced"
+    """Its maker has signed it again, or another version of it has become a contract."""
+    UNDECIDED = "undecided"
+    """A transaction with another version of it may still succeed, after a reorganisation; try again later."""
+    UNPAID = "unpaid"
+    """Its contract would not cover the provider's gas, and no free one is left now; try again later."""
+    BLOCKED = "blocked"
+    """Its maker is blocked; this is not published."""
+
+
 class Rejection(_Statement, frozen=True, kw_only=True):
     """A provider's statement that it can't use an order or a result; put on `aira/{lighthouse}/reject/{maker}`.
 
-    `reason` is a word for programs (a rejection by the order book, or the name of the contracts' error), `provider` the
+    `reason` is a word for programs (a `Refusal` by the order book, or the name of the contracts' error), `provider` the
     EIP-55 address of the provider. Trust it only if it `is_signed` by a provider of the lighthouse.
     """
 
@@ -236,9 +323,12 @@ class Rejection(_Statement, frozen=True, kw_only=True):
 class Decline(_Statement, frozen=True, kw_only=True):
     """An agent's statement that it does not work for a demand; put on `aira/{lighthouse}/decline/{maker}`.
 
+    A bridge states with it, as `too-large`, that it does not pass a demand on to the legacy network.
+
     `code` is a word for programs: `unknown-topic`, `unfit-message`, or another reason why the objective does not fit;
     `objective-unavailable`, `busy`, or a word of the agent's own, as `too-cheap`. `detail` has at most `LONGEST_DETAIL`
-    characters; `agent` is the EIP-55 address of the agent. Trust it only if it `is_signed` by an agent that is present.
+    characters; `agent` is the EIP-55 address of the agent. Trust it only if it `is_signed` by an agent or a bridge that
+    is present.
     """
 
     domain: ClassVar = b"aira decline\0"

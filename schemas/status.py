@@ -1,7 +1,8 @@
-"""The status of agents, providers and bridges, as they report it over Zenoh.
+"""What a process tells about itself over Zenoh: its status, and its log.
 
-Agents and providers answer the service `status` (see `schemas.rpc`), bridges a query on `bridge_status_key`. Readers
-ignore unknown fields, because different versions talk to each other here.
+Agents, providers, bridges and edge agents answer the services `status` and `logs` (see `schemas.rpc`), bridges a query
+on `bridge_status_key`. A log event as a JSON line on stderr has the same fields. Readers ignore unknown fields, because
+different versions talk to each other here.
 """
 
 from __future__ import annotations
@@ -11,8 +12,71 @@ from typing import Final
 
 import msgspec
 
-from schemas.agent_keys import RpcKey
+from schemas.keys import RpcKey
 from schemas.records import Record, UInt256
+
+LEVELS: Final = ("debug", "info", "warning", "error", "critical")
+"""The levels, in ascending order."""
+
+
+class LogEvent(Record, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=False):
+    """One event of a log. Empty fields are not sent."""
+
+    sequence: int = 0
+    """Its number in the log of its process, from 1."""
+    time: str
+    """ISO 8601, UTC, with milliseconds and `Z`."""
+    level: str
+    """One of `LEVELS`."""
+    logger: str
+    """The module that logged it."""
+    event: str = ""
+    """The stable name of what happened (`contract-created`), for programs; empty for other programs' lines."""
+    message: str
+    role: str = ""
+    """The role of the process: agent, provider, router, bridge, edge."""
+    address: str = ""
+    """The account of the process (EIP-55)."""
+    lighthouse: str = ""
+    liability: str = ""
+    """The contract that it concerns (EIP-55)."""
+    facts: Mapping[str, str] = {}
+    """Further fields by name; in a JSON line they are members of the event itself."""
+    error: str = ""
+    """The exception, in one line."""
+    trace: str = ""
+    """Its traceback, with line breaks."""
+
+
+class ReadLogs(Record, frozen=True, kw_only=True):
+    """A request for events, the oldest first."""
+
+    after: Mapping[str, int] = {}
+    """The sequence number of the last event that the caller has, by instance."""
+    lines: int = 100
+    """How many of the newest events to return from an instance that is not in `after`."""
+    level: str = "debug"
+    """The lowest level to return, one of `LEVELS`."""
+    liability: str = ""
+    """Return only events that concern this contract (empty: all)."""
+
+
+class LogsRead(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
+    """The reply: as many events as fit."""
+
+    instance: str
+    """An id of this run of the process; it changes at a restart."""
+    began: str
+    """When this run started; as `LogEvent.time`."""
+    role: str = ""
+    entries: tuple[LogEvent, ...] = ()
+    last: int
+    """The sequence number to continue from."""
+    more: bool = False
+    """Whether there are more events now."""
+    missed: int = 0
+    """How many of the requested events are no longer in memory."""
+
 
 ALIVE: Final = "alive"
 """The state of a part that works."""
@@ -41,7 +105,8 @@ class Work(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fie
 class MarketStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
     """A provider's market since it started: open orders, contracts, rejected messages by reason, amounts.
 
-    `fees` and `minted` (XRT for gas) are in wn, `spent` is in wei.
+    `fees` and `minted` (XRT for gas) are in wn, `spent` is in wei. Of the contracts that don't cover their gas,
+    `free_created` were created; `free_a_day` may be a day, for others than customers, and `free_left` now.
     """
 
     open_orders: int
@@ -52,6 +117,9 @@ class MarketStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unk
     spent: UInt256
     fees: UInt256
     minted: UInt256
+    free_a_day: int = 0
+    free_left: int = 0
+    free_created: int = 0
 
 
 class ValidationStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):

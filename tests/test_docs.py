@@ -1,4 +1,4 @@
-"""The documents name files that exist."""
+"""The documents name files, headings and parts of the source that exist."""
 
 from __future__ import annotations
 
@@ -8,14 +8,41 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")))
 SOURCE = re.compile(r"`((?:schemas|mesh|bridges|tests|bench|contracts|deploy|peers|examples)/[\w./-]*)`")
 LINK = re.compile(r"\]\((?!https?:|#)([^)#]+)")
+ANCHOR = re.compile(r"\]\((?!https?:)([^)#]*)#([^)]+)\)")
+PARTS = re.compile(r"`((?:schemas|mesh|bridges)/[\w/]+\.py)`: (`[\w.]+`(?:,\s`[\w.]+`)*)")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+@pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 def test_every_file_that_a_page_names_exists(page: Path) -> None:
     text = page.read_text()
     named = [ROOT / path for path in SOURCE.findall(text)] + [page.parent / path for path in LINK.findall(text)]
 
     assert [str(path) for path in named if not path.exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
+def test_every_heading_that_a_page_links_to_exists(page: Path) -> None:
+    linked = [(page.parent / path if path else page, anchor) for path, anchor in ANCHOR.findall(page.read_text())]
+
+    assert [(str(path), anchor) for path, anchor in linked if anchor not in anchors(path)] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
+def test_every_part_that_a_page_names_is_in_its_file(page: Path) -> None:
+    missing = [
+        (path, name)
+        for path, names in PARTS.findall(page.read_text())
+        for name in re.findall(r"[\w.]+", names)
+        if not all(re.search(rf"\b{part}\b", (ROOT / path).read_text()) for part in name.split("."))
+    ]
+
+    assert missing == []
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}

@@ -68,6 +68,34 @@ def test_a_class_name_is_defined_in_one_module() -> None:
     assert {name: sorted(paths) for name, paths in homes.items() if len(paths) > 1 and name not in SHARED} == {}
 
 
+def imported(tree: ast.AST) -> set[str]:
+    """The modules, and the names in them, that a module imports."""
+    names = set[str]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}", *(f"{node.module}.{name.name}" for name in node.names)}
+    return names
+
+
+def test_modules_that_only_their_package_imports_begin_with_an_underscore() -> None:
+    others = [(path, imported(tree)) for path, tree in sources()]
+    others += [(f"bench/{path.name}", imported(ast.parse(path.read_text()))) for path in (ROOT / "bench").glob("*.py")]
+    entry_points = set(re.findall(r'"([\w.]+):\w+"', (ROOT / "pyproject.toml").read_text()))
+    others.append(("pyproject.toml", entry_points))
+    misnamed = []
+    for path, _ in sources():
+        package, name = path.removesuffix(".py").rsplit("/", 1)
+        # What stands at the top is everybody's, and commands are named by what people type.
+        if name.startswith("__") or package in (*PACKAGES, "mesh/cli"):
+            continue
+        module = f"{package}/{name}".replace("/", ".")
+        is_public = any(module in names for other, names in others if not other.startswith(f"{package}/"))
+        if is_public == name.startswith("_"):
+            misnamed.append(path)
+
+    assert misnamed == []
+
+
 def import_everything() -> None:
     for path, _ in sources():
         if "__main__" not in path:
@@ -79,6 +107,19 @@ def codes_of_errors() -> dict[str, str | None]:
     import_everything()
     ours = (kind for kind in error_classes() if kind.__module__.startswith(PACKAGES))
     return {f"{kind.__module__}.{kind.__qualname__}": kind.__dict__.get("code") for kind in ours}
+
+
+def codes_of_raised() -> set[str]:
+    """The codes that errors are given where they are raised: `ConfigurationError("…", code="files-missing")`."""
+    classes = {name.rsplit(".", 1)[1] for name in codes_of_errors()} | {"AiraError", "super().__init__"}
+    return {
+        str(keyword.value.value)
+        for _, tree in sources()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func).removeprefix("errors.") in classes
+        for keyword in node.keywords
+        if keyword.arg == "code" and isinstance(keyword.value, ast.Constant)
+    }
 
 
 def documented(heading: str) -> set[str]:
@@ -95,7 +136,16 @@ def test_every_error_class_has_a_code_of_its_own() -> None:
 
 
 def test_the_documented_error_codes_are_those_of_the_source() -> None:
-    assert documented("Errors") == set(codes_of_errors().values())
+    assert documented("Errors") == set(codes_of_errors().values()) | codes_of_raised()
+
+
+def test_the_documented_error_classes_are_those_of_the_codes() -> None:
+    classes = {code: name.rsplit(".", 1)[1] for name, code in codes_of_errors().items()}
+    section = (ROOT / "docs" / "codes.md").read_text().split("## Errors\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| `([\w-]+)` \| `(\w+)` \|", section, re.MULTILINE)
+
+    assert {code: name for code, name in rows if classes.get(code, name) != name} == {}
+    assert {name for _, name in rows} <= {"AiraError", *classes.values()}
 
 
 def test_the_documented_log_events_are_those_of_the_source() -> None:

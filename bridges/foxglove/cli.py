@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 from contextlib import AsyncExitStack
 from dataclasses import replace
 from functools import partial
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from bridges.web.cli import token_in
-from mesh.agent.status import WatcherStatus
-from mesh.background import Background
+from bridges.web.cli import listening
+from mesh.base.background import Background
+from mesh.base.extras import needs_extra
 from mesh.cli.options import ADDRESS, FILE, with_settings
 from mesh.cli.output import announce
-from mesh.extras import needs_extra
-from mesh.running import run_until_stopped
-from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
-from mesh.starting import open_when_ready
+from mesh.role.running import open_when_ready, run_until_stopped
+from mesh.role.status import WatcherStatus
+from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings
 from mesh.telemetry.serving import Telemetry
 from schemas import parse_address
+from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bridges.foxglove.front import FoxgloveFront
-    from bridges.foxglove.options import FoxgloveOptions
+    from bridges.foxglove.server import FoxgloveFront
     from mesh.network import Channel, Network
     from mesh.settings import Settings
 
@@ -52,13 +53,15 @@ def served(function: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--token-file", type=FILE, help="file with the token that clients add to the address"),
         click.option("--key", type=FILE, help="key of the certificate (PEM)"),
         click.option("--certificate", type=FILE, help="certificate of this server for TLS (PEM)"),
-        click.option("--listen", default="127.0.0.1:8765", show_default=True, metavar="HOST:PORT", help="address"),
+        click.option(
+            "--listen", default="127.0.0.1:8765", show_default=True, metavar="HOST:PORT", help="address to listen on"
+        ),
     ):
         function = option(function)
     return function
 
 
-_WATCHING: Final = (*options_of(NetworkSettings), "lighthouse_contract", *options_of(TelemetrySettings))
+_WATCHING: Final = (NetworkSettings, "lighthouse_contract", TelemetrySettings)
 
 
 @command.command("market", short_help="orders, results, jobs and readings of a market")
@@ -66,7 +69,7 @@ _WATCHING: Final = (*options_of(NetworkSettings), "lighthouse_contract", *option
 @with_settings(*_WATCHING)
 def market(settings: Settings, **options: Any) -> None:
     """Show everything that happens on a lighthouse's market. Needs a router, but no account and no chain."""
-    run_until_stopped(lambda: _serve(settings, options, _market), settings=settings, role="foxglove")
+    run_until_stopped(lambda: _serve(settings, options, partial(_live, "")), settings=settings, role="foxglove")
 
 
 @command.command("agent", short_help="an agent's readings, devices, jobs, status and log")
@@ -75,14 +78,14 @@ def market(settings: Settings, **options: Any) -> None:
 @with_settings(*_WATCHING)
 def agent(settings: Settings, address: str, **options: Any) -> None:
     """Show what the agent with ADDRESS and its devices publish. Needs a router, but no account and no chain."""
-    work = partial(_agent, parse_address(address))
+    work = partial(_live, parse_address(address))
     run_until_stopped(lambda: _serve(settings, options, work), settings=settings, role="foxglove")
 
 
 @command.command("job", short_help="a running job; one that has ended, to scrub through")
 @click.argument("liability")
 @served
-@with_settings(*_WATCHING, "objective_size_limit", "content_limit", "fetch_timeout", *options_of(ChainSettings))
+@with_settings(*_WATCHING, "objective_size_limit", "content_limit", "fetch_timeout", ChainSettings)
 def job(settings: Settings, liability: str, **options: Any) -> None:
     """Show the job of the contract LIABILITY while it runs. One that has ended is played from its recording, and
     Foxglove controls that: play, pause, speed, seek. A job that ends while it is watched can be played then."""
@@ -97,14 +100,28 @@ def job(settings: Settings, liability: str, **options: Any) -> None:
 @click.option("--out", type=FILE, help="file to write (new)")
 def layout(name: str, plots: tuple[str, ...], images: tuple[str, ...], out: Any) -> None:
     """Print the layout NAME, or save it with --out. In Foxglove: Layouts, Import from file."""
-    from bridges.foxglove.layouts import layout_json
     from mesh.cli.files import require_new_file
 
     text = layout_json(name, plots=plots, images=images)
     if out is None:
         click.echo(text)
     else:
-        require_new_file(out).write_text(text + "\n")
+        require_new_file(out).write_text(text + "\n", encoding="utf-8")
+
+
+def layout_json(name: str, *, plots: tuple[str, ...] = (), images: tuple[str, ...] = ()) -> str:
+    """The layout of that name, with these paths in its plot, and a panel for each of these topics of images."""
+    text = (files("bridges.foxglove") / "layouts" / f"{name}.json").read_text(encoding="utf-8")
+    layout: dict[str, Any] = decode_json(text)
+    panels = layout["configById"]
+    if plots:
+        series = [{"value": path, "enabled": True, "timestampMethod": "receiveTime"} for path in plots]
+        panels["Plot!values"]["paths"] = series
+    for number, topic in enumerate(images):
+        panel = f"Image!{number}"
+        panels[panel] = {"imageMode": {"imageTopic": topic}}
+        layout["layout"] = {"direction": "row", "first": layout["layout"], "second": panel, "splitPercentage": 70}
+    return json.dumps(layout, indent=2)
 
 
 async def _serve(
@@ -112,11 +129,13 @@ async def _serve(
 ) -> None:
     """Open the address that clients connect to, and show something there until cancelled."""
     with needs_extra("foxglove", "aira foxglove"):
-        from bridges.foxglove.front import FoxgloveFront
-        from bridges.foxglove.server import FoxgloveServer  # noqa: F401 - whether the SDK is here
-    from mesh.flood import Drops
+        from bridges.foxglove.server import (
+            FoxgloveFront,
+            FoxgloveOptions,
+        )
+    from mesh.base.flood import Drops
 
-    chosen = await asyncio.to_thread(foxglove_options, options)
+    chosen = FoxgloveOptions(**await asyncio.to_thread(listening, options), origins=options["origins"])
     drops = Drops()
     async with (
         Telemetry(settings.metrics_listen) as telemetry,
@@ -127,51 +146,28 @@ async def _serve(
         await show(settings, telemetry, front)
 
 
-def foxglove_options(options: dict[str, Any]) -> FoxgloveOptions:
-    """The options as the server takes them. Raises `InputError`, `InvalidListenAddress`, `NotOpenToOthers`."""
-    from bridges.foxglove.options import FoxgloveOptions
-    from mesh.telemetry.health import listen_address
-
-    host, port = listen_address(options["listen"])
-    chosen = FoxgloveOptions(
-        host=host,
-        port=port,
-        token=token_in(options["token_file"]),
-        certificate=str(options["certificate"] or ""),
-        key=str(options["key"] or ""),
-        origins=options["origins"],
-    )
-    chosen.check()
-    return chosen
-
-
-async def _market(settings: Settings, telemetry: Telemetry, front: FoxgloveFront) -> None:
+async def _live(agent: str, settings: Settings, telemetry: Telemetry, front: FoxgloveFront) -> None:
+    """Show the agent with that address; without one, the market."""
     from bridges.foxglove.server import FoxgloveServer
-    from bridges.foxglove.sources import show_market
+    from bridges.foxglove.sources import show_agent, show_market
+    from mesh.role.composition import watching
 
     async with AsyncExitStack() as stack:
-        network, channel = await _watching(stack, settings, telemetry, front)
-        name = f"market {channel.lighthouse}"
-        server = await stack.enter_async_context(FoxgloveServer(front, name, front.drops))
+        make = partial(watching, settings, drops=front.drops)
+        network, channel = await open_when_ready(stack, settings, make, role="view", on_wait=telemetry.starting)
+        _show_health(stack, telemetry, network, channel, front)
+        name = f"agent {agent}" if agent else f"market {channel.lighthouse}"
+        server = await stack.enter_async_context(FoxgloveServer(front, name))
         _announce(front, name, network)
-        await show_market(server, network.session, channel)
-
-
-async def _agent(address: str, settings: Settings, telemetry: Telemetry, front: FoxgloveFront) -> None:
-    from bridges.foxglove.server import FoxgloveServer
-    from bridges.foxglove.sources import show_agent
-
-    async with AsyncExitStack() as stack:
-        network, channel = await _watching(stack, settings, telemetry, front)
-        name = f"agent {address}"
-        server = await stack.enter_async_context(FoxgloveServer(front, name, front.drops))
-        _announce(front, name, network)
-        await show_agent(server, network.session, address, channel.lighthouse, drops=front.drops)
+        if agent:
+            await show_agent(server, network.session, agent, channel.lighthouse)
+        else:
+            await show_market(server, network.session, channel)
 
 
 async def _job(address: str, settings: Settings, telemetry: Telemetry, front: FoxgloveFront) -> None:
     with needs_extra("chain", "aira foxglove job"):
-        from bridges.foxglove.jobs import show_job_until_end, show_recording
+        from bridges.foxglove._player import show_job_until_end, show_recording
         from bridges.web.components import opened
 
     own = replace(settings, keyfile="")
@@ -182,18 +178,6 @@ async def _job(address: str, settings: Settings, telemetry: Telemetry, front: Fo
         _announce(front, f"job {address}", parts.network)
         liability = await show_job_until_end(parts, front, address)
         await show_recording(parts, front, liability)
-
-
-async def _watching(
-    stack: AsyncExitStack, settings: Settings, telemetry: Telemetry, front: FoxgloveFront
-) -> tuple[Network, Channel]:
-    """The router and the channel of the market."""
-    from mesh.agent.components import watching
-
-    make = partial(watching, settings, drops=front.drops)
-    network, channel = await open_when_ready(stack, settings, make, role="view", on_wait=telemetry.starting)
-    _show_health(stack, telemetry, network, channel, front)
-    return network, channel
 
 
 def _show_health(

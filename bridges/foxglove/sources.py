@@ -7,28 +7,31 @@ import time
 from collections import Counter
 from contextlib import AsyncExitStack
 from datetime import datetime
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from mesh import foxglove
-from mesh.background import Background
-from mesh.cli.event_lines import EventFormatter, event_json
+from mesh.base.background import Background
+from mesh.cli.watch import EventFormatter, event_json
 from mesh.errors import AiraError
 from mesh.network import Pump, Reading
+from mesh.recording import foxglove
 from mesh.watching import JobEvent, MarketWatch, status_of
-from mesh.watching.logs import LogReader
 from mesh.watching.market import read_event
+from mesh.watching.presence import LogReader
 from schemas import PlaybackPosition, ProgressKey, event_selector
-from schemas.agent_keys import (
+from schemas.keys import (
     DeviceTopicKey,
     LiabilityTopicKey,
     ObjectiveTopicKey,
     ReadingKey,
     RpcKey,
+    device_selector,
+    objective_selector,
     parse_agent_key,
+    reading_selector,
+    topic_selector,
 )
-from schemas.definitions import defined_by
-from schemas.payloads import PayloadType, payload_type
-from schemas.selectors import device_selector, objective_selector, reading_selector, topic_selector
+from schemas.payloads import PayloadType, defined_by, payload_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,7 +39,6 @@ if TYPE_CHECKING:
     import zenoh
 
     from bridges.foxglove.server import FoxgloveServer
-    from mesh.flood import Drops
     from mesh.network import Channel
     from mesh.watching import MarketEvent
 
@@ -46,11 +48,6 @@ JOB: Final = "/aira/job"
 PROGRESS: Final = "/aira/progress"
 STATUS: Final = "/aira/status"
 COUNTS: Final = "/aira/counts"
-STATUS_INTERVAL: Final = 5.0
-LOG_INTERVAL: Final = 2.0
-COUNT_INTERVAL: Final = 1.0
-LINES: Final = 100
-"""Lines of an agent's log from before."""
 _LEVELS: Final = {
     "debug": foxglove.LogLevel.DEBUG,
     "info": foxglove.LogLevel.INFO,
@@ -88,9 +85,9 @@ def _show_event(server: FoxgloveServer, formatter: EventFormatter, event: Market
         topic = f"/{event.agent.lower()}{event.topic}"
         server.publish(topic, event.payload, event.type, sender=event.agent)
         return "reading"
-    facts = event_json(event, time="")
+    facts = _facts(event)
     kind = "job" if isinstance(event, JobEvent) else str(facts["event"])
-    server.publish_value(f"/market/{kind}", {name: value for name, value in facts.items() if name != "time"})
+    server.publish_value(f"/market/{kind}", facts)
     server.publish_value(LOG, foxglove.Log(message=formatter.line(event), name=kind))
     return kind
 
@@ -100,12 +97,10 @@ async def _show_counts(server: FoxgloveServer, counts: Counter[str]) -> None:
     kinds = ("demand", "offer", "result", "rejected", "declined", "job", "reading")
     while True:
         server.publish_value(COUNTS, {kind: counts[kind] for kind in kinds})
-        await asyncio.sleep(COUNT_INTERVAL)
+        await asyncio.sleep(1.0)
 
 
-async def show_agent(
-    server: FoxgloveServer, session: zenoh.Session, agent: str, lighthouse: str, *, drops: Drops
-) -> None:
+async def show_agent(server: FoxgloveServer, session: zenoh.Session, agent: str, lighthouse: str) -> None:
     """Show what an agent (address) and its devices publish, its jobs, its status and its log, until cancelled."""
     selectors = (
         reading_selector(agent),
@@ -116,15 +111,15 @@ async def show_agent(
     )
     async with Background() as tasks:
         for selector in selectors:
-            tasks.start(_show_topics(server, session, selector, _agent_topic, drops=drops), f"foxglove: {selector}")
+            tasks.start(_show_topics(server, session, selector, _agent_topic), f"foxglove: {selector}")
         tasks.start(_show_log(server, session, agent), "foxglove: log")
         while True:
             for status in await status_of(session, agent, lighthouse):
                 server.publish(STATUS, status.encode(), PayloadType("json", "aira.Status"))
-            await asyncio.sleep(STATUS_INTERVAL)
+            await asyncio.sleep(5.0)
 
 
-async def show_job(server: FoxgloveServer, session: zenoh.Session, agent: str, liability: str, *, drops: Drops) -> None:
+async def show_job(server: FoxgloveServer, session: zenoh.Session, agent: str, liability: str) -> None:
     """Show a job, by the address of its promisor and its own, until cancelled."""
     selectors = (
         topic_selector(agent, liability),
@@ -133,35 +128,26 @@ async def show_job(server: FoxgloveServer, session: zenoh.Session, agent: str, l
     )
     async with Background() as tasks:
         for selector in selectors:
-            tasks.start(_show_topics(server, session, selector, _job_topic, drops=drops), f"foxglove: {selector}")
+            tasks.start(_show_topics(server, session, selector, attrgetter("topic")), f"foxglove: {selector}")
         await _show_log(server, session, agent, liability)
         await asyncio.Event().wait()
 
 
 async def _show_topics(
-    server: FoxgloveServer,
-    session: zenoh.Session,
-    selector: str,
-    name: Callable[[Any], str],
-    *,
-    drops: Drops,
+    server: FoxgloveServer, session: zenoh.Session, selector: str, name: Callable[[Any], str]
 ) -> None:
-    def convert(sample: zenoh.Sample) -> LiveMessage | None:
-        return received(sample, name)
-
-    async with Pump(session, selector, convert, drops=drops) as pump:
+    async with Pump(session, selector, lambda sample: received(sample, name), drops=server.front.drops) as pump:
         async for message in pump:
-            _show(server, message)
+            if message.event is None:
+                server.publish(message.topic, message.payload, message.type, at_ns=message.at_ns)
+                continue
+            server.publish_value(JOB, _facts(message.event), at_ns=message.at_ns)
+            words = f"{message.event.event}: {message.event.liability.address}"
+            server.publish_value(LOG, foxglove.Log(message=words, name="job"), at_ns=message.at_ns)
 
 
-def _show(server: FoxgloveServer, message: LiveMessage) -> None:
-    if message.event is None:
-        server.publish(message.topic, message.payload, message.type, at_ns=message.at_ns)
-        return
-    facts = event_json(message.event, time="")
-    server.publish_value(JOB, {name: value for name, value in facts.items() if name != "time"}, at_ns=message.at_ns)
-    words = f"{message.event.event}: {message.event.liability.address}"
-    server.publish_value(LOG, foxglove.Log(message=words, name="job"), at_ns=message.at_ns)
+def _facts(event: MarketEvent) -> dict[str, Any]:
+    return {name: value for name, value in event_json(event, time="").items() if name != "time"}
 
 
 def received(sample: zenoh.Sample, name: Callable[[Any], str]) -> LiveMessage | None:
@@ -189,11 +175,6 @@ def _type_of(sample: zenoh.Sample) -> PayloadType:
     return defined_by(sample.attachment.to_bytes(), kind) or kind
 
 
-def _job_topic(key: Any) -> str:
-    """The topic of a message of a job: as in its recording."""
-    return str(key.topic)
-
-
 def _agent_topic(key: Any) -> str:
     match key:
         case ReadingKey():
@@ -205,7 +186,7 @@ def _agent_topic(key: Any) -> str:
 
 async def _show_log(server: FoxgloveServer, session: zenoh.Session, agent: str, liability: str = "") -> None:
     """Show the lines of an agent's log as long as it answers us: on a site, it answers operators only."""
-    reader = LogReader(session, str(RpcKey(agent, "logs")), lines=LINES, level="info", liability=liability)
+    reader = LogReader(session, str(RpcKey(agent, "logs")), lines=100, level="info", liability=liability)
     while True:
         try:
             update = await reader.poll()
@@ -221,7 +202,7 @@ async def _show_log(server: FoxgloveServer, session: zenoh.Session, agent: str, 
             )
             server.publish_value(LOG, line, at_ns=at)
         if not update.more:
-            await asyncio.sleep(LOG_INTERVAL)
+            await asyncio.sleep(2.0)
 
 
 def _time_of(text: str) -> int:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 from bridges.ipfs.daemon import Daemon
 from bridges.ipfs.service import authorization_of
-from mesh.doctor.checks import Check, CheckResult, passed, warning
+from mesh.ops.doctor.checks import Check, CheckResult, passed, warning
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.doctor.context import DoctorContext
+    from mesh.ops.doctor.checks import DoctorContext
     from mesh.settings import IpfsSettings, Settings
 
 CALL_TIMEOUT: Final = 4.0
@@ -39,7 +39,7 @@ async def check_daemon(settings: IpfsSettings) -> CheckResult:
 
 
 async def check_pubsub(settings: Settings) -> CheckResult:
-    """Whether PubSub is enabled, and how many others subscribe to the lighthouse's topic. Raises `PubSubDisabled`."""
+    """Whether PubSub is enabled, and how many others subscribe to the lighthouse's topic. Raises `IpfsError`."""
     async with _connected(settings) as daemon:
         topic = settings.lighthouse_contract
         listeners = len(await daemon.listeners(topic))

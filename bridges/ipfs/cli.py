@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from mesh.base.log_context import LogSource
+from mesh.base.outage_log import OutageLog
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
-from mesh.errors import NetworkUnavailable
-from mesh.log_context import LogSource
-from mesh.outage_log import OutageLog
-from mesh.retry import Backoff
-from mesh.running import run_until_stopped
-from mesh.settings import ChainSettings, IpfsSettings, NetworkSettings, TelemetrySettings, options_of
+from mesh.errors import InputError
+from mesh.role.running import run_until_stopped
+from mesh.settings import ChainSettings, IpfsSettings, NetworkSettings, TelemetrySettings
 from mesh.telemetry.logs import LogService, set_process_source
 from schemas import parse_address
 
@@ -40,26 +39,34 @@ log = logging.getLogger(__name__)
     metavar="NAME",
     help="lighthouse whose channel to bridge (may be repeated) [the settings' lighthouse_contract]",
 )
+@click.option(
+    "--serve-api",
+    metavar="HOST:PORT",
+    help="where there is no daemon: serve what legacy pages use of one's RPC from the mesh, as at 127.0.0.1:5001",
+)
 @with_settings(
-    *options_of(NetworkSettings),
-    *options_of(IpfsSettings),
+    NetworkSettings,
+    IpfsSettings,
     "lighthouse_contract",
     "blocked_signers",
     "objective_size_limit",
     "content_limit",
     "fetch_timeout",
     "keyfile",
-    *options_of(ChainSettings),
-    *options_of(TelemetrySettings),
+    ChainSettings,
+    TelemetrySettings,
 )
-def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -> None:
+def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...], serve_api: str | None) -> None:
     """Relay messages and content between the mesh and the legacy network on IPFS. Ctrl-C stops it.
 
     The daemon must have PubSub enabled. The bridge waits for the daemon, the router and the node, and reconnects to
     them. Several bridges may serve one lighthouse, each with its own --data-dir: one is active, the others are on
     standby. Without a node (--web3-http-provider ""), or until it is reachable, ENS names in messages are not resolved
-    and deadlines are not checked.
+    and deadlines are not checked. With --serve-api there is no daemon, and nothing is relayed to IPFS.
     """
+    if serve_api is not None:
+        run_until_stopped(lambda: _serve_api(settings, serve_api), settings=settings, role="bridge")
+        return
     if api:
         settings = dataclasses.replace(settings, ipfs_http_provider=api)
     run_until_stopped(lambda: _serve(settings, lighthouses), settings=settings, role="bridge")
@@ -71,15 +78,16 @@ def _address(settings: Settings) -> str | None:
 
     if not settings.tls_certificate:
         return own_address(settings)
-    from mesh.identity.certificates import holder_address
+    from mesh.ops.identity.certificates import holder_address
 
     return holder_address(settings.tls_certificate)
 
 
 async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
-    from bridges.ipfs.addresses import base_url
+    from bridges.ipfs.daemon import base_url
     from bridges.ipfs.service import IpfsBridge
-    from mesh.starting import wait_for_files
+    from mesh.role.composition import endpoints_of, open_network
+    from mesh.role.running import wait_for_files
     from mesh.telemetry.serving import Telemetry
 
     base_url(settings.ipfs_http_provider)  # fail now rather than after waiting for files or a router
@@ -87,13 +95,41 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         await wait_for_files(settings)
         chain = _chain(settings)
-        network = await _network(settings, stack, waiting=telemetry.starting)
+        network = await open_network(
+            stack, endpoints_of(settings), OutageLog(log, "router"), on_wait=telemetry.starting
+        )
         bridge = await stack.enter_async_context(
             IpfsBridge(network, settings, lighthouses=lighthouses, chain=chain, address=_address(settings))
         )
         stack.enter_context(telemetry.showing(measure=bridge.measure, health=bridge.parts))
         await _introduce(bridge, network, stack)
         await bridge.run()
+
+
+async def _serve_api(settings: Settings, address: str) -> None:
+    """Serve the daemon's RPC from the mesh; no daemon is needed."""
+
+    from bridges.ipfs._serving import IpfsApi
+    from mesh.content import Exchange
+    from mesh.role.composition import endpoints_of, open_network, open_store
+
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit():
+        raise InputError(f"{address!r} is not as in 127.0.0.1:5001")
+    async with AsyncExitStack() as stack:
+        network = await open_network(stack, endpoints_of(settings), OutageLog(log, "router"), on_wait=lambda _: None)
+        directory = settings.state_directory / "bridge" / "ipfs-api"
+        store = await open_store(stack, settings, directory, limit=settings.objective_size_limit)
+        exchange = await stack.enter_async_context(Exchange(network.session, store))
+        limit, timeout = settings.objective_size_limit, settings.fetch_timeout
+        api = await stack.enter_async_context(
+            IpfsApi(
+                network.session, store, exchange,
+                host=host, port=int(port), size_limit=limit, timeout=timeout,
+            )
+        )  # fmt: skip
+        announce(log, "ipfs-api-served", f"the API of IPFS is served from the mesh at {api.url}", url=api.url)
+        await api.run()
 
 
 async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack) -> None:
@@ -110,27 +146,9 @@ async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack
         services.offer("logs", LogService("bridge", "").logs)
 
 
-async def _network(settings: NetworkSettings, stack: AsyncExitStack, *, waiting: Callable[[str], None]) -> Network:
-    """Open the session, and wait for a router; `waiting` is called with the error of each attempt."""
-    from mesh.composition import endpoints_of
-    from mesh.network import Network
-
-    backoff, outage = Backoff(), OutageLog(log, "router")
-    while True:
-        try:
-            network = await stack.enter_async_context(Network(endpoints_of(settings)))
-        except NetworkUnavailable as error:
-            outage.failed(error, "the bridge waits for a router")
-            waiting(str(error))
-            await backoff.wait()
-        else:
-            outage.recovered("a router answers")
-            return network
-
-
 def _chain(settings: ChainSettings) -> Callable[[], Chain] | None:
     """A factory of chain clients, None if the settings name no node. Raises `ConfigurationError`."""
-    from mesh.composition import chain_of
+    from mesh.role.composition import chain_of
 
     if not settings.web3_http_provider.strip() and not settings.web3_ws_provider.strip():
         return None

@@ -1,44 +1,236 @@
-"""A client of an IPFS daemon's HTTP RPC: PubSub, content, the swarm."""
+"""An IPFS daemon: its errors, its address, the two dialects of its PubSub, and a client of its HTTP RPC.
+
+Since go-ipfs 0.11 and ipfs-core 0.13 (both December 2021) topics and data are multibase texts, and published data is a
+multipart file, because the older dialect broke topics and data that contain a line feed. Sources: the changelogs of
+go-ipfs 0.11.0 and ipfs-core 0.13.0, and `core/commands/pubsub.go` of go-ipfs 0.4.18.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import binascii
 import math
+import re
+from base64 import b64decode, urlsafe_b64encode
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
+from urllib.parse import urlsplit
 
 import aiohttp
 import msgspec
 
-from bridges.ipfs.addresses import base_url, without_credentials
-from bridges.ipfs.errors import (
-    AccessDenied,
-    DaemonRefused,
-    DaemonUnreachable,
-    NoPeers,
-    PublishedOutOfOrder,
-    PubSubDisabled,
-)
-from bridges.ipfs.pubsub import DaemonVersion, MultibaseDialect, PubsubDialect, PubsubMessage, dialect_of, lines_of
-from mesh.errors import ClosedError
+from mesh.errors import ClosedError, ConfigurationError, RemoteError
+from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator
+    from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator
     from pathlib import Path
+
+
+class IpfsError(RemoteError, code="daemon-refused"):
+    """An IPFS daemon or gateway answered a call with an error, or (`daemon-unreachable`) not at all.
+
+    `no-peers`: it knows no other subscriber of the topic; keep the message and publish it later.
+    `published-out-of-order`: it validated a later message of its own first, and dropped this one as a replay; publish
+    it again.
+    """
+
+    def __init__(self, api: str, why: str, *, hint: str = "", code: str = "") -> None:
+        super().__init__(f"IPFS at {api}: {why}", hint=hint, code=code)
+
+
+def unreachable(api: str, why: str | BaseException) -> IpfsError:
+    """The error for a daemon that does not answer, or whose connection broke; it may be back later."""
+    hint = "is the daemon running, and is this the address of its RPC?"
+    return IpfsError(api, str(why) or type(why).__name__, hint=hint, code="daemon-unreachable")
+
+
+async def read_answer(answer: aiohttp.ClientResponse, api: str, limit: int) -> bytes:
+    """The body of an answer. Raises `IpfsError`, also for more than `limit` bytes."""
+    content = bytearray()
+    try:
+        async for chunk in answer.content.iter_any():
+            content += chunk
+            if len(content) > limit:
+                raise IpfsError(api, f"an answer of more than {limit} bytes")
+    except (aiohttp.ClientError, TimeoutError) as error:
+        raise unreachable(api, f"the answer broke off: {_words(error)}") from error
+    return bytes(content)
+
+
+def _words(error: BaseException) -> str:
+    return str(error) or type(error).__name__
+
+
+_HINT: Final = "write it as /ip4/127.0.0.1/tcp/5001 or http://127.0.0.1:5001"
+_HOSTS: Final = ("ip4", "ip6", "dns", "dns4", "dns6", "dnsaddr")
+
+
+def base_url(text: str) -> str:
+    """The URL for `text`, which is a URL or a multiaddr, without a trailing slash.
+
+    Multiaddrs look like `/ip4/127.0.0.1/tcp/5001`, optionally followed by `/http`, `/https` or `/tls/http`. Raises
+    `ConfigurationError`.
+    """
+    url = _of_multiaddr(text) if text.startswith("/") else text
+    try:
+        parts = urlsplit(url)
+        usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # an invalid port, or an unclosed bracket
+        usable = False
+    if not usable or parts.query or parts.fragment:
+        raise ConfigurationError(f"{text!r} is not the address of an IPFS daemon or gateway", hint=_HINT)
+    return url.rstrip("/")
+
+
+def without_credentials(url: str) -> str:
+    """The URL without user name and password, for display."""
+    scheme, _, rest = url.partition("://")
+    return f"{scheme}://{rest.rpartition('@')[2]}"
+
+
+def _of_multiaddr(text: str) -> str:
+    match text.rstrip("/").split("/")[1:]:
+        case [kind, host, "tcp", port, *rest] if kind in _HOSTS and host and _is_port(port):
+            scheme = {(): "http", ("http",): "http", ("https",): "https", ("tls", "http"): "https"}.get(tuple(rest))
+            if scheme is not None:
+                return f"{scheme}://{f'[{host}]' if kind == 'ip6' else host}:{port}"
+    raise ConfigurationError(f"{text!r} is not a multiaddr of an IPFS daemon's RPC", hint=_HINT)
+
+
+def _is_port(text: str) -> bool:
+    return text.isascii() and text.isdigit() and 0 < int(text) <= 65_535
+
+
+class DaemonVersion(msgspec.Struct, frozen=True):
+    """A daemon's answer to `/api/v0/version`."""
+
+    version: str = msgspec.field(default="", name="Version")
+    golang: str = msgspec.field(default="", name="Golang")
+    js_core: str = msgspec.field(default="", name="ipfs-core")
+    js_interface: str = msgspec.field(default="", name="interface-ipfs-core")
+
+    @property
+    def is_js(self) -> bool:
+        """Whether it is js-ipfs; all others are go-ipfs or Kubo."""
+        return bool(self.js_core or self.js_interface)
+
+    def __str__(self) -> str:
+        if self.is_js:
+            return f"js-ipfs {self.version or 'unknown'}"
+        return f"{'go-ipfs' if _numbers(self.version) < (0, 14) else 'kubo'} {self.version or 'unknown'}"
+
+
+class PubsubMessage(NamedTuple):
+    """A message received on a topic: its publisher, as the daemon writes it, and the data."""
+
+    sender: str
+    data: bytes
+
+
+class _SubscriptionLine(msgspec.Struct):
+    """A line of a subscription. The first line of js-ipfs is `{}`."""
+
+    sender: str = msgspec.field(default="", name="from")
+    data: str | None = None
+
+
+class PubsubDialect:
+    """How a daemon encodes topics and data: plainly, before December 2021; received data is base64."""
+
+    name = "plain"
+    subscription: tuple[tuple[str, str], ...] = (("discover", "true"),)
+    """The arguments of a subscription besides the topic."""
+
+    def topic(self, topic: str) -> str:
+        """The topic as a call's argument."""
+        return topic
+
+    def publication(self, data: bytes) -> tuple[list[tuple[str, str]], bytes | None]:
+        """How to publish data: further arguments of the call, and the content of its file, if it has one.
+
+        Raises `UnicodeDecodeError` (a `ValueError`), if an argument can't be this text.
+        """
+        return [("arg", data.decode())], None
+
+    def message(self, line: bytes) -> PubsubMessage | None:
+        """The message in a line of a subscription; None for a line without one. Raises `ValueError`."""
+        try:
+            decoded = decode_json(line, _SubscriptionLine)
+        except InvalidData as error:
+            raise ValueError(f"not a line of a subscription: {error}") from None
+        if decoded.data is None:
+            return None
+        try:
+            return PubsubMessage(decoded.sender, self._data(decoded.data))
+        except binascii.Error as error:
+            raise ValueError(f"the data is not base64: {error}") from None
+
+    def _data(self, text: str) -> bytes:
+        return b64decode(text, validate=True)
+
+
+class MultibaseDialect(PubsubDialect):
+    """The current dialect: topics and data are base64url without padding, prefixed with `u`."""
+
+    name = "multibase"
+    subscription = ()
+
+    def topic(self, topic: str) -> str:
+        return "u" + urlsafe_b64encode(topic.encode()).rstrip(b"=").decode()
+
+    def publication(self, data: bytes) -> tuple[list[tuple[str, str]], bytes | None]:
+        return [], data
+
+    def _data(self, text: str) -> bytes:
+        if not text.startswith("u"):
+            raise ValueError(f"the data is in multibase {text[:1]!r}, not in base64url")
+        return b64decode(text[1:] + "=" * (-len(text[1:]) % 4), altchars=b"-_", validate=True)
+
+
+def dialect_of(version: DaemonVersion) -> PubsubDialect:
+    """The dialect of a daemon of that version; the current one if the version is unreadable."""
+    if version.js_core:
+        return PubsubDialect() if _numbers(version.js_core) < (0, 13) else MultibaseDialect()
+    if version.js_interface:  # js-ipfs did not report its core before 2020
+        return PubsubDialect()
+    return PubsubDialect() if _numbers(version.version) < (0, 11) else MultibaseDialect()
+
+
+async def lines_of(chunks: AsyncIterable[bytes], *, limit: int) -> AsyncIterator[bytes]:
+    """Yield each line without its line feed as soon as it is complete; an empty one for more than `limit` bytes.
+
+    Data after the last line feed is dropped: the stream broke off inside a line.
+    """
+    kept, too_long = bytearray(), False
+    async for chunk in chunks:
+        *ends, rest = chunk.split(b"\n")
+        for end in ends:
+            too_long = too_long or len(kept) + len(end) > limit
+            yield b"" if too_long else bytes(kept) + end
+            kept.clear()
+            too_long = False
+        too_long = too_long or len(kept) + len(rest) > limit
+        if too_long:
+            kept.clear()
+        else:
+            kept += rest
+
+
+def _numbers(text: str) -> tuple[int, int]:
+    found = re.search(r"(\d+)\.(\d+)", text)
+    return (int(found[1]), int(found[2])) if found else (9999, 0)  # an unreadable version counts as a recent one
+
 
 T = TypeVar("T")
 
 CALL_TIMEOUT: Final = 15.0
 """Seconds for a call that transfers no content."""
-CONNECT_TIMEOUT: Final = 5.0
 PUBLISH_INTERVAL: Final = 0.02
 """Seconds between two messages to a Kubo. Since 0.40 a node drops a message that it validates after a later one of the
 same origin, and it validates concurrently: of 1000 messages without a pause 9 were lost. 2 ms suffice on an idle
 machine; this is for busy ones."""
-LINE_LIMIT: Final = 2 * 1024 * 1024
-"""Bytes of a subscription's line, at most: PubSub's own limit of 1 MiB in base64, with its envelope."""
 RESPONSE_LIMIT: Final = 4 * 1024 * 1024
-REASON_LIMIT: Final = 300
 ADD_OPTIONS: Final = (
     ("cid-version", "0"),
     ("raw-leaves", "false"),
@@ -51,40 +243,26 @@ ADD_OPTIONS: Final = (
 configured otherwise since 2025. Daemons ignore options that they do not know."""
 
 
-class _Refusal(msgspec.Struct):
+class _Peer(msgspec.Struct):
+    id: str = msgspec.field(name="Peer")
+
+
+class _DaemonAnswer(msgspec.Struct):
+    """What the daemon answers to a call: each has some of these fields."""
+
     message: str = msgspec.field(default="", name="Message")
-
-
-class _Strings(msgspec.Struct):
-    strings: list[str] | None = msgspec.field(default=None, name="Strings")
-
-
-class Identity(msgspec.Struct, frozen=True):
-    """A daemon's peer id and addresses in the swarm."""
-
     id: str = msgspec.field(default="", name="ID")
-    addresses: list[str] | None = msgspec.field(default=None, name="Addresses")
-
-
-class _Added(msgspec.Struct):
-    name: str = msgspec.field(name="Hash")
-
-
-class _SwarmPeer(msgspec.Struct):
-    peer: str = msgspec.field(name="Peer")
-
-
-class _SwarmPeers(msgspec.Struct):
-    peers: list[_SwarmPeer] | None = msgspec.field(default=None, name="Peers")
+    hash: str = msgspec.field(default="", name="Hash")
+    strings: list[str] | None = msgspec.field(default=None, name="Strings")
+    peers: list[_Peer] | None = msgspec.field(default=None, name="Peers")
 
 
 class Daemon:
     """The daemon at `api` (a multiaddr or a URL): `async with Daemon(api) as daemon`, then `detect_version`.
 
     `authorization` is the value of the `Authorization` header of a protected API; `call_timeout` is in seconds, for
-    calls that transfer no content. Opening makes no call, so the daemon may start later. Every call raises
-    `DaemonUnreachable` when the daemon does not answer in time, `DaemonRefused` with the daemon's message when it
-    answers with an error, and `ClosedError` outside `async with`.
+    calls that transfer no content. Opening makes no call, so the daemon may start later. Every call raises `IpfsError`:
+    with the daemon's message when it answers with an error, and `daemon-unreachable` when it does not answer in time.
     """
 
     def __init__(self, api: str, *, authorization: str = "", call_timeout: float = CALL_TIMEOUT) -> None:
@@ -121,16 +299,16 @@ class Daemon:
         """`multibase` or `plain`."""
         return self._dialect.name
 
-    async def identity(self) -> Identity:
-        """The daemon's peer id and addresses."""
-        return await self._call("id", Identity)
+    async def identity(self) -> str:
+        """The daemon's peer id."""
+        return (await self._call("id", _DaemonAnswer)).id
 
     async def publish(self, topic: str, data: bytes) -> None:
         """Publish `data` on `topic`. Concurrent calls are serialized, and spaced for a Kubo.
 
-        Raises `NoPeers` when the daemon reports that there are no listeners (not all do, see `listeners`), and
-        `PublishedOutOfOrder` when the message must be published again: a Kubo since 0.40 numbers a message before
-        validating it, and drops one that it validates after a higher number.
+        Raises `IpfsError`: `no-peers` when the daemon reports that there are no listeners (not all do, see
+        `listeners`), `published-out-of-order` when the message must be published again: a Kubo since 0.40 numbers a
+        message before validating it, and drops one that it validates after a higher number.
         """
         more, content = self._dialect.publication(data)
         form = None if content is None else _form(content)
@@ -145,8 +323,8 @@ class Daemon:
     async def subscribe(self, topic: str) -> AsyncGenerator[AsyncIterator[PubsubMessage | None]]:
         """Subscribe to `topic`: an iterator over its messages, this daemon's own included; None for an unreadable line.
 
-        The subscription is active when the body begins. The iterator ends only by `DaemonUnreachable`, when the daemon
-        ends the subscription.
+        The subscription is active when the body begins. The iterator ends only by `IpfsError`, when the daemon ends
+        the subscription.
         """
         arguments = (("arg", self._dialect.topic(topic)), *self._dialect.subscription)
         async with self._post("pubsub/sub", *arguments, timeout=math.inf) as answer:
@@ -154,17 +332,17 @@ class Daemon:
 
     async def listeners(self, topic: str) -> list[str]:
         """The other nodes on `topic` that the daemon knows."""
-        found = await self._call("pubsub/peers", _Strings, ("arg", self._dialect.topic(topic)))
+        found = await self._call("pubsub/peers", _DaemonAnswer, ("arg", self._dialect.topic(topic)))
         return found.strings or []
 
     async def swarm_peers(self) -> list[str]:
         """The peer ids of the nodes to which the daemon is connected."""
-        found = await self._call("swarm/peers", _SwarmPeers)
-        return [peer.peer for peer in found.peers or []]
+        found = await self._call("swarm/peers", _DaemonAnswer)
+        return [peer.id for peer in found.peers or []]
 
     async def connect(self, address: str) -> None:
         """Connect to the node at a multiaddr that ends in `/p2p/` (or `/ipfs/`) and its peer id."""
-        await self._call("swarm/connect", _Strings, ("arg", address))
+        await self._call("swarm/connect", _DaemonAnswer, ("arg", address))
 
     async def add(self, path: Path, *, timeout: float = CALL_TIMEOUT) -> str:
         """Add and pin a file with `ADD_OPTIONS`; returns the daemon's CID. Raises `OSError` when it can't be read."""
@@ -172,9 +350,11 @@ class Daemon:
             form = aiohttp.FormData()
             form.add_field("file", stream, filename=path.name, content_type="application/octet-stream")
             added = await self._call(
-                "add", _Added, *ADD_OPTIONS, ("pin", "true"), ("progress", "false"), body=form, timeout=timeout
+                "add", _DaemonAnswer, *ADD_OPTIONS, ("pin", "true"), ("progress", "false"), body=form, timeout=timeout
             )
-        return added.name
+        if not added.hash:
+            raise IpfsError(self.api, "an answer to add without a hash")
+        return added.hash
 
     async def put_block(self, data: bytes) -> None:
         """Put a block of a CIDv0 file, unpinned.
@@ -195,14 +375,15 @@ class Daemon:
     async def block(self, cid: str, *, limit: int, timeout: float = CALL_TIMEOUT) -> bytes:
         """A block by its CID, unverified, which the daemon holds or finds within `timeout` seconds.
 
-        Raises `DaemonRefused` when it does not find it, or when it has more than `limit` bytes.
+        Raises `IpfsError` when it does not find it, or when it has more than `limit` bytes.
         """
         async with self._post("block/get", ("arg", cid), timeout=timeout) as answer:
-            return await self._read(answer, limit)
+            return await read_answer(answer, self.api, limit)
 
     async def _messages(self, answer: aiohttp.ClientResponse) -> AsyncIterator[PubsubMessage | None]:
         try:
-            async for line in lines_of(answer.content.iter_any(), limit=LINE_LIMIT):
+            # PubSub's own limit of 1 MiB in base64, with its envelope
+            async for line in lines_of(answer.content.iter_any(), limit=2 * 1024 * 1024):
                 try:
                     message = self._dialect.message(line)
                 except ValueError:
@@ -211,8 +392,8 @@ class Daemon:
                 if message is not None:
                     yield message
         except (aiohttp.ClientError, TimeoutError) as error:
-            raise DaemonUnreachable(self.api, f"the subscription broke off: {_words(error)}") from error
-        raise DaemonUnreachable(self.api, "the daemon ended the subscription")
+            raise unreachable(self.api, f"the subscription broke off: {_words(error)}") from error
+        raise unreachable(self.api, "the daemon ended the subscription")
 
     async def _call(
         self,
@@ -223,11 +404,11 @@ class Daemon:
         timeout: float | None = None,
     ) -> T:
         async with self._post(call, *arguments, body=body, timeout=timeout) as answer:
-            content = await self._read(answer, RESPONSE_LIMIT)
+            content = await read_answer(answer, self.api, RESPONSE_LIMIT)
         try:
-            return msgspec.json.decode(content, type=kind)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise DaemonRefused(self.api, 200, f"unexpected answer to {call}: {error}") from None
+            return decode_json(content, kind)
+        except InvalidData as error:
+            raise IpfsError(self.api, f"unexpected answer to {call}: {error}") from None
 
     @asynccontextmanager
     async def _post(
@@ -246,50 +427,40 @@ class Daemon:
             raise ClosedError("the client of the IPFS daemon is not open", hint="use it inside `async with`")
         url = f"{self._base}/api/v0/{call}"
         total = self._call_timeout if timeout is None else timeout
-        limits = aiohttp.ClientTimeout(total=None if total == math.inf else total, connect=CONNECT_TIMEOUT)
+        limits = aiohttp.ClientTimeout(total=None if total == math.inf else total, connect=5.0)
         try:
             async with asyncio.timeout(self._call_timeout if total == math.inf else None):
                 answer = await self._http.post(url, params=arguments, data=body, timeout=limits, allow_redirects=False)
         except (aiohttp.ClientError, TimeoutError) as error:
-            raise DaemonUnreachable(self.api, f"{call}: {_words(error)}") from error
+            raise unreachable(self.api, f"{call}: {_words(error)}") from error
         async with answer:
             if answer.status != 200:
-                raise self._refused(answer.status, await self._read(answer, RESPONSE_LIMIT))
+                raise self._refused(answer.status, await read_answer(answer, self.api, RESPONSE_LIMIT))
             yield answer
 
-    async def _read(self, answer: aiohttp.ClientResponse, limit: int) -> bytes:
-        content = bytearray()
+    def _refused(self, status: int, content: bytes) -> IpfsError:
         try:
-            async for chunk in answer.content.iter_any():
-                content += chunk
-                if len(content) > limit:
-                    raise DaemonRefused(self.api, answer.status, f"an answer of more than {limit} bytes")
-        except (aiohttp.ClientError, TimeoutError) as error:
-            raise DaemonUnreachable(self.api, f"the answer broke off: {_words(error)}") from error
-        return bytes(content)
-
-    def _refused(self, status: int, content: bytes) -> DaemonRefused:
-        try:
-            why = msgspec.json.decode(content, type=_Refusal).message
-        except (msgspec.DecodeError, UnicodeDecodeError):
+            why = decode_json(content, _DaemonAnswer).message
+        except InvalidData:
             why = content.decode(errors="replace").strip()
-        why = why[:REASON_LIMIT] or f"HTTP {status}"
+        why = why[:300] or f"HTTP {status}"
         if status in (401, 403):
-            return AccessDenied(self.api, status, why)
+            hint = (
+                "put the value of the Authorization header into a file and pass --ipfs-authorization-file; it must"
+                " allow version, id, pubsub, swarm, add, block and pin below /api/v0/"
+            )
+            return IpfsError(self.api, why, code="access-denied", hint=hint)
         if "InsufficientPeers" in why:
-            return NoPeers(self.api, status, why)
+            return IpfsError(self.api, why, code="no-peers")
         if "validation ignored" in why:
-            return PublishedOutOfOrder(self.api, status, why)
+            return IpfsError(self.api, why, code="published-out-of-order")
         if "pubsub" in why.lower() and "not enabled" in why.lower():
-            return PubSubDisabled(self.api, status, why)
-        return DaemonRefused(self.api, status, why)
+            hint = "ipfs config --json Pubsub.Enabled true; old ones: --enable-pubsub-experiment"
+            return IpfsError(self.api, why, code="pubsub-disabled", hint=hint)
+        return IpfsError(self.api, why)
 
 
 def _form(content: bytes) -> aiohttp.FormData:
     form = aiohttp.FormData()
     form.add_field("file", content, filename="data", content_type="application/octet-stream")
     return form
-
-
-def _words(error: BaseException) -> str:
-    return str(error) or type(error).__name__

@@ -3,36 +3,129 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bridges.ipfs.channel import ChannelBridge
-from bridges.ipfs.content import ContentBridge
+from bridges.ipfs._channel import BridgeParts, ChannelBridge, bridge_families, health_parts
+from bridges.ipfs._content import URGENT, ContentBridge, ContentParts, ContentSources, Gateway, content_families
+from bridges.ipfs._messages import RelayValidator
+from bridges.ipfs._relay import RelayJournal, Side
 from bridges.ipfs.daemon import Daemon
-from bridges.ipfs.journal import RelayJournal, Side
-from bridges.ipfs.status import bridge_families, content_families, health_parts
-from bridges.ipfs.transfer_queue import URGENT, USUAL
-from bridges.ipfs.transfers import ContentSources, Gateway
-from bridges.ipfs.validation import ChainView, RelayValidator
-from mesh.blocklist import blocklist_at
-from mesh.content import Exchange, Store
-from mesh.errors import ConfigurationError
-from mesh.flood import Drops
+from mesh.base.blocklist import blocklist_at
+from mesh.base.flood import Drops
+from mesh.base.lifecycle import Role
+from mesh.base.log_context import log_event
+from mesh.base.outage_log import OutageLog
+from mesh.base.retry import REMOTE, Backoff, RetryPolicy
+from mesh.content import Exchange
+from mesh.errors import ChainError, ConfigurationError
+from mesh.market.store import MarketStore
 from mesh.market.withdrawals import Withdrawals
+from mesh.network import MarketRules
 from mesh.network.metrics import drop_family, network_families
-from mesh.role import Role
-from schemas import Demand, Result, decode, recover
+from mesh.role.composition import open_store
+from schemas import Demand, Result, Signer, decode
+from schemas.decoding import InvalidData, text_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from contextlib import AbstractAsyncContextManager, AsyncExitStack
 
-    from bridges.ipfs.validation import RelayMessage
+    from bridges.ipfs._messages import RelayMessage
+    from mesh.base.blocklist import BlockedSigners
     from mesh.chain import Chain
     from mesh.network import Network
     from mesh.settings import IpfsSettings, Settings
     from mesh.telemetry.metrics import MetricFamily
+
+
+log = logging.getLogger(__name__)
+
+
+class ChainView:
+    """What validation needs from the chain: the lighthouses' addresses, ENS names and the latest block.
+
+    `chain` creates an unopened client; `lighthouses` are ENS names, whose `rules` it makes and keeps up to date;
+    `interval` is in seconds between two reads of the latest block. Start `run` as a task. Until the node is reached
+    nothing is known, which is logged once; what was read stays known.
+    """
+
+    def __init__(
+        self,
+        chain: Callable[[], AbstractAsyncContextManager[Chain]],
+        lighthouses: tuple[str, ...],
+        *,
+        interval: float,
+        blocked: BlockedSigners = frozenset(),
+        retry: RetryPolicy = REMOTE,
+    ) -> None:
+        self._make_chain = chain
+        self._interval = interval
+        self._retry = retry
+        self._outage = OutageLog(log, "chain")
+        self._chain: Chain | None = None
+        self.rules: Final = {
+            name: MarketRules(name, head=lambda: self.head, resolver=self.resolve, validators=self, blocked=blocked)
+            for name in lighthouses
+        }
+        self.head = 0
+        """The latest block number; 0 while it isn't known."""
+        self.error = ""
+        """The last error, empty while all is well."""
+
+    async def resolve(self, name: str) -> str:
+        """The address of an ENS name. Raises `ChainError`."""
+        return await self._reached.names.address(name)
+
+    def known(self, validator: str) -> bool | None:
+        """Whether orders may name a validator (address); None if that has to be asked."""
+        return None if self._chain is None else self._chain.validators.known(validator)
+
+    async def is_safe(self, validator: str) -> bool:
+        """The same, asked. Raises `ChainError`."""
+        return await self._reached.validators.is_safe(validator)
+
+    @property
+    def _reached(self) -> Chain:
+        if self._chain is None:
+            raise ChainError("the chain's node was not reached yet", code="chain-awaited")
+        return self._chain
+
+    async def run(self) -> None:
+        """Follow the chain until cancelled. Raises `ConfigurationError` for a chain that contradicts the settings."""
+        backoff = Backoff(self._retry)
+        while True:
+            try:
+                async with self._make_chain() as self._chain:
+                    log.info("the chain's node is reachable", extra=log_event("chain-connected"))
+                    backoff.reset()
+                    while True:
+                        await self._read(self._chain)
+                        await asyncio.sleep(self._interval)
+            except ChainError as error:
+                self._failed(error, "deadlines and ENS names are not checked until the chain's node is reachable")
+            finally:
+                self._chain = None
+            await backoff.wait()
+
+    async def _read(self, chain: Chain) -> None:
+        """Read the head and unknown addresses. After an outage of the node, its client reconnects by itself."""
+        try:
+            self.head = await chain.block_number()
+            for name, rules in self.rules.items():
+                if rules.address is None:
+                    rules.address = await chain.names.address(name)
+        except ChainError as error:
+            self._failed(error, "the latest block or a lighthouse's address could not be read")
+        else:
+            self.error = ""
+            self._outage.recovered("deadlines and ENS names are checked")
+
+    def _failed(self, error: ChainError, consequence: str) -> None:
+        self._outage.failed(error, consequence)
+        self.error = str(error)
 
 
 class IpfsBridge(Role):
@@ -57,10 +150,17 @@ class IpfsBridge(Role):
         self._network = network
         self._settings = settings
         self._lighthouses = tuple(name.lower() for name in lighthouses or (settings.lighthouse_contract,))
-        self._chain = chain and ChainView(chain, self._lighthouses, interval=max(settings.poll_interval, 1.0))
-        self._address = (address or f"0x{secrets.token_hex(20)}").lower()
+        blocked = blocklist_at(settings.blocked_signers)
+        interval = max(settings.poll_interval, 1.0)
+        self._chain = chain and ChainView(chain, self._lighthouses, interval=interval, blocked=blocked)
+        self._rules = {name: MarketRules(name, blocked=blocked) for name in self._lighthouses}
+        if self._chain is not None:
+            self._rules = self._chain.rules
+        own = Signer(secrets.token_bytes(32))
+        self._signer = None if address else own
+        """Signs declines, if nobody else has the key of its address."""
+        self._address = (address or own.address).lower()
         self.channels: tuple[ChannelBridge, ...] = ()
-        self._blocked = blocklist_at(settings.blocked_signers)
         self.drops: Final = Drops()
         """What strangers sent that was dropped."""
         self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=authorization_of(settings))
@@ -97,10 +197,8 @@ class IpfsBridge(Role):
 
     async def _open_content(self, stack: AsyncExitStack) -> ContentBridge:
         settings = self._settings
-        store = await asyncio.to_thread(
-            Store, self._directory / "content", limit=settings.objective_size_limit, quota=settings.content_limit
-        )
-        stack.callback(store.close)
+        limit = settings.objective_size_limit
+        store = await open_store(stack, settings, self._directory / "content", limit=limit)
         exchange = Exchange(self._network.session, store, address=self._address, drops=self.drops)
         await stack.enter_async_context(exchange)
         gateways = [Gateway(settings.ipfs_gateway)] if settings.ipfs_gateway else []
@@ -109,63 +207,46 @@ class IpfsBridge(Role):
         providers = tuple(Daemon(api) for api in settings.ipfs_public_providers)
         for provider in providers:
             await stack.enter_async_context(provider)
-        return await stack.enter_async_context(
-            ContentBridge(
-                self._network.session,
-                store,
-                exchange,
-                ContentSources(self.daemon, *gateways),
-                self.daemon,
-                providers=providers,
-                address=self._address,
-                drops=self.drops,
-                size_limit=settings.objective_size_limit,
-                timeout=settings.fetch_timeout,
-            )
+        parts = ContentParts(
+            session=self._network.session,
+            store=store,
+            exchange=exchange,
+            sources=ContentSources(self.daemon, *gateways),
+            daemon=self.daemon,
+            providers=providers,
+            size_limit=settings.objective_size_limit,
+            timeout=settings.fetch_timeout,
+            drops=self.drops,
         )
+        return await stack.enter_async_context(ContentBridge(parts, address=self._address))
 
     async def _open_channel(self, stack: AsyncExitStack, lighthouse: str) -> ChannelBridge:
-        return await stack.enter_async_context(
-            ChannelBridge(
-                self._network,
-                self.daemon,
-                self._validator(
-                    lighthouse, stack.enter_context(Withdrawals(self._directory / f"withdrawals-{lighthouse}.sqlite"))
-                ),
-                stack.enter_context(RelayJournal(self._directory / f"{lighthouse}.sqlite")),
-                lighthouse=lighthouse,
-                swarm_peers=self._settings.ipfs_swarm_connect,
-                address=self._address,
-                published=self._published,
-                content=self.content.metrics,
-                drops=self.drops,
-            )
+        withdrawals = stack.enter_context(
+            Withdrawals(MarketStore(self._directory / f"withdrawals-{lighthouse}.sqlite"))
         )
-
-    def _validator(self, lighthouse: str, withdrawals: Withdrawals) -> RelayValidator:
-        chain = self._chain
-        if chain is None:
-            return RelayValidator(lighthouse, withdrawals=withdrawals, blocked=self._blocked)
-        return RelayValidator(
-            lighthouse,
-            withdrawals=withdrawals,
-            address=lambda: chain.address(lighthouse),
-            resolver=chain.resolve,
-            is_safe=chain.is_safe_validator,
-            head=lambda: chain.head,
-            blocked=self._blocked,
+        rules, large_numbers = self._rules[lighthouse], self._settings.ipfs_large_numbers
+        validator = RelayValidator(rules, withdrawals=withdrawals, large_numbers=large_numbers)
+        parts = BridgeParts(
+            network=self._network,
+            daemon=self.daemon,
+            validator=validator,
+            journal=stack.enter_context(RelayJournal(self._directory / f"{lighthouse}.sqlite")),
+            drops=self.drops,
+            signer=self._signer,
+            published=self._published,
+            content=self.content.metrics,
         )
+        swarm_peers = self._settings.ipfs_swarm_connect
+        return await stack.enter_async_context(ChannelBridge(parts, address=self._address, swarm_peers=swarm_peers))
 
     def _published(self, side: Side, message: RelayMessage) -> None:
         """Transfer the file that a message names to the side to which the message was sent."""
-        match named := decode(message.payload):
-            case Demand(objective=cid) | Result(result=cid):
-                signer = recover(bytes.fromhex(message.hash), named.signature)
-                priority = URGENT if isinstance(named, Result) else USUAL
-                if side is Side.IPFS:
-                    self.content.schedule_add(cid, signer, priority=priority)
-                else:
-                    self.content.schedule_fetch(cid, signer, priority=priority)
+        transfers = self.content.adds if side is Side.IPFS else self.content.fetches
+        match decode(message.payload):
+            case Demand(objective=cid):
+                transfers.add(cid, message.signer)
+            case Result(result=cid):
+                transfers.add(cid, message.signer, priority=URGENT)
 
 
 def authorization_of(settings: IpfsSettings) -> str:
@@ -174,8 +255,8 @@ def authorization_of(settings: IpfsSettings) -> str:
         return ""
     path = Path(settings.ipfs_authorization_file).expanduser()
     try:
-        value = path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
+        value = text_of(path.read_bytes()).strip()
+    except (OSError, InvalidData) as error:
         raise ConfigurationError(f"can't read the IPFS credentials in {path}: {error}") from None
     if not value.isascii() or not value.isprintable():
         raise ConfigurationError(

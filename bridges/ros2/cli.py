@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import logging
 from contextlib import AsyncExitStack
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from mesh.base.log_context import LogSource
+from mesh.base.outage_log import OutageLog
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
-from mesh.errors import NetworkUnavailable
-from mesh.log_context import LogSource
-from mesh.outage_log import OutageLog
-from mesh.retry import Backoff
-from mesh.running import run_until_stopped
-from mesh.settings import NetworkSettings, Ros2Settings, TelemetrySettings, options_of
+from mesh.role.running import run_until_stopped
+from mesh.settings import NetworkSettings, Ros2Settings, TelemetrySettings
 from mesh.telemetry.logs import set_process_source
 from schemas import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from mesh.network import Network
-    from mesh.network.endpoints import Endpoints
     from mesh.settings import Settings
     from mesh.telemetry.metrics import MetricFamily
-    from mesh.telemetry.serving import Telemetry
 
 log = logging.getLogger(__name__)
 
@@ -53,48 +47,35 @@ log = logging.getLogger(__name__)
     type=click.Path(path_type=Path, file_okay=False, exists=True),
     help="folder with the definitions of own types: PACKAGE/msg/TYPE.msg",
 )
-@with_settings(*options_of(NetworkSettings), *options_of(Ros2Settings), *options_of(TelemetrySettings))
-def command(
-    settings: Settings,
-    agent: str,
-    name: str,
-    domain: int,
-    namespace: str,
-    flavour: str,
-    publish: tuple[str, ...],
-    subscribe: tuple[str, ...],
-    folder: Path | None,
-) -> None:
+@with_settings(NetworkSettings, Ros2Settings, TelemetrySettings)
+def command(settings: Settings, **options: Any) -> None:
     """Connect a ROS 2 system to the mesh as a device of the agent at ADDRESS. Needs no ROS. Ctrl-C stops it.
 
     The system is reached at its Zenoh router (--ros2-connect), which must be another one than the mesh's. Nothing is
     carried but what --publish and --subscribe allow (both may be repeated). In a job, what its objective plays and its
     handlers publish goes to the robot, and what the robot says is recorded. In a site's roster, the bridge is a member
     with the role edge."""
-    options = {"domain": domain, "namespace": namespace, "flavour": flavour}
-    run_until_stopped(
-        lambda: _serve(settings, agent, name, options, publish, subscribe, folder), settings=settings, role="edge"
-    )
+    run_until_stopped(lambda: _serve(settings, **options), settings=settings, role="edge")
 
 
 async def _serve(
     settings: Settings,
+    *,
     agent: str,
     name: str,
-    options: dict[str, object],
     publish: tuple[str, ...],
     subscribe: tuple[str, ...],
     folder: Path | None,
+    **robot: Any,
 ) -> None:
     from bridges.devices import LOG, answer_log_queries
-    from bridges.ros2.allowed import RosAllowed
-    from bridges.ros2.bridge import RosBridge
-    from bridges.ros2.process import bridge_health, bridge_metrics, check_apart, ros_endpoints, types_of
-    from mesh.network.endpoints import Endpoints
-    from mesh.network.metrics import drop_family, network_families
-    from mesh.starting import wait_for_files
+    from bridges.ros2._bridge import RosBridge, check_apart, ros_endpoints, types_of
+    from bridges.ros2._robot import RosAllowed
+    from mesh.network.metrics import network_families
+    from mesh.role.composition import endpoints_of, open_network
+    from mesh.role.running import wait_for_files
     from mesh.telemetry.serving import Telemetry
-    from schemas.agent_keys import DeviceTopicKey
+    from schemas.keys import DeviceTopicKey
 
     allow = RosAllowed(publish=publish, subscribe=subscribe)
     types, ros_at = types_of(settings, allow, folder), ros_endpoints(settings)
@@ -102,37 +83,19 @@ async def _serve(
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         await wait_for_files(settings)
-        mesh = await _network(Endpoints.from_settings(settings), stack, "router", telemetry)
-        ros = await _network(ros_at, stack, "ros2-router", telemetry)
+        mesh = await open_network(stack, endpoints_of(settings), OutageLog(log, "router"), on_wait=telemetry.starting)
+        ros = await open_network(stack, ros_at, OutageLog(log, "ros2-router"), on_wait=telemetry.starting)
         check_apart(mesh.session, ros.session)
         bridge = await stack.enter_async_context(
-            RosBridge(mesh.session, ros.session, types, allow, agent=agent, name=name, **options)
+            RosBridge(mesh.session, ros.session, types, allow, agent=agent, name=name, **robot)
         )
         stack.enter_context(answer_log_queries(mesh.session, log_key, "edge"))
         set_process_source(LogSource("edge", parse_address(agent)))
 
         async def measure() -> Iterable[MetricFamily]:
-            return (*bridge_metrics(bridge), drop_family(bridge.drops), *network_families(mesh))
+            return (*bridge.families(), *network_families(mesh))
 
-        health = partial(bridge_health, bridge, mesh.session, ros.session)
-        stack.enter_context(telemetry.showing(measure=measure, health=health))
+        stack.enter_context(telemetry.showing(measure=measure, health=bridge.parts))
         words = f"bridge of {agent}: {name} is the ROS 2 system at {', '.join(settings.ros2_connect)}"
         announce(log, "edge-started", words, device=name)
         await bridge.run()
-
-
-async def _network(endpoints: Endpoints, stack: AsyncExitStack, name: str, telemetry: Telemetry) -> Network:
-    """Open a session, and wait for its router."""
-    from mesh.network import Network
-
-    backoff, outage = Backoff(), OutageLog(log, name)
-    while True:
-        try:
-            network = await stack.enter_async_context(Network(endpoints))
-        except NetworkUnavailable as error:
-            outage.failed(error, f"the bridge waits for the {name}")
-            telemetry.starting(str(error))
-            await backoff.wait()
-        else:
-            outage.recovered(f"the {name} answers")
-            return network

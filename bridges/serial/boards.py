@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -17,34 +18,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from bridges.serial.errors import InvalidPort, PortBusy
-from mesh.errors import ConfigurationError, InputError, RemoteError
+import click
+
+from bridges.serial.dialect import LineError
+from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
+from mesh.role.running import INTERRUPTED, fail
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
 
 SOURCES: Final = Path(__file__).parent / "board"
 HEADER: Final = Path("/usr/include/simavr/sim_avr.h")
 START: Final = 30.0
 """Seconds that a board has to start."""
-STOP: Final = 5.0
 AVR: Final = 83
 """The number of the processor in ELF files (EM_AVR)."""
-
-
-class InvalidFirmware(InputError, code="invalid-firmware"):
-    """A file is not an ELF file for an AVR."""
-
-    def __init__(self, path: Path, why: str) -> None:
-        super().__init__(
-            f"{path} is not firmware for an Uno: {why}",
-            hint="`python -m bridges.serial.firmware SKETCH -o FOLDER` compiles a sketch to an ELF file",
-        )
-        self.path = path
-
-
-class BoardFailed(RemoteError, code="board-failed"):
-    """The simulated board stopped, or did not do what was expected; the text has its last output."""
 
 
 @dataclass(frozen=True)
@@ -100,26 +89,30 @@ def simulator(header: Path = HEADER) -> Path:
 
 
 def check_firmware(path: Path) -> None:
-    """Raise `InvalidFirmware` for a file that is not an ELF file with code for an AVR."""
+    """Raise `InputError` for a file that is not an ELF file with code for an AVR."""
+    head, why = b"", ""
     try:
         with path.open("rb") as file:
             head = file.read(20)
     except OSError as error:
-        raise InvalidFirmware(path, error.strerror or str(error)) from None
-    if not head.startswith(b"\x7fELF"):
-        raise InvalidFirmware(path, "it is not an ELF file")
-    if int.from_bytes(head[18:20], "little") != AVR:
-        raise InvalidFirmware(path, "it is for another processor")
+        why = error.strerror or str(error)
+    if not why and not head.startswith(b"\x7fELF"):
+        why = "it is not an ELF file"
+    if not why and int.from_bytes(head[18:20], "little") != AVR:
+        why = "it is for another processor"
+    if why:
+        hint = "`python -m bridges.serial.firmware SKETCH -o FOLDER` compiles a sketch to an ELF file"
+        raise InputError(f"{path} is not firmware for an Uno: {why}", hint=hint, code="invalid-firmware")
 
 
 def check_free(port: Path) -> None:
-    """Raise `PortBusy` if this port exists, `InvalidPort` if something else is there, or its folder is missing."""
+    """Raise `LineError` if this port exists, something else is there, or its folder is missing."""
     if port.is_char_device():
-        raise PortBusy(f"the port {port} exists already", hint=f"if no other board uses it: rm {port}")
+        hint = f"if no other board uses it: rm {port}"
+        raise LineError(f"the port {port} exists already", hint=hint, code="port-busy")
     if port.exists() or not port.parent.is_dir():
-        raise InvalidPort(
-            f"{port} can't become the port of the board: {'it is a file' if port.exists() else 'no folder'}"
-        )
+        why = "it is a file" if port.exists() else "no folder"
+        raise LineError(f"{port} can't become the port of the board: {why}", code="invalid-port")
 
 
 class SimulatedBoard:
@@ -127,9 +120,9 @@ class SimulatedBoard:
 
     `port` is a path of one's own choice, or one in a new folder; it stays the same when the cable is pulled and plugged
     in again. With `resets`, opening the port resets the board, as it does a real Uno; with `monitor`, the output has
-    what the board sends. `watch` is called with each line of the simulator's output. Entering raises `InvalidFirmware`,
-    `PortBusy` or `InvalidPort` if the path is in use, `ConfigurationError` if the simulator can't be compiled, and
-    `BoardFailed`.
+    what the board sends. `watch` is called with each line of the simulator's output. Entering raises `InputError`
+    if the file is no firmware for an Uno, `LineError` if the path is in use, `ConfigurationError` if the simulator does
+    not compile, and `RemoteError` (`board-failed`).
     """
 
     def __init__(
@@ -184,7 +177,7 @@ class SimulatedBoard:
         if process is not None:
             process.terminate()
             try:
-                process.wait(STOP)
+                process.wait(5.0)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -208,7 +201,6 @@ class SimulatedBoard:
         self.send(f"noise {rate} {seed}")
 
     def reset(self) -> None:
-        """Press the reset button."""
         self.send("reset")
 
     def unplug(self) -> None:
@@ -218,27 +210,24 @@ class SimulatedBoard:
         self.wait_until(lambda: self._count("unplugged") > count, what="the unplugged")
 
     def plug(self) -> None:
-        """Plug the cable in again."""
         count = self._count("port ")
         self.send("plug")
         self.wait_until(lambda: self._count("port ") > count, what="the port")
 
     def changes(self, pin: int) -> list[PinChange]:
-        """The changes of one pin so far."""
         return [change for change in self.pins if change.pin == pin]
 
     def wait_until(self, condition: Callable[[], object], *, what: str, seconds: float = START) -> None:
-        """Return when `condition()`, checked after each line of output, is true. Raises `BoardFailed`."""
+        """Return when `condition()`, checked after each line of output, is true. Raises `RemoteError`."""
         deadline = time.monotonic() + seconds
         with self._changed:
             while not condition():
                 left = deadline - time.monotonic()
                 if left <= 0 or (self._process is not None and self._process.poll() is not None):
-                    raise BoardFailed(f"gave up waiting for {what}; the board said: {' | '.join(self.output[-10:])}")
+                    raise self._failed(f"gave up waiting for {what}; the board said")
                 self._changed.wait(min(left, 0.2))
 
     def wait_for_end(self) -> None:
-        """Return when the simulator has stopped."""
         self._running().wait()
 
     def _read(self, process: subprocess.Popen[str]) -> None:
@@ -259,21 +248,89 @@ class SimulatedBoard:
         return sum(line.startswith(word) for line in self.output)
 
     def send(self, line: str) -> None:
-        """Send the simulator a command line: those of `aira board run`. Raises `BoardFailed` when it has stopped."""
+        """Send the simulator a command line: those of `aira board run`. Raises `RemoteError` when it has stopped."""
         process = self._running()
         assert process.stdin is not None
         try:
             process.stdin.write(f"{line.strip()}\n")
             process.stdin.flush()
         except BrokenPipeError:
-            raise BoardFailed(f"the board has stopped; it said: {' | '.join(self.output[-10:])}") from None
+            raise self._failed("the board has stopped; it said") from None
+
+    def _failed(self, why: str) -> RemoteError:
+        return RemoteError(f"{why}: {' | '.join(self.output[-10:])}", code="board-failed")
 
     def _running(self) -> subprocess.Popen[str]:
         if self._process is None:
-            raise BoardFailed("the board is not running")
+            raise RemoteError("the board is not running", code="board-failed")
         return self._process
 
 
 def cache_folder() -> Path:
     """The folder that `make peers` also uses; it may be deleted at any time."""
     return Path(os.environ.get("AIRA_PEERS_CACHE") or "~/.cache/aira-mesh").expanduser()
+
+
+HELP = (
+    "commands: pin 0-19 high|low|free, adc 0-7 MILLIVOLTS, send TEXT, monitor on|off, noise 0-1, unplug, plug, reset,"
+    " quit"
+)
+
+
+@click.group("board", short_help="run firmware on a simulated board")
+def command() -> None:
+    """Run firmware on a simulated Arduino Uno."""
+
+
+@command.command("run", short_help="run a firmware and show its pins")
+@click.argument("firmware", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "--tty",
+    "port",
+    metavar="PATH",
+    type=click.Path(path_type=Path),
+    help="path of the serial port, which exists as long as the board runs; by default a new one in a temporary folder",
+)
+@click.option("--reset-on-open", is_flag=True, help="opening the port resets the board, as on a real Uno")
+@click.option(
+    "--monitor", is_flag=True, help="show the text that the board sends, as the monitor of the Arduino IDE does"
+)
+def run(firmware: Path, port: Path | None, reset_on_open: bool, monitor: bool) -> None:
+    """Run FIRMWARE (an ELF file), print its port, and show its pins as they change.
+
+    Lines on stdin control the board: `pin 2 low` presses a button between pin 2 and ground, `pin 2 free` releases it,
+    `adc 0 2500` puts 2.5 V on A0, `send hello` sends a line to the sketch, `unplug` and `plug` disconnect and connect
+    the cable, `reset` restarts the board, `noise 0.01` corrupts 1 % of the bytes on the line. `quit` or Ctrl-C ends it.
+    """
+    from bridges.serial.boards import SimulatedBoard
+
+    try:
+        with SimulatedBoard(firmware, port=port, resets=reset_on_open, monitor=monitor, watch=_show) as board:
+            click.echo(f"{HELP}\nconnect it with: aira edge {board.port} --agent ADDRESS")
+            for line in sys.stdin:
+                if line.strip() == "quit":
+                    return
+                board.send(line)
+            board.wait_for_end()
+    except AiraError as error:
+        fail(error)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+
+
+def _show(line: str) -> None:
+    match line.split():
+        case ["pin", pin, level, at]:
+            click.echo(f"{_seconds(at)}  pin {pin:>2}  {'high' if level == '1' else 'low'}")
+        case ["pwm", pin, value, top, at]:
+            click.echo(f"{_seconds(at)}  pin {pin:>2}  {int(value) / int(top):.0%} ({value} of {top})")
+        case ["serial", *_]:
+            click.echo(line.removeprefix("serial "))
+        case ["unknown", *words]:
+            click.echo(f"{' '.join(words)!r} is not a command; {HELP}", err=True)
+        case ["port" | "opened" | "closed" | "unplugged" | "crashed", *_]:
+            click.echo(line)
+
+
+def _seconds(microseconds: str) -> str:
+    return f"{int(microseconds) / 1e6:10.3f} s"

@@ -10,31 +10,28 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING
 
-from bridges.serial.detection import AUTO, BAUDS, make_dialect
-from bridges.serial.dialect import BoardReady
-from bridges.serial.errors import LineError, PortBusy, PortForbidden
+from bridges.serial.dialect import AUTO, BAUDS, BoardReady, LineError, make_dialect
 from bridges.serial.line import PortName, SerialLine, SerialPort
-from mesh.doctor.checks import Check, CheckResult, failed, in_thread, passed
+from mesh.ops.doctor.checks import Check, CheckResult, failed, in_thread, passed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from mesh.doctor.context import DoctorContext, SerialSettings
+    from mesh.ops.doctor.checks import DoctorContext, SerialSettings
 
 
 def checks(context: DoctorContext) -> list[Check]:
-    """The checks of the serial line (entry point `aira.doctor_checks`)."""
     port = Check("serial port", partial(in_thread, check_port, context.serial))
     board = Check("serial board", partial(in_thread, check_board, context.serial), needs=((port,),))
     return [port, board]
 
 
 def check_port(settings: SerialSettings) -> CheckResult:
-    """Whether the port exists, may be used, and is not in use. Raises `PortMissing`, `InputError`."""
+    """Whether the port exists, may be used, and is not in use. Raises `LineError` if it is missing, `InputError`."""
     if not settings.port:
         return failed(
-            "no serial port is given", code="no-port", hint="give --port /dev/ttyACM0, or --port usb:VENDOR:PRODUCT"
+            "no serial port is given", code="no-port", hint="give --tty /dev/ttyACM0, or --tty usb:VENDOR:PRODUCT"
         )
     path = PortName(settings.port).find()
     try:
@@ -78,10 +75,9 @@ def check_board(settings: SerialSettings, *, timeout: float | None = None) -> Ch
 
 
 def _unusable(path: Path, error: LineError) -> CheckResult:
-    """Why an existing port can't be opened, and what to do."""
-    if isinstance(error, PortForbidden):
+    if error.code == "port-forbidden":
         return _forbidden(path)
-    if isinstance(error, PortBusy):
+    if error.code == "port-busy":
         return failed(
             str(error),
             code="port-busy",

@@ -6,17 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from bridges.serial.detection import AUTO
-from bridges.serial.dialect import dialect_names
+from bridges.serial.dialect import AUTO, dialect_names
 from mesh.cli.options import with_settings
 from mesh.errors import AiraError, InputError
-from mesh.running import fail
-from mesh.settings import NetworkSettings, TelemetrySettings, options_of
+from mesh.role.running import fail
+from mesh.settings import NetworkSettings, TelemetrySettings
 from mesh.telemetry.logs import configure_logging_from
-from schemas.agent_keys import topic_chunks
+from schemas.keys import topic_chunks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from mesh.settings import Settings
 
@@ -37,35 +36,31 @@ class BaudRate(click.IntRange):
         super().__init__(300, 4_000_000)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """The number that a text states."""
         return 0 if value in (0, AUTO) else int(super().convert(value, param, ctx))
 
 
-class TopicNames:
-    """Maps a board's topics to their names in the mesh; `renamed` are pairs of the board's name and the mesh's.
+def topic_names(renamed: Iterable[tuple[str, str]] = ()) -> Callable[[str], str]:
+    """A function that gives a board's topics their names in the mesh, by pairs of the board's name and the mesh's.
 
     A pair also renames all topics below it, and `/` stands for all topics: `("/", "/left")` maps `/led` to `/left/led`.
     If several pairs match, the longest one applies. Raises `InvalidKey` for a text that is no topic, and `InputError`
     for one that is renamed twice.
     """
+    names: dict[str, str] = {}
+    for topic, other in renamed:
+        if (prefix := _prefix(topic)) in names:
+            raise InputError(f"{topic} is given two names")
+        names[prefix] = _prefix(other)
 
-    def __init__(self, renamed: Iterable[tuple[str, str]] = ()) -> None:
-        self._renamed: dict[str, str] = {}
-        for name, other in renamed:
-            prefix = _prefix(name)
-            if prefix in self._renamed:
-                raise InputError(f"{name} is given two names")
-            self._renamed[prefix] = _prefix(other)
-
-    def of(self, name: str) -> str:
-        """The name in the mesh of the board's topic `name`."""
-        prefix = name
-        while True:
-            if prefix in self._renamed:
-                return self._renamed[prefix] + name[len(prefix) :] or name
+    def name_of(topic: str) -> str:
+        prefix = topic
+        while prefix not in names:
             if not prefix:
-                return name
+                return topic
             prefix = prefix.rpartition("/")[0]
+        return names[prefix] + topic[len(prefix) :] or topic
+
+    return name_of
 
 
 def _prefix(name: str) -> str:
@@ -130,7 +125,7 @@ def _number(text: str) -> int | float | str:
     callback=_renaming,
     help="rename a topic of the board and all topics below it, as in /led=/left/led or /=/left (may be repeated)",
 )
-@with_settings(*options_of(NetworkSettings), *options_of(TelemetrySettings))
+@with_settings(NetworkSettings, TelemetrySettings)
 def command(settings: Settings, renamed: tuple[tuple[str, str], ...], **options: Any) -> None:
     """Connect the device at PORT to its agent. Ctrl-C stops it.
 
@@ -143,14 +138,14 @@ def command(settings: Settings, renamed: tuple[tuple[str, str], ...], **options:
     A command on a topic of a job reaches all devices of the agent that have a topic of that name. Use --map to rename
     the topics of this device.
     """
-    from bridges.serial.process import EdgeOptions, run_edge, serve_metrics, wait_for_files
+    from bridges.serial._edge import Edge, EdgeOptions, run_edge, serve_metrics
     from mesh.network.endpoints import Endpoints
 
     configure_logging_from(settings, "edge")
     endpoints = Endpoints.from_settings(settings)
     try:
-        with serve_metrics(settings.metrics_listen) as metrics:
-            wait_for_files(settings)
-            run_edge(EdgeOptions(**options, rename=TopicNames(renamed).of), endpoints=endpoints, metrics=metrics)
+        edge = Edge(EdgeOptions(**options, rename=topic_names(renamed)))
+        with serve_metrics(edge, settings.metrics_listen):
+            run_edge(edge, settings, endpoints)
     except AiraError as error:
         fail(error)

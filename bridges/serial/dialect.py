@@ -1,28 +1,79 @@
-"""The interface of a protocol on a serial line, and the protocols that are installed.
+"""The interface of a protocol on a serial line, the protocols that are installed, and how a board's is found.
 
 A dialect is the host's side of a protocol, without a port and without a clock: `SerialLine` feeds it bytes and the
 time, sends what `outgoing` returns, and delivers its `events`. Times are seconds of any monotonic clock.
 
 A package adds a dialect by an entry point of the group `aira.dialects`: the name is what users type after `--protocol`,
-the value names a subclass of `Dialect`.
+the value names a subclass of `Dialect`. `DetectingDialect` is the one that a board is found to speak.
 """
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
-from bridges.serial.errors import BoardBusy, BrokenDialect, UnknownDialect
-from mesh.plugins import entry_points
+from mesh.base.log_context import log_event
+from mesh.base.plugins import entry_points
+from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from schemas.payloads import PayloadType
 
+
+R = TypeVar("R")
+
+
+class LineError(RemoteError, code="line-error"):
+    """A serial port can't be opened, read or written; the code says why, if that is known."""
+
+
+class CommandRefused(AiraError, code="invalid-board-message"):
+    """A command was not taken: it has the wrong type, an unknown topic, or is too long; or too many wait for the board.
+
+    `reason` is one of `REASONS`.
+    """
+
+    def __init__(self, topic: str, why: str, *, reason: str = "unfit", code: str = "") -> None:
+        super().__init__(f"a message for {topic} can't be sent: {why}", code=code)
+        self.topic = topic
+        self.reason = reason
+
+
+class CallFailed(AiraError, code="call-failed"):
+    """A call to a device failed, for a `reason` (a word for programs), and its code says what that means.
+
+    `call-refused`: the device or its edge agent would refuse it again (`refused`, `unfit`). `no-such-topic`: the device
+    has no topic of that name to call. `call-not-done`: it certainly was not done, so it is safe to try again (`absent`,
+    `expired`, `full`). `call-in-doubt`: the device was restarted or unplugged before it answered (`doubt`).
+    """
+
+    def __init__(self, topic: str, reason: str, detail: str, *, code: str = "") -> None:
+        super().__init__(f"{topic}: {detail}" + (f" ({reason})" if reason != code else ""), code=code)
+        self.topic = topic
+        self.reason = reason
+
+
+REASONS: Final = frozenset({"refused", "unfit", "absent", "expired", "full", "doubt"})
+"""The reasons for which a call fails, as they travel."""
+
+
+def call_failed(topic: str, reason: str, detail: str) -> CallFailed:
+    """The error for one of these reasons."""
+    if reason in ("refused", "unfit"):
+        return CallFailed(topic, reason, detail, code="call-refused")
+    if reason in ("absent", "expired", "full"):
+        return CallFailed(topic, reason, detail, code="call-not-done")
+    return CallFailed(topic, reason, detail, code="call-in-doubt")
+
+
 ENTRY_POINTS: Final = "aira.dialects"
+PATIENCE: Final = 30.0
+"""Seconds that a command waits for a board that is absent or busy, by default."""
 QUEUE_SIZE: Final = 256
 """The most commands that wait for a board; further ones are rejected."""
 
@@ -42,12 +93,15 @@ class Flow(Enum):
 
 @dataclass(frozen=True)
 class BoardTopic:
-    """A topic that the board has announced: its name with the leading `/` of ROS, and the type of its messages."""
+    """A topic that the board has announced: its name with the leading `/` of ROS, and the type of its messages.
+
+    A board may have several publishers or subscribers of one topic: these are equal, and differ in `id` only.
+    """
 
     name: str
     flow: Flow
     type: PayloadType
-    id: int
+    id: int = field(compare=False)
 
 
 @dataclass(frozen=True)
@@ -109,8 +163,8 @@ class MessageReceived:
 
 @dataclass(frozen=True)
 class CommandFinished:
-    """A command has ended. `payload`, of type `type`, is the board's answer; a failed command has a `reason` (a key of
-    `errors.CALL_ERRORS`) and a sentence, `detail`."""
+    """A command has ended. `payload`, of type `type`, is the board's answer; a failed command has a `reason` (of
+    `REASONS`) and a sentence, `detail`."""
 
     command: Command
     status: CallStatus
@@ -199,7 +253,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def submit(self, command: Command, now: float) -> None:
-        """Queue a command; `CommandFinished` reports its end. Raises `InvalidBoardMessage`, `BoardBusy`."""
+        """Queue a command; `CommandFinished` reports its end. Raises `CommandRefused`."""
 
     def respond(self, topic: BoardTopic, payload: bytes, now: float) -> None:
         """Answer a request of the board (`Flow.REQUESTS`), if the boards of this dialect send any."""
@@ -218,38 +272,230 @@ class Dialect(ABC):
 
     @property
     def _next_expiry(self) -> float:
-        """When the first queued command expires."""
         return min((command.deadline for command in self._queue), default=float("inf"))
 
     def _enqueue(self, command: Command) -> None:
-        """Append a command. Raises `BoardBusy` if the queue is full."""
+        """Append a command. Raises `CommandRefused` if the queue is full."""
         if len(self._queue) >= QUEUE_SIZE:
-            raise BoardBusy(command.topic, QUEUE_SIZE)
+            why = f"{QUEUE_SIZE} commands are already waiting for the board"
+            raise CommandRefused(command.topic, why, reason="full", code="board-busy")
         self._queue.append(command)
 
     def _expire_queued(self, now: float) -> None:
-        """Fail the commands that have waited too long."""
         late = [command for command in self._queue if command.deadline <= now]
         self._queue = [command for command in self._queue if command.deadline > now]
         for command in late:
             self._fail(command, "expired", "the board was absent, or busy with earlier commands")
+
+    def _next_of(self, resolve: Callable[[Command], R]) -> tuple[Command, R] | None:
+        """The first queued command that `resolve` takes, and what it returns; those that it refuses fail."""
+        while self._queue:
+            command = self._queue.pop(0)
+            try:
+                resolved = resolve(command)
+            except CommandRefused as error:
+                self._fail(command, error.reason, str(error))
+            else:
+                command.begun = True
+                return command, resolved
+        return None
 
     def _fail(self, command: Command, reason: str, detail: str) -> None:
         self._events.append(CommandFinished(command, CallStatus.FAILED, reason=reason, detail=detail))
 
 
 def dialect_names() -> list[str]:
-    """The names of the installed dialects."""
     return sorted(entry_points(ENTRY_POINTS))
 
 
 def load_dialect(name: str) -> type[Dialect]:
-    """The installed dialect of that name, imported now. Raises `UnknownDialect`, `BrokenDialect`."""
+    """The installed dialect of that name, imported now. Raises `InputError`, `ConfigurationError` if it can't be."""
     installed = entry_points(ENTRY_POINTS)
     if name not in installed:
-        raise UnknownDialect(name, sorted(installed))
+        raise InputError(
+            f"there is no dialect {name!r}; installed: {', '.join(sorted(installed)) or 'none'}",
+            hint="choose an installed one, or (re)install the package that provides it",
+            code="unknown-dialect",
+        )
     try:
         dialect: type[Dialect] = installed[name].load()
     except (ImportError, AttributeError) as error:
-        raise BrokenDialect(name, installed[name].package, error) from error
+        package = installed[name].package
+        raise ConfigurationError(
+            f"can't load the dialect {name!r} of {package}: {type(error).__name__}: {error}",
+            hint=f"reinstall or uninstall {package}",
+            code="dialect-broken",
+        ) from error
     return dialect
+
+
+log = logging.getLogger(__name__)
+
+AUTO: Final = "auto"
+DETECTED: Final = ("frames", "rosserial")
+"""The protocols that are tried; boards with other protocols may be disturbed by their questions."""
+BAUDS: Final = (57_600, 115_200, 9_600, 38_400, 19_200, 230_400, 250_000, 500_000, 1_000_000)
+"""The baud rates of boards, the usual ones first."""
+FIRST_TRIAL: Final = 3.0
+"""Seconds at the first baud rate after the port was opened: opening it resets most boards, which takes almost two."""
+TRIAL: Final = 0.8
+"""Seconds at each further baud rate."""
+LONGEST_TRIAL: Final = 10.0
+"""Seconds at a baud rate at which whole frames arrive, until the board has introduced itself."""
+SEARCH_AGAIN: Final = 15.0
+"""Seconds without an answer in the protocol that was found, after which the search begins again."""
+
+
+def make_dialect(protocol: str, baud: int, parameters: Mapping[str, object] | None = None) -> Dialect:
+    """The dialect `protocol` at `baud` bits per second; with `auto`, or 0, that which a board is found to have.
+
+    Raises as `load_dialect`.
+    """
+    if protocol == AUTO or not baud:
+        protocols = DETECTED if protocol == AUTO else (protocol,)
+        return DetectingDialect(protocols, (baud,) if baud else BAUDS, parameters=parameters)
+    dialect = load_dialect(protocol)(baud=baud, parameters=parameters)
+    dialect.protocol = protocol
+    return dialect
+
+
+class DetectingDialect(Dialect):
+    """The one of several protocols that the board speaks, at one of several baud rates.
+
+    While none is found, `baud` is the one that is being tried, `protocol` is empty, and commands wait.
+    """
+
+    def __init__(
+        self,
+        protocols: Sequence[str],
+        bauds: Sequence[int],
+        *,
+        parameters: Mapping[str, object] | None = None,
+        seconds_to_search_again: float = SEARCH_AGAIN,
+    ) -> None:
+        super().__init__(baud=bauds[0], parameters=parameters)
+        self._kinds = {protocol: load_dialect(protocol) for protocol in protocols}
+        self._bauds = tuple(bauds)
+        self._search_again = seconds_to_search_again
+        self._trials: dict[str, Dialect] = {}
+        self._trial_began = self._trial_ends = float("inf")
+        self._found: Dialect | None = None
+        self._unfinished = 0
+        self._absent_since = float("inf")
+        self.silence = FIRST_TRIAL + TRIAL * len(bauds)
+        rates = ", ".join(map(str, self._bauds))
+        self.attempt = f"in {' or '.join(protocols)}, at {rates} baud: is the firmware loaded, in another protocol?"
+
+    @property
+    def next_tick(self) -> float:
+        if self._found is not None:
+            again = self._absent_since + self._search_again if not self._unfinished else float("inf")
+            return min(again, self._found.next_tick)
+        return min(self._next_expiry, self._trial_ends, *(trial.next_tick for trial in self._trials.values()))
+
+    def opened(self, now: float) -> None:
+        self._is_open, self._absent_since = True, now
+        if self._found is not None:
+            self._found.opened(now)
+            self._pass_on(now)
+        else:
+            self._try(self.baud, now, FIRST_TRIAL)
+
+    def closed(self, now: float) -> None:
+        """The search ends; what was found is kept for the next time."""
+        self._is_open, self._absent_since = False, float("inf")
+        self._trials.clear()
+        self._trial_ends = float("inf")
+        self._out.clear()
+        if self._found is not None:
+            self._found.closed(now)
+            self._pass_on(now)
+
+    def receive(self, data: bytes, now: float) -> None:
+        if self._found is not None:
+            self._found.receive(data, now)
+            self._pass_on(now)
+            return
+        for protocol, trial in self._trials.items():
+            trial.receive(data, now)
+            if trial.info is not None:
+                self._use(protocol, trial, now)
+                return
+
+    def tick(self, now: float) -> None:
+        """Repeat the questions, try the next baud rate, or begin to search again."""
+        if self._found is not None:
+            self._found.tick(now)
+            self._pass_on(now)
+            if not self._unfinished and self._absent_since + self._search_again <= now:
+                self._found = None
+                self._try(self.baud, now, TRIAL)
+            return
+        self._expire_queued(now)
+        for protocol, trial in self._trials.items():
+            trial.tick(now)
+            if trial.info is not None:
+                self._use(protocol, trial, now)
+                return
+        if self._trial_ends <= now:
+            self._end_trial(now)
+
+    def submit(self, command: Command, now: float) -> None:
+        if self._found is None:
+            self._enqueue(command)
+            return
+        self._found.submit(command, now)
+        self._unfinished += 1
+        self._pass_on(now)
+
+    def respond(self, topic: BoardTopic, payload: bytes, now: float) -> None:
+        if self._found is not None:
+            self._found.respond(topic, payload, now)
+            self._pass_on(now)
+
+    def outgoing(self) -> bytes:
+        for dialect in self._trials.values() if self._found is None else (self._found,):
+            self._out += dialect.outgoing()
+        return super().outgoing()
+
+    def _try(self, baud: int, now: float, seconds: float) -> None:
+        self.baud, self.protocol = baud, ""
+        self._trial_began, self._trial_ends = now, now + seconds
+        self._trials = {name: kind(baud=baud, parameters=self._parameters) for name, kind in self._kinds.items()}
+        for trial in self._trials.values():
+            trial.opened(now)
+
+    def _end_trial(self, now: float) -> None:
+        """Try the next baud rate, unless whole frames arrive at this one."""
+        is_heard = any(trial.counters.received for trial in self._trials.values())
+        if is_heard and now < self._trial_began + LONGEST_TRIAL:
+            self._trial_ends = self._trial_began + LONGEST_TRIAL
+            return
+        self._try(self._bauds[(self._bauds.index(self.baud) + 1) % len(self._bauds)], now, TRIAL)
+
+    def _use(self, protocol: str, dialect: Dialect, now: float) -> None:
+        """The board speaks this protocol: continue where its trial is."""
+        self._found, self.protocol, self.counters = dialect, protocol, dialect.counters
+        self._trials.clear()
+        self._trial_ends = float("inf")
+        found = log_event("board-detected", protocol=protocol, baud=self.baud)
+        log.info("the board speaks %s at %d baud", protocol, self.baud, extra=found)
+        waiting, self._queue = self._queue, []
+        self._pass_on(now)
+        for command in waiting:
+            try:
+                self.submit(command, now)
+            except CommandRefused as error:
+                self._fail(command, error.reason, str(error))
+
+    def _pass_on(self, now: float) -> None:
+        """Take over what the found dialect knows and reports."""
+        assert self._found is not None
+        events = self._found.events()
+        self._unfinished -= sum(isinstance(event, CommandFinished) for event in events)
+        self._events += events
+        self.info = self._found.info
+        if self.info is not None:
+            self._absent_since = float("inf")
+        elif self._is_open:
+            self._absent_since = min(self._absent_since, now)

@@ -3,6 +3,9 @@
 A sketch is a folder with a `.ino` file of its name; other sources in the folder, and in its `src`, belong to it.
 `LIBRARIES` is a folder of Arduino libraries, as the Arduino IDE has, or a library; those that the sketch includes are
 compiled. The libraries of this project are in examples/firmware; those of the Arduino core are always found.
+
+A library has its sources in `src` and all folders below, or at its top and in `utility`. Other folders at the top, as
+the packages of ros_lib, hold only headers.
 """
 
 from __future__ import annotations
@@ -13,16 +16,120 @@ import re
 import subprocess
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bridges.serial.boards import cache_folder
-from bridges.serial.libraries import libraries_in, source_files, used_libraries, without_comments
 from mesh.errors import AiraError, ConfigurationError, InputError
-from mesh.running import fail
+from mesh.role.running import fail
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
+
+
+SOURCES: Final = (".c", ".cpp", ".S")
+INCLUDE: Final = re.compile(r'^[ \t]*#[ \t]*include[ \t]*[<"]([^>"]+)[>"]', re.MULTILINE)
+COMMENT: Final = re.compile(r'//[^\n]*|/\*.*?\*/|"(?:\\.|[^"\\\n])*"', re.DOTALL)
+"""A comment; or a text, which may contain what looks like one."""
+
+
+@dataclass(frozen=True)
+class ArduinoLibrary:
+    """The library in a folder."""
+
+    folder: Path
+
+    @cached_property
+    def root(self) -> Path:
+        """The folder of its headers."""
+        below = self.folder / "src"
+        return below if below.is_dir() and not any(self.folder.glob("*.h")) else self.folder
+
+    @cached_property
+    def includes(self) -> tuple[Path, ...]:
+        """The folders in which the compiler looks for headers."""
+        utility = self.root / "utility"
+        return (self.root, utility) if utility.is_dir() else (self.root,)
+
+    @cached_property
+    def sources(self) -> tuple[Path, ...]:
+        if self.root != self.folder:
+            return tuple(source_files(self.root.rglob("*")))
+        return tuple(path for folder in self.includes for path in source_files(folder.iterdir()))
+
+    @cached_property
+    def fits(self) -> bool:
+        """Whether it is for AVR processors, as far as it says."""
+        about = self.folder / "library.properties"
+        text = about.read_text(encoding="utf-8", errors="replace") if about.is_file() else ""
+        stated = re.search(r"^architectures=(.*)$", text, re.MULTILINE)
+        return stated is None or bool({"*", "avr"} & {each.strip() for each in stated[1].split(",")})
+
+    def find(self, header: str) -> Path | None:
+        """The file that an `#include` of this library names."""
+        return next((path for folder in self.includes if (path := folder / header).is_file()), None)
+
+
+def source_files(paths: Iterable[Path]) -> list[Path]:
+    """Those of these paths that are compiled, sorted."""
+    return sorted(path for path in paths if path.suffix in SOURCES and path.is_file())
+
+
+def libraries_in(folders: Sequence[Path]) -> list[ArduinoLibrary]:
+    """The libraries in these folders; a folder may also be a library itself. Raises `InputError` if one is missing."""
+    found = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"the folder of libraries {folder} is missing")
+        is_library = (folder / "library.properties").is_file() or any(folder.glob("*.h"))
+        inside = [folder] if is_library else sorted(path for path in folder.iterdir() if path.is_dir())
+        found += [library for each in inside if (library := ArduinoLibrary(each)).fits]
+    return found
+
+
+def used_libraries(
+    sources: Iterable[Path], libraries: Sequence[ArduinoLibrary], *, folders: Sequence[Path]
+) -> list[ArduinoLibrary]:
+    """The libraries whose headers these sources include, directly or through others; `folders` have headers, too.
+
+    If several libraries have a header, that with the header's name is used, otherwise the first one. What the
+    preprocessor would leave out counts as well.
+    """
+    used: list[ArduinoLibrary] = []
+    waiting = list(sources)
+    seen = set(waiting)
+    while waiting:
+        source = waiting.pop()
+        for header in INCLUDE.findall(without_comments(source.read_text(encoding="utf-8", errors="replace"))):
+            found = next((path for folder in (source.parent, *folders) if (path := folder / header).is_file()), None)
+            found = found or next((path for library in used if (path := library.find(header))), None)
+            reached = [found] if found else []
+            if found is None and (library := _library_of(header, libraries)) is not None:
+                used.append(library)
+                reached = [library.find(header), *library.sources]
+            for path in reached:
+                if path is not None and path not in seen:
+                    seen.add(path)
+                    waiting.append(path)
+    return used
+
+
+def without_comments(source: str) -> str:
+    """The same source with blanks in place of its comments: lines and columns stay."""
+
+    def blank(found: re.Match[str]) -> str:
+        return found[0] if found[0].startswith('"') else re.sub(r"[^\n]", " ", found[0])
+
+    return COMMENT.sub(blank, source)
+
+
+def _library_of(header: str, libraries: Sequence[ArduinoLibrary]) -> ArduinoLibrary | None:
+    having = [library for library in libraries if library.find(header) is not None]
+    stem = header.rpartition("/")[2].removesuffix(".h")
+    return next((library for library in having if library.folder.name == stem), having[0] if having else None)
+
 
 CORE: Final = Path("/usr/share/arduino/hardware/arduino/avr")
 CORE_INCLUDES: Final = (CORE / "cores/arduino", CORE / "variants/standard")
@@ -51,15 +158,11 @@ FUNCTION: Final = re.compile(
 """The head of a function at the beginning of a line, without default arguments; the IDE makes a prototype of it."""
 
 
-class CompilationFailed(InputError, code="compilation-failed"):
-    """A sketch does not compile; the text has the compiler's output."""
-
-
 def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), defines: Sequence[str] = ()) -> Path:
     """Compile the sketch in the folder `sketch` into `elf`, for an Uno. `defines` are as for the compiler's `-D`,
     `libraries` are Arduino libraries and folders of them.
 
-    Raises `CompilationFailed`, `InputError` for a folder that is missing or no sketch, and `ConfigurationError` if the
+    Raises `InputError` for what does not compile, is missing or no sketch, and `ConfigurationError` if the
     tools are not installed.
     """
     written = sketch_files(sketch)
@@ -75,7 +178,7 @@ def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), d
     elf.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="aira-firmware-") as folder:
         generated = Path(folder) / "sketch.cpp"
-        generated.write_text(as_cpp(written))
+        generated.write_text(as_cpp(written), encoding="utf-8")
         parts = [generated, *own, *(source for library in used for source in library.sources)]
         made = _objects(parts, Path(folder), [*macros, *(f"-I{path}" for path in includes)])
         _run("avr-gcc", *FLAGS, "-Wl,--gc-sections", "-fuse-linker-plugin", *made, core, "-lm", "-o", elf)
@@ -129,7 +232,6 @@ def size_of(elf: Path) -> tuple[int, int]:
 
 
 def _objects(sources: Sequence[Path], folder: Path, flags: Sequence[str]) -> list[Path]:
-    """Compile these sources into files in `folder`."""
 
     def compiled(source: Path, into: Path) -> Path:
         if source.suffix == ".cpp":
@@ -151,12 +253,11 @@ def _run(*command: str | Path) -> str:
     if done.returncode:
         lacks = re.search(r"fatal error: (\S+): No such file", done.stderr)
         hint = f"-L FOLDER names a folder that has the library with {lacks[1]}" if lacks else ""
-        raise CompilationFailed(f"{command[0]} failed:\n{done.stderr.strip()}", hint=hint)
+        raise InputError(f"{command[0]} failed:\n{done.stderr.strip()}", hint=hint, code="compilation-failed")
     return done.stdout
 
 
 def main() -> None:
-    """The command line."""
     parser = argparse.ArgumentParser(description="Compile Arduino sketches for an Uno.")
     parser.add_argument("sketches", nargs="+", type=Path, metavar="SKETCH", help="a sketch's folder or its .ino file")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the ELF files")

@@ -12,19 +12,19 @@ import socket
 import termios
 import time
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
-from bridges.serial.errors import InvalidPort, LineError, PortBusy, PortForbidden, PortMissing
+from bridges.serial.dialect import LineError
+from mesh.base.extras import needs_extra
+from mesh.base.log_context import log_event
 from mesh.errors import InputError
-from mesh.extras import needs_extra
-from mesh.log_context import log_event
 
 with needs_extra("serial", "a serial line"):
     import serial
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from bridges.serial.dialect import Dialect, LineEvent
 
@@ -32,8 +32,6 @@ log = logging.getLogger(__name__)
 
 USB: Final = re.compile(r"usb:(?P<vendor>[0-9a-fA-F]{4}):(?P<product>[0-9a-fA-F]{4})(?::(?P<serial>.+))?")
 READ_SIZE: Final = 4096
-PORT_POLL: Final = 0.25
-"""Seconds between two attempts to find a port that is not plugged in."""
 
 
 class PortName:
@@ -54,22 +52,24 @@ class PortName:
         return self.text
 
     def find(self) -> Path:
-        """Where the port is now. Raises `PortMissing`."""
+        """Where the port is now. Raises `LineError` (port-missing)."""
         if self._usb is None:
             path = Path(self.text)
             if not path.exists():
-                raise PortMissing(self.text, "there is no such file")
+                raise _missing(self.text, "there is no such file")
             return path
+        from serial.tools import list_ports  # reads /sys, which a path does not need
+
         vendor, product = int(self._usb["vendor"], 16), int(self._usb["product"], 16)
-        for port in _usb_ports():
+        for port in list_ports.comports():
             same = (port.vid, port.pid) == (vendor, product)
             if same and self._usb["serial"] in (None, port.serial_number):
                 return Path(port.device)
-        raise PortMissing(self.text, "no such device is plugged in")
+        raise _missing(self.text, "no such device is plugged in")
 
 
 class SerialPort:
-    """An open port, locked for this process. Raises `PortMissing`, or `LineError` if it can't be used."""
+    """An open port, locked for this process. Raises `LineError` if it is missing or can't be used."""
 
     def __init__(self, path: Path, *, baud: int) -> None:
         self.path = path
@@ -78,11 +78,10 @@ class SerialPort:
             self._serial = serial.Serial(str(path), baud, timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # pyserial's errors are OSErrors
             if not path.exists():
-                raise PortMissing(str(path), "it was unplugged") from None
+                raise _missing(str(path), "it was unplugged") from None
             raise _open_error(path, baud, error) from None
 
     def fileno(self) -> int:
-        """The file descriptor, for select."""
         return int(self._serial.fileno())
 
     def read(self) -> bytes:
@@ -113,7 +112,6 @@ class SerialPort:
             self._serial.baudrate = baud
 
     def close(self) -> None:
-        """Close the port."""
         with contextlib.suppress(OSError):  # a port that was unplugged can't be closed properly
             self._serial.close()
 
@@ -131,12 +129,10 @@ class SerialLine:
         dialect: Dialect,
         *,
         on_event: Callable[[LineEvent], None],
-        poll: float = PORT_POLL,
     ) -> None:
         self.name = name
         self.dialect = dialect
         self._on_event = on_event
-        self._poll = poll
         self._tasks: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._woken, self._waker = socket.socketpair()
         self._waker.setblocking(False)
@@ -152,7 +148,6 @@ class SerialLine:
 
     @property
     def is_open(self) -> bool:
-        """Whether the port is open."""
         return self._port is not None
 
     def call_soon(self, task: Callable[[], object]) -> None:
@@ -186,7 +181,6 @@ class SerialLine:
             self._waker.send(b"!")
 
     def _serve_once(self) -> None:
-        """Wait for something, and handle it."""
         now = time.monotonic()
         if self._port is None and self._next_attempt <= now:
             self._open_port(now)
@@ -201,20 +195,13 @@ class SerialLine:
             data = self._port.read()
             self._bytes_received += len(data)
             self.dialect.receive(data, time.monotonic())
-        self._run_tasks()
+        while not self._tasks.empty():
+            self._tasks.get_nowait()()
         now = time.monotonic()
         if self.dialect.next_tick <= now:
             self.dialect.tick(now)
         if self._silence_ends <= now:
             self._warn_of_silence()
-
-    def _run_tasks(self) -> None:
-        while True:
-            try:
-                task = self._tasks.get_nowait()
-            except Empty:
-                return
-            task()
 
     def _wait(self) -> bool:
         """Wait for bytes, a task or the next tick; returns whether bytes have arrived."""
@@ -243,13 +230,13 @@ class SerialLine:
             )
 
     def _open_port(self, now: float) -> None:
-        self._next_attempt = now + self._poll
+        self._next_attempt = now + 0.25
         try:
             self._port = SerialPort(self.name.find(), baud=self.dialect.baud)
         except LineError as error:
             if str(error) != self._last_error:
                 self._last_error = str(error)
-                level = logging.INFO if isinstance(error, PortMissing) else logging.WARNING
+                level = logging.INFO if error.code == "port-missing" else logging.WARNING
                 log.log(
                     level, "%s; waiting", error, extra=log_event("port-unavailable", port=self.name, code=error.code)
                 )
@@ -272,22 +259,20 @@ class SerialLine:
         self.dialect.closed(time.monotonic())
 
 
+def _missing(port: str, why: str) -> LineError:
+    return LineError(f"no serial port {port}: {why}", hint="is the board plugged in?", code="port-missing")
+
+
 def _open_error(path: Path, baud: int, error: OSError | ValueError) -> LineError:
-    """Why a port can't be opened, in short."""
     below = error.__context__
     number = below.args[0] if isinstance(below, termios.error) else getattr(error, "errno", None)
     failed = f"can't open {path} at {baud} baud:"
     match number:
         case errno.EACCES | errno.EPERM:
-            return PortForbidden(f"{failed} no permission", hint="on Debian, join the group dialout")
+            hint = "on Debian, join the group dialout"
+            return LineError(f"{failed} no permission", hint=hint, code="port-forbidden")
         case errno.EAGAIN | errno.EBUSY:
-            return PortBusy(f"{failed} another process uses it")
+            return LineError(f"{failed} another process uses it", code="port-busy")
         case errno.ENOTTY | errno.EISDIR | errno.ENODEV:
-            return InvalidPort(f"{failed} it is not a serial port")
+            return LineError(f"{failed} it is not a serial port", code="invalid-port")
     return LineError(f"{failed} {os.strerror(number) if number else error}")
-
-
-def _usb_ports() -> Iterable[serial.tools.list_ports_common.ListPortInfo]:
-    from serial.tools import list_ports  # reads /sys, which a path does not need
-
-    return list_ports.comports()

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import tomllib
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.errors import InvalidOptions
-from mesh.cli.files import require_model, require_readable
-from mesh.cli.options import with_settings
+from mesh.base.extras import needs_extra
+from mesh.cli.files import file_or_cid, model_named, require_readable
+from mesh.cli.options import AmountText, with_settings
 from mesh.cli.output import announce
-from mesh.extras import needs_extra
-from mesh.running import run_until_stopped
-from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
-from mesh.starting import open_when_ready, serve_on_each_chain, wait_for_files
+from mesh.errors import InputError
+from mesh.role.running import open_when_ready, run_until_stopped, serve_on_each_chain, wait_for_files
+from mesh.settings import AccountSettings, ChainSettings, NetworkSettings, TelemetrySettings
 from mesh.telemetry.serving import Telemetry
-from schemas import parse_cid
+from schemas import cid_of_file
+from schemas.decoding import InvalidData, decode_toml, text_of
 
 if TYPE_CHECKING:
-    from bridges.web.options import WebOptions
+    from bridges.web.access import WebOptions
+    from mesh.amounts import Unit
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -37,28 +38,36 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option("--name", "names", multiple=True, metavar="HOST", help="another name of this server (may be repeated)")
 @click.option("--certificate", type=FILE, help="certificate of this server for HTTPS (PEM)")
 @click.option("--key", type=FILE, help="key of the certificate (PEM)")
+@click.option(
+    "--proxy",
+    "proxies",
+    multiple=True,
+    metavar="ADDRESS",
+    help="address of a proxy in front: its X-Forwarded-For says who asks (may be repeated)",
+)
 @click.option("--token-file", type=FILE, help="file with the token that people log in with")
 @click.option("--operator-token-file", type=FILE, help="file with the token that operators log in with")
 @click.option("--embed", multiple=True, metavar="ORIGIN", help="site that may show the page in a frame")
 @click.option("--explorer", default="", metavar="URL", help="block explorer to link to")
 @click.option("--from-block", type=click.IntRange(min=0), default=0, help="first block whose contracts are listed")
 @click.option("--robot", type=FILE, help="page for one robot: a TOML file with model, objective, cost, title, text")
-@click.option("--model", help="page for one robot: its model (CID)")
-@click.option("--objective", help="page for one robot: what it is ordered to do (CID)")
-@click.option("--cost", help="page for one robot: the price, in the smallest unit of the token")
+@click.option("--model", help="page for one robot: its model, a file or a CID")
+@click.option("--objective", help="page for one robot: what it is ordered to do, a file or a CID")
+@click.option(
+    "--cost", type=AmountText(), help="page for one robot: the price, in tokens (1.5) or their smallest unit (5wn)"
+)
 @with_settings(
-    *options_of(NetworkSettings),
+    NetworkSettings,
     "lighthouse_contract",
     "erc20_token",
-    "keyfile",
-    "keyfile_password_file",
+    AccountSettings,
     "roster",
     "blocked_signers",
     "objective_size_limit",
     "content_limit",
     "fetch_timeout",
-    *options_of(ChainSettings),
-    *options_of(TelemetrySettings),
+    ChainSettings,
+    TelemetrySettings,
 )
 def command(settings: Settings, **options: Any) -> None:
     """Serve a page on which people order work, watch it, and judge it. Ctrl-C stops it.
@@ -89,6 +98,11 @@ async def _serve(options: dict[str, Any], telemetry: Telemetry, settings: Settin
     async with AsyncExitStack() as stack:
         make = partial(opened, settings)
         components = await open_when_ready(stack, settings, make, role="page", on_wait=telemetry.starting)
+        if chosen.robot is not None:
+            unit = await components.chain.tokens.unit(settings.erc20_token)
+            chosen = replace(chosen, robot=priced(chosen.robot, unit))
+            for file in files_of(options):
+                await asyncio.to_thread(components.store.put_file, file)
         server = await stack.enter_async_context(PageServer(components, chosen))
         stack.enter_context(telemetry.showing(measure=server.measure, health=server.health))
         account = f", orders for {components.agent.address}" if components.agent else ""
@@ -98,21 +112,16 @@ async def _serve(options: dict[str, Any], telemetry: Telemetry, settings: Settin
 
 
 def web_options(settings: Settings, options: dict[str, Any]) -> WebOptions:
-    """The options as the server takes them. Raises `InputError`, `InvalidListenAddress`."""
-    from bridges.web.options import WebOptions
-    from mesh.telemetry.health import listen_address
+    """The options as the server takes them. Raises `InputError`, `ConfigurationError`."""
+    from bridges.web.access import WebOptions
 
-    host, port = listen_address(options["listen"])
     return WebOptions(
-        host=host,
-        port=port,
+        **listening(options),
         names=options["names"],
-        token=token_in(options["token_file"]),
         operator_token=token_in(options["operator_token_file"]),
-        certificate=str(options["certificate"] or ""),
-        key=str(options["key"] or ""),
         roster=settings.roster,
         ca=settings.tls_ca,
+        proxies=options["proxies"],
         embed=options["embed"],
         robot=robot_of(options),
         explorer=options["explorer"],
@@ -120,39 +129,76 @@ def web_options(settings: Settings, options: dict[str, Any]) -> WebOptions:
     )
 
 
+def listening(options: dict[str, Any]) -> dict[str, Any]:
+    """The fields of `ServerOptions`, from options of the command line. Raises `InputError`, `ConfigurationError`."""
+    from mesh.telemetry.metrics import listen_address
+
+    host, port = listen_address(options["listen"])
+    certificate, key = (str(options[name] or "") for name in ("certificate", "key"))
+    return {
+        "host": host,
+        "port": port,
+        "token": token_in(options["token_file"]),
+        "certificate": certificate,
+        "key": key,
+    }
+
+
 def robot_of(options: dict[str, Any]) -> dict[str, Any] | None:
-    """The one robot of the page: from the TOML file, overridden by options. None if none is named."""
-    given: dict[str, Any] = {}
-    if options["robot"] is not None:
-        try:
-            given = tomllib.loads(require_readable(options["robot"]).read_text())
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InvalidOptions(f"{options['robot']} is no TOML file: {error}") from None
-    given |= {name: options[name] for name in ("model", "objective", "cost") if options[name]}
+    """The one robot of the page: from the TOML file, overridden by options; its cost as it is written. None if none is
+    named."""
+    given = _described(options)
     if not given:
         return None
     if unknown := given.keys() - {"model", "objective", "cost", "title", "text"}:
-        raise InvalidOptions(f"a robot's page has no {', '.join(sorted(unknown))}")
-    parse_cid(require_model(str(given.get("model", ""))))
-    if given.get("objective"):
-        parse_cid(str(given["objective"]))
+        raise InputError(f"a robot's page has no {', '.join(sorted(unknown))}", code="invalid-options")
+    objective = _objective_in(given)
     cost = str(given.get("cost", "")) or None
-    if cost is not None and not (cost.isascii() and cost.isdigit()):
-        raise InvalidOptions("the cost is a whole number in the smallest unit of the token")
+    if cost is not None:
+        AmountText().convert(cost, None, None)  # its value depends on the token
     return {
-        "model": given["model"],
-        "objective": given.get("objective") or None,
+        "model": model_named(str(given.get("model", ""))).cid(),
+        "objective": cid_of_file(objective) if isinstance(objective, Path) else objective,
         "cost": cost,
         "title": str(given.get("title", "")),
         "text": str(given.get("text", "")),
     }
 
 
+def priced(robot: dict[str, Any], unit: Unit) -> dict[str, Any]:
+    """The robot with its cost in the smallest unit of the token, as requests have it. Raises `InvalidAmount`."""
+    return robot if robot["cost"] is None else robot | {"cost": str(unit.parse(robot["cost"]))}
+
+
+def files_of(options: dict[str, Any]) -> list[Path]:
+    """The files of the one robot's model and objective, where files were given: others may read them."""
+    given = _described(options)
+    named = (model_named(str(given["model"])).file, _objective_in(given))
+    return [one for one in named if isinstance(one, Path)]
+
+
+def _objective_in(given: dict[str, Any]) -> Path | str | None:
+    """The objective's file or CID; None if people choose. Raises `InputError`."""
+    objective = file_or_cid(str(given["objective"])) if given.get("objective") else None
+    return require_readable(objective) if isinstance(objective, Path) else objective
+
+
+def _described(options: dict[str, Any]) -> dict[str, Any]:
+    """What the TOML file and the options say of the one robot. Raises `InputError`."""
+    given: dict[str, Any] = {}
+    if options["robot"] is not None:
+        try:
+            given = decode_toml(text_of(require_readable(options["robot"]).read_bytes()))
+        except InvalidData as error:
+            raise InputError(f"{options['robot']} is no TOML file: {error}", code="invalid-options") from None
+    return given | {name: options[name] for name in ("model", "objective", "cost") if options[name]}
+
+
 def token_in(path: Path | None) -> str:
     """The token in a file; empty without a file."""
     if path is None:
         return ""
-    token = require_readable(path).read_text().strip()
+    token = text_of(require_readable(path).read_bytes()).strip()
     if len(token) < 16:
-        raise InvalidOptions(f"the token in {path} is too short", hint="use at least 16 characters")
+        raise InputError(f"the token in {path} is too short", hint="use at least 16 characters", code="invalid-options")
     return token

@@ -7,12 +7,12 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from mesh.agent import Agent
-from mesh.agent.components import ChainHead, connected
+from mesh.agent.agent import Agent
 from mesh.agent.validators import ValidatorDirectory
-from mesh.composition import chain_of
+from mesh.base.flood import Drops
 from mesh.content import Exchange, Store
-from mesh.flood import Drops
+from mesh.role.composition import chain_of, connected, open_store
+from mesh.role.following import ChainHead
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -65,8 +65,7 @@ async def opened(
             head = ChainHead(await opened_chain.block_number())
             network, channel = await enter(connected(settings, opened_chain, head, drops))
             folder, limit = settings.state_directory / "content", settings.objective_expanded_limit
-            store = await asyncio.to_thread(Store, folder, limit=limit, quota=settings.content_limit)
-            stack.callback(store.close)
+            store = await open_store(stack, settings, folder, limit=limit)
             holder = await asyncio.to_thread(_holder, settings)
             exchange = await enter(Exchange(network.session, store, address=holder, drops=drops))
         yield WebComponents(
@@ -89,6 +88,6 @@ def _holder(settings: Settings) -> str:
     """Whose space on the site's routers is the server's own: its certificate's holder; empty without a certificate."""
     if not settings.tls_certificate:
         return ""
-    from mesh.identity.certificates import holder_address
+    from mesh.ops.identity.certificates import holder_address
 
     return holder_address(settings.tls_certificate)

@@ -5,63 +5,63 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
-import time
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
-import msgspec
 from aiohttp import web
 
-from bridges.web.answers import answer
-from bridges.web.api import Api
-from bridges.web.errors import (
-    InvalidRequest,
-    LoginRequired,
-    PageNotFound,
-    TooManyRequests,
-    WrongHost,
-    WrongOrigin,
+from bridges.web._api import Api
+from bridges.web.access import (
+    SENDER,
+    Logins,
+    WebError,
+    WebOptions,
+    answer,
+    is_loopback,
     status_of,
 )
-from bridges.web.files import Files
-from bridges.web.jobs import Views
-from bridges.web.logins import Logins
-from bridges.web.market import Market
-from bridges.web.options import is_loopback
-from bridges.web.orders import OrderPublisher
-from bridges.web.stream import Stream
-from mesh.agent.status import WatcherStatus
-from mesh.background import Background
-from mesh.errors import AiraError
-from mesh.flood import Rate, RateLimiter
-from mesh.log_context import log_event
-from mesh.role import Lifecycle
+from bridges.web.components import opened
+from mesh.base.door import network_of
+from mesh.base.flood import Rate, RateLimiter
+from mesh.base.http_server import HttpServer
+from mesh.base.lifecycle import Lifecycle
+from mesh.base.log_context import log_event
+from mesh.errors import AiraError, public_text
+from mesh.role.status import WatcherStatus
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable
     from contextlib import AsyncExitStack
 
     from bridges.web.components import WebComponents
-    from bridges.web.options import WebOptions
+    from mesh.agent.agent import Agent
+    from mesh.chain import Chain
+    from mesh.settings import Settings
     from mesh.telemetry.metrics import MetricFamily
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
 
 log = logging.getLogger(__name__)
 
 OWN_HEADER: Final = "X-Aira-Request"
 REQUESTS: Final = Rate(per_second=50, burst=400)
-"""Requests of one address."""
+"""Requests of one login, or of one address without a login."""
 REQUESTS_IN_TOTAL: Final = Rate(per_second=500, burst=2000)
+"""Those without a login."""
+REFUSED: Final = Rate(per_second=10, burst=100)
+"""Requests of one address that are refused, or that a page of another site makes: they use up nobody's own."""
+COUNTED: Final = frozenset({"invalid-request", "login-required", "wrong-host", "wrong-origin"})
+"""The codes of requests that are refused."""
+LOGIN: Final = "/api/v1/session"
 LONGEST_BODY: Final = 1 << 18
 """Bytes of a body that is no objective."""
-AGENTS_INTERVAL: Final = 3.0
-"""Seconds between two lists of agents on the stream."""
 VIEWERS: Final = ("https://app.foxglove.dev",)
 """Sites that may read files here: a link of the page opens a recording there."""
 VIEWED: Final = re.compile(r"/api/v1/files/\w+/recording\.\w+")
-OPEN_PATHS: Final = ("/api/v1/session", "/api/v1/openapi.json")
+OPEN_PATHS: Final = (LOGIN, "/api/v1/openapi.json")
 """Parts of the interface that need no login."""
 
 
@@ -74,36 +74,25 @@ class PageServer(Lifecycle):
         options.check()
         self.components = components
         self.options = options
-        self.stream = Stream()
-        self.market = Market(components, self.stream, from_block=options.from_block)
-        self.files = Files(components)
-        self.views = Views(components, self.market, self.files)
-        self.publisher = OrderPublisher(components, self.market)
-        self._status = WatcherStatus(components.network, components.channel, components.drops)
         self.url = ""
-        self._hosts: frozenset[str] = frozenset()
         self._logins = Logins(options)
+        self.api = Api(components, options, self._logins)
+        self._status = WatcherStatus(components.network, components.channel, components.drops)
+        self._hosts: frozenset[str] = frozenset()
         self._limiter = RateLimiter(per_sender=REQUESTS, total=REQUESTS_IN_TOTAL)
-        self._chain_asked = float("-inf")
-        self._has_chain = True
+        self._of_logins = RateLimiter(per_sender=REQUESTS)
+        self._refused = RateLimiter(per_sender=REFUSED)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         enter = stack.enter_async_context
-        await enter(self.market)
-        await enter(self.publisher)
-        tasks = await enter(Background())
-        tasks.start(self._show_agents(), "page: agents")
-        tasks.start(self.components.drops.run(), "page: drops")
+        await enter(self.api)
         app = web.Application(middlewares=[self._guarded], client_max_size=LONGEST_BODY)
-        app.add_routes([*Api(self).routes(), web.post("/api/v1/session", self._logins.log_in)])
+        app.add_routes([*self.api.routes(), web.post(LOGIN, self._logins.log_in)])
         app.router.add_get("/{path:.*}", self._static)
-        app.on_shutdown.append(lambda _: self.stream.close())
-        runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0)
-        await runner.setup()
-        stack.push_async_callback(runner.cleanup)
-        site = web.TCPSite(runner, self.options.host, self.options.port, ssl_context=self._logins.tls())
-        await site.start()
-        port = runner.addresses[0][1]
+        app.on_shutdown.append(lambda _: self.api.stream.close())
+        tls = await asyncio.to_thread(self._logins.tls)
+        listen, proxies = (self.options.host, self.options.port), self.options.proxies
+        port = (await enter(HttpServer(app, *listen, tls=tls, trusted=proxies, option="--listen HOST:PORT"))).port
         host = f"[{self.options.host}]" if ":" in self.options.host else self.options.host
         self.url = f"{'https' if self.options.certificate else 'http'}://{host}:{port}"
         own = {f"{host}:{port}"}
@@ -111,29 +100,11 @@ class PageServer(Lifecycle):
             own |= {f"{name}:{port}" for name in ("localhost", "127.0.0.1", "[::1]")}
         self._hosts = frozenset(own)
 
-    def role_of(self, request: web.Request) -> str:
-        """`operator` or `anybody`: what the session of a request may do."""
-        return self._logins.role_of(request) or "anybody"
-
     async def measure(self) -> tuple[MetricFamily, ...]:
-        """Its metrics now."""
         return await self._status.measure(())
 
     def health(self) -> dict[str, str]:
-        """The state of its parts."""
-        return {**self._status.health(), "chain": ALIVE if self._has_chain else "waits for the node"}
-
-    async def has_chain(self) -> bool:
-        """Whether the node answers; asked once in three seconds."""
-        if time.monotonic() - self._chain_asked > AGENTS_INTERVAL:
-            self._chain_asked = time.monotonic()
-            try:
-                async with asyncio.timeout(2.0):
-                    await self.components.chain.block_number()
-                self._has_chain = True
-            except (AiraError, TimeoutError):
-                self._has_chain = False
-        return self._has_chain
+        return {**self._status.health(), "chain": ALIVE if self.api.chain_answers else "waits for the node"}
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -142,11 +113,13 @@ class PageServer(Lifecycle):
             self._check(request)
             response = web.Response(status=204) if _is_viewer(request, "OPTIONS") else await handler(request)
         except AiraError as error:
-            response = _failure(error)
+            response = _failure(self._counted(request, error) if error.code in COUNTED else error)
         except web.HTTPRequestEntityTooLarge:
-            response = _failure(InvalidRequest(f"a body has at most {LONGEST_BODY} bytes"))
+            response = _failure(WebError(f"a body has at most {LONGEST_BODY} bytes"))
         except web.HTTPException as error:
-            response = _failure(PageNotFound(error.reason)) if error.status == 404 else error
+            missing = error.status == 404
+            response = _failure(WebError(error.reason, code="page-not-found") if missing else WebError(error.reason))
+            response.set_status(error.status)
         except (ConnectionError, asyncio.CancelledError):
             raise
         except Exception:
@@ -163,40 +136,56 @@ class PageServer(Lifecycle):
         return response
 
     def _check(self, request: web.Request) -> None:
-        sender = request.remote or ""
-        if not self._limiter.allow(sender):
-            self.components.drops.count("page-request", sender)
-            raise TooManyRequests("too many requests", hint="wait a moment")
-        if not self._is_own(request.host):
-            raise WrongHost(f"this server is not {request.host[:80]!r}", hint="name it with --name")
+        host = request.host
+        # A name without a port is one at any port.
+        if host not in self._hosts and {host, host.rpartition(":")[0]}.isdisjoint(self.options.names):
+            raise WebError(f"this server is not {host[:80]!r}", hint="name it with --name", code="wrong-host")
         if not _is_viewer(request):
             self._check_site(request)
-        is_api = request.path.startswith("/api/") or request.path == "/rpc"
-        if (
-            is_api
-            and request.path not in OPEN_PATHS
-            and self._logins.is_needed
-            and self._logins.role_of(request) is None
-        ):
-            raise LoginRequired("log in first", hint="the token is in the server's token file")
+        login = self._logins.login_of(request)
+        if _is_api(request) and request.path not in OPEN_PATHS and self._logins.is_needed and login is None:
+            raise WebError("log in first", hint="the token is in the server's token file", code="login-required")
+        address = self._address_of(request)
+        request[SENDER] = address if login is None else login.sender
+        if request.path == LOGIN:  # wrong tokens are refused, and the right one never
+            return
+        if _is_foreign(request):
+            allowed = self._refused.allow(address)
+        elif login is None:
+            allowed = self._limiter.allow(address)
+        else:
+            allowed = self._of_logins.allow(login.sender)
+        if not allowed:
+            raise self._too_many(address)
+
+    def _counted(self, request: web.Request, refusal: AiraError) -> AiraError:
+        """What a refused request is answered: of too many only that they are."""
+        address = self._address_of(request)
+        return refusal if self._refused.allow(address) else self._too_many(address)
+
+    def _too_many(self, address: str) -> WebError:
+        self.components.drops.count("page-request", address)
+        return WebError("too many requests", hint="wait a moment", code="too-many-requests")
+
+    def _address_of(self, request: web.Request) -> str:
+        """Who asks: the address of the connection, or what a proxy of ours says."""
+        path = [request.remote or ""]
+        for line in request.headers.getall("X-Forwarded-For", ()):
+            path[:-1] += [one.strip() for one in line.split(",")]
+        address = next((one for one in reversed(path) if one not in self.options.proxies), path[0])
+        return network_of(address[:64])
 
     def _check_site(self, request: web.Request) -> None:
-        """Refuse pages of other sites."""
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != request.host:
-            raise WrongOrigin("pages of other sites may not use this server")
-        is_api = request.path.startswith("/api/") or request.path == "/rpc"
-        if is_api and request.headers.get("Sec-Fetch-Site") == "cross-site":
-            raise WrongOrigin("pages of other sites may not use this server")
+            raise WebError("pages of other sites may not use this server", code="wrong-origin")
+        if _is_api(request) and _is_foreign(request):
+            raise WebError("pages of other sites may not use this server", code="wrong-origin")
         if request.method not in ("GET", "HEAD"):
             if request.headers.get(OWN_HEADER) != "1":
-                raise WrongOrigin(f"the header {OWN_HEADER} is missing")
+                raise WebError(f"the header {OWN_HEADER} is missing", code="wrong-origin")
             if request.content_type not in ("application/json", "application/octet-stream"):
-                raise InvalidRequest("a body is application/json, or application/octet-stream for an objective")
-
-    def _is_own(self, host: str) -> bool:
-        """Whether a request for this host is meant for this server: a name without a port is one at any port."""
-        return host in self._hosts or not {host, host.rpartition(":")[0]}.isdisjoint(self.options.names)
+                raise WebError("a body is application/json, or application/octet-stream for an objective")
 
     def _headers(self) -> dict[str, str]:
         frames = " ".join(self.options.embed) or "'none'"
@@ -212,30 +201,16 @@ class PageServer(Lifecycle):
     async def _static(self, request: web.Request) -> web.StreamResponse:
         """A built file; any other path that looks like no file is the page itself, which has its own routes."""
         root = self.options.static
-        path = (root / request.match_info["path"].lstrip("/")).resolve()
-        if path.is_file() and path.is_relative_to(root.resolve()):
-            return web.FileResponse(path, headers={"Cache-Control": "no-cache"})
         index = root / "index.html"
+        try:
+            path = (root / request.match_info["path"].lstrip("/")).resolve()
+            if path.is_file() and path.is_relative_to(root.resolve()):
+                return web.FileResponse(path, headers={"Cache-Control": "no-cache"})
+        except (OSError, ValueError):  # no file can have this name
+            raise WebError(f"there is no {request.path[:80]!r}", code="page-not-found") from None
         if "." in request.path.rpartition("/")[2] or request.path.startswith("/api/") or not index.is_file():
-            raise PageNotFound(f"there is no {request.path[:80]}")
+            raise WebError(f"there is no {request.path[:80]}", code="page-not-found")
         return web.FileResponse(index, headers={"Cache-Control": "no-cache"})
-
-    async def _show_agents(self) -> None:
-        """Publish the agents while somebody looks at them."""
-        last: bytes = b""
-        while True:
-            await asyncio.sleep(AGENTS_INTERVAL)
-            await self.has_chain()
-            if not self.stream.has_subscribers("agents"):
-                continue
-            try:
-                agents = await self.views.agents()
-            except AiraError as error:
-                log.debug("the agents can't be listed: %s", error)
-                continue
-            if (text := msgspec.json.encode(agents)) != last:
-                last = text
-                self.stream.publish("agents", "agents", agents)
 
 
 _VIEWER_HEADERS: Final = {
@@ -245,6 +220,15 @@ _VIEWER_HEADERS: Final = {
     "Cross-Origin-Resource-Policy": "cross-origin",
     "Vary": "Origin",
 }
+
+
+def _is_api(request: web.Request) -> bool:
+    return request.path.startswith("/api/") or request.path == "/rpc"
+
+
+def _is_foreign(request: web.Request) -> bool:
+    """Whether a browser says that a page of another site, or of another port, makes a request."""
+    return request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin")
 
 
 def _is_viewer(request: web.Request, *methods: str) -> bool:
@@ -257,7 +241,19 @@ def _is_viewer(request: web.Request, *methods: str) -> bool:
 
 
 def _failure(error: AiraError) -> web.Response:
-    facts = {"code": error.code, "message": str(error), "hint": error.hint}
-    if (reason := getattr(error, "reason", None)) is not None and isinstance(reason, str):
+    facts = {"code": error.code, "message": public_text(error), "hint": public_text(error.hint)}
+    if isinstance(reason := getattr(error, "reason", None), str) and reason:
         facts["reason"] = reason
     return answer({"error": facts}, status=status_of(error))
+
+
+@asynccontextmanager
+async def served(
+    settings: Settings, *, port: int, chain: Chain | None = None, agent: Agent | None = None
+) -> AsyncIterator[str]:
+    """See `mesh.dev.page.ServePage`."""
+    async with (
+        opened(settings, agent=agent, chain=chain) as components,
+        PageServer(components, WebOptions(port=port)) as server,
+    ):
+        yield server.url

@@ -62,6 +62,10 @@ interface LiabilityErrors {
     error RefusedByValidator(address signer);
     error RefundTooEarly(uint256 fromBlock);
     error NotTheFactory(address caller);
+    /// No payment of this token to this account was refused, or it was claimed.
+    error NothingOwed(address token, address account);
+    /// A payment failed with less gas than every payment is given, so it may not have been the token that refused it.
+    error TooLittleGas(uint256 left, uint256 needed);
 }
 
 interface LighthouseErrors {

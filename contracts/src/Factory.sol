@@ -9,6 +9,7 @@ import {ILiabilityFactory, Liability} from "./Liability.sol";
 import {ILighthouseFactory, Lighthouse} from "./Lighthouse.sol";
 import {LighthouseNames} from "./LighthouseNames.sol";
 import {Order, Orders} from "./Orders.sol";
+import {PullPayments} from "./PullPayments.sol";
 import {Signatures} from "./Signatures.sol";
 import {Terms, TermsCode} from "./Terms.sol";
 import {Tokens} from "./Tokens.sol";
@@ -18,7 +19,14 @@ import {XRT} from "./XRT.sol";
 /// @notice It keeps no list of what it has made: a clone of its own is known by its code (see Clone). Money moves in
 /// before a liability exists and out after it has ended, so there is no state in between for a token's hook to come
 /// back to.
-contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFactory, ILiabilityFactory {
+contract Factory is
+    RobonomicsErrors,
+    LighthouseNames,
+    Emission,
+    PullPayments,
+    ILighthouseFactory,
+    ILiabilityFactory
+{
     using Orders for Order;
 
     /// Tells liabilities from lighthouses.
@@ -297,12 +305,17 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         _credit(terms, false, address(0));
     }
 
-    /// Pays what `_collect` has taken into the factory; for a liability that has just ended, so it comes once.
+    /// Pays what `_collect` has taken into the factory; for a liability that has just ended, so it comes once. XRT returns
+    /// true or reverts, and refuses nobody who can have a part in a liability.
+    // slither-disable-start unchecked-transfer
     function _payOut(Terms memory terms, address costTo, address feeTo) private {
-        if (terms.cost > 0) Tokens.pay(terms.token, costTo, terms.cost);
-        // slither-disable-next-line unchecked-transfer (XRT returns true or reverts)
+        if (terms.cost > 0) {
+            if (terms.token == address(xrt)) xrt.transfer(costTo, terms.cost);
+            else _payOrOwe(terms.token, costTo, terms.cost);
+        }
         if (_hasValidatorFee(terms)) xrt.transfer(feeTo, terms.validatorFee);
     }
+    // slither-disable-end unchecked-transfer
 
     /// The digest of a result, and what its signer has signed.
     function _readResult(address liability, bytes calldata result, bool success)

@@ -48,10 +48,11 @@ contract XRT is TokenErrors {
         minter = account;
     }
 
-    /// @notice Creates `value` wn for `account`; for the minter alone.
+    /// @notice Creates `value` wn for `account`, or as many as there can still be; for the minter alone.
     function mint(address account, uint256 value) external returns (bool) {
         if (msg.sender != minter) revert NotTheMinter(msg.sender);
-        _mint(account, value);
+        uint256 left = type(uint96).max - _supply;
+        _mint(account, value < left ? value : left);
         return true;
     }
 

@@ -14,7 +14,7 @@ async def ask(times: int, out: Path | None) -> None:
     async with Agent(cid_of_file(Path(__file__).with_name("model.md"))) as agent:
         for _ in range(times):
             answers.append(await agent.ask())
-            for gas, volts in zip(GASES, answers[-1].value.data.split(), strict=True):
+            for gas, volts in zip(GASES, answers[-1].value.split(), strict=True):
                 print(f"{gas:<10}{volts} V", flush=True)
     if out is not None:
         pack((message for answer in answers for message in answer.messages), out)

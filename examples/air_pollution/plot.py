@@ -33,7 +33,9 @@ def draw(measured: Iterable[Reading], png: Path) -> int:
         from matplotlib.dates import date2num
         from matplotlib.figure import Figure
     except ImportError:
-        raise ConfigurationError("drawing needs matplotlib", hint="pip install 'aira-mesh[plot]'") from None
+        raise ConfigurationError(
+            "drawing needs matplotlib", hint="in a clone of aira-mesh: pip install '.[plot]'"
+        ) from None
     ordered = sorted(measured)
     if not ordered:
         raise InputError("there are no measurements to draw", hint="a recording of /measurements has them")

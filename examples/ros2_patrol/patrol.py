@@ -14,7 +14,7 @@ GOAL, CAMERA, ODOMETRY = "/patrol/goal", "/camera/image/compressed", "/odom"
 NAVIGATE, ACTION = "/navigate_to_pose", "nav2_msgs/NavigateToPose"
 
 ros = RosTypes(os.environ.get("ROS_DISTRO", "jazzy"))
-ros.register(ACTION, (Path(__file__).parent / "nav2_msgs/action/NavigateToPose.action").read_text())
+ros.register(ACTION, (Path(__file__).parent / "nav2_msgs/action/NavigateToPose.action").read_text(encoding="utf-8"))
 
 
 def session(mode: str, **endpoints: str) -> zenoh.Session:

@@ -1,41 +1,207 @@
-"""The agent, which users write: a model, handlers, and `run`."""
+"""The agent, which users write: a model, handlers, and `run`; what it does on its market, and what it says there."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
-from mesh.agent.components import watching, working
+from mesh.agent._answers import Answer, Question, Unanswered, metadata_of_answer
+from mesh.agent.components import working
+from mesh.agent.contracts import nothing
 from mesh.agent.demands import HANDLED
-from mesh.agent.handlers import HandlerDecorators, check_model, dispatch, repeat
-from mesh.agent.own_model import derived, model_of, own_description
-from mesh.agent.reading_agent import ReadingAgent
-from mesh.agent.status import WatcherStatus
-from mesh.background import Background
-from mesh.composition import load_account
-from mesh.flood import Drops
-from mesh.log_context import LogSource, log_event, source_context
-from mesh.starting import open_when_ready, serve_on_each_chain, wait_for_files
-from mesh.telemetry.logs import set_process_source
-from mesh.telemetry.serving import Telemetry
-from mesh.work.models import Models
-from mesh.work.outbox import RESEND
-from schemas import Demand, Result
+from mesh.agent.errors import OrderClosed
+from mesh.agent.handlers import (
+    ANY_TOPIC,
+    DemandHandler,
+    Handler,
+    Handlers,
+    LiabilityHandler,
+    OfferHandler,
+    PeriodicHandler,
+    ReadingHandler,
+    RegistrationError,
+    ReportHandler,
+    ResultHandler,
+    check_handler,
+    check_model,
+    check_period,
+    check_topic,
+    dispatch,
+    invalid_topic,
+    repeat,
+)
+from mesh.agent.orders import HANDLED_FOR, OrderState
+from mesh.agent.validators import ValidatorSilent, check_named
+from mesh.amounts import XRT
+from mesh.base.log_context import log_event
+from mesh.errors import ChainError, ClosedError, ConfigurationError, InputError
+from mesh.network import ReadingSubscription, sending
+from mesh.network.readings import LARGEST_READING
+from mesh.recording import encode_described, pack_values
+from mesh.role.composition import watching
+from mesh.role.models import Models, description_in
+from mesh.role.program import RESEND, OpenRole, Program
+from mesh.role.status import WatcherStatus
+from mesh.settings import load
+from schemas import (
+    ZERO_ADDRESS,
+    Demand,
+    Offer,
+    Result,
+    Verified,
+    cid_of_file,
+    parse_address,
+    reading_selector,
+    verify_message,
+)
+from schemas.cid import is_cid
+from schemas.errors import InvalidKey
+from schemas.keys import ReadingKey
+from schemas.model import ModelDescription, topic_gap, topic_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Coroutine, Iterator, Mapping
     from contextlib import AsyncExitStack
-    from pathlib import Path
 
-    from mesh.agent.runtime import AgentRuntime
+    from mesh.agent._runtime import AgentRuntime
+    from mesh.agent._status import AgentStatus
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.contracts import Contract, OnProgress
+    from mesh.agent.handlers import Job, TopicHandlers
+    from mesh.agent.orders import Terms
+    from mesh.agent.trade import Order
+    from mesh.agent.validators import AnnouncedValidator
+    from mesh.base.retry import RetryPolicy
     from mesh.chain import Account, Chain
-    from mesh.retry import RetryPolicy
+    from mesh.content import Store
+    from mesh.network import Channel, Network, Subscription
+    from mesh.recording import Objective
     from mesh.settings import Settings
-    from schemas.model import ModelDescription, ModelLimits
+    from schemas.model import ModelLimits
+    from schemas.payloads import PayloadType
 
-log = logging.getLogger(__name__)
+
+class ModelUnfit(ConfigurationError, code="model-unfit"):
+    """The handlers of an agent don't fit the description of its model: it would take orders that it can't do."""
+
+    def __init__(self, model: str, why: str) -> None:
+        hint = "change the handlers or the description; `aira model new PROGRAM.py` writes one from the handlers"
+        super().__init__(f"the handlers don't fit the model {model}: {why}", hint=hint)
+        self.model = model
+        self.why = why
+
+
+def model_of(model: str | Path) -> str:
+    """The model that an agent is given: its name, or the CID of its file. Raises `ConfigurationError`."""
+    with _reading(model):
+        return model if isinstance(model, str) else cid_of_file(model)
+
+
+@contextmanager
+def _reading(model: str | Path) -> Iterator[None]:
+    """Raise a `ConfigurationError` if the file of a model can't be read."""
+    try:
+        yield
+    except OSError as error:
+        why, hint = error.strerror or str(error), "`aira model new PROGRAM.py` writes one"
+        raise ConfigurationError(f"can't read the model {model}: {why}", hint=hint, code="model-unreadable") from None
+
+
+def derived(topics: TopicHandlers, result: Mapping[str, Any], fields: dict[str, Any]) -> ModelDescription:
+    """The description of what these handlers take; `result` has the Python type of each topic that they publish.
+
+    `fields` are others of `ModelDescription`. Raises `InvalidDescription`.
+    """
+    taken = topics.declared
+    description = ModelDescription(
+        objective=tuple(topic_of(topic, kind) for topic, kind in taken.items() if topic != ANY_TOPIC),
+        other_topics=ANY_TOPIC in taken,
+        result=tuple(topic_of(topic, kind) for topic, kind in result.items()),
+        **fields,
+    )
+    description.encode()  # a constructor does not check lengths and ranges
+    return description
+
+
+def require_fit(description: ModelDescription, topics: TopicHandlers) -> None:
+    """Raise `ModelUnfit` unless the handlers take every message that the description allows, and no other topics.
+
+    An agent without handlers leaves the work to devices, of which nothing is known here.
+    """
+    taken = topics.declared
+    if not taken:
+        return
+    for topic in description.objective:
+        kind = taken.get(topic.topic, taken.get(ANY_TOPIC))
+        if kind is None:
+            raise ModelUnfit(description.cid, f"no handler takes {topic.topic}")
+        if why := topic_gap(topic, topic_of(topic.topic, kind)):
+            raise ModelUnfit(description.cid, why)
+    if description.other_topics and ANY_TOPIC not in taken:
+        raise ModelUnfit(description.cid, "no handler takes other topics")
+    if not description.other_topics:
+        unknown = sorted(topic for topic in taken if topic != ANY_TOPIC and description.topic(topic) is None)
+        if unknown:
+            raise ModelUnfit(description.cid, f"the model has no topic {unknown[0]}, which a handler takes")
+
+
+async def own_description(
+    parts: AgentComponents, models: Models, model: str | Path, topics: TopicHandlers
+) -> ModelDescription | None:
+    """The description of an agent's own model, which its handlers fit; None if it has none, or nobody serves it now.
+
+    A file is put into the store, from which others fetch it. Raises `InvalidDescription`, `ConfigurationError`.
+    """
+    if isinstance(model, str):
+        description = None
+        with suppress(ChainError):  # a name that can't be resolved now
+            cid = await parts.chain.names.model(model) if model else ""
+            description = await models.find(cid) if cid else None
+    else:
+        with _reading(model):
+            description = await asyncio.to_thread(description_in, model)
+            await asyncio.to_thread(parts.store.put_file, model, pin="model")
+    if description is not None:
+        require_fit(description, topics)
+    return description
+
+
+D = TypeVar("D", bound=DemandHandler)
+O = TypeVar("O", bound=OfferHandler)  # noqa: E741
+R = TypeVar("R", bound=ResultHandler)
+L = TypeVar("L", bound=LiabilityHandler)
+G = TypeVar("G", bound=ReadingHandler)
+J = TypeVar("J", bound=ReportHandler)
+P = TypeVar("P", bound=PeriodicHandler)
+K = TypeVar("K")
+V = TypeVar("V")
+T = TypeVar("T", bound=Callable[["Job", Any], object])
+
+
+Messages: TypeAlias = Sequence[tuple[str, object]]
+"""Topics with what is published on them: anything that `Job.publish` accepts."""
+
+
+class DemandTerms(TypedDict, total=False):
+    """The optional arguments of `Agent.order` and `Agent.demand`."""
+
+    cost: int | str
+    model: str
+    token: str
+    validator: str
+    validator_fee: int | str | None
+    lifetime: int | None
+
+
+ASK_SECONDS: Final = 60.0
+"""How long `Agent.ask` waits for an answer by default."""
 
 
 class DescriptionFields(TypedDict, total=False):
@@ -48,7 +214,7 @@ class DescriptionFields(TypedDict, total=False):
     limits: ModelLimits
 
 
-class Agent(HandlerDecorators, ReadingAgent):
+class Agent(Program):
     """A participant of the market: `agent = Agent(model)`, handlers, then `agent.run()` or `async with agent`.
 
     `model` is the CID of the behaviour that it offers or demands ('' for any), or the path of the model's file, which
@@ -57,7 +223,13 @@ class Agent(HandlerDecorators, ReadingAgent):
     market. It opens nothing before `run` or `async with`. Any number of agents can run in one event loop. `chain`, if
     given, is an open chain to use instead of the one that the settings name; `resend` is how often messages without
     effect are sent again.
+
+    The decorators register handlers. A handler may be sync: it then runs in a thread of its own, and may block. What
+    can't work raises a `RegistrationError`, a `ConfigurationError` with the line of your program.
     """
+
+    title = "agent"
+    needs_account = False
 
     def __init__(
         self,
@@ -69,20 +241,109 @@ class Agent(HandlerDecorators, ReadingAgent):
         resend: RetryPolicy = RESEND,
     ) -> None:
         check_model(model)
-        HandlerDecorators.__init__(self)
-        ReadingAgent.__init__(self, model_of(model, missing=""), settings)
+        super().__init__(load() if settings is None else settings, account=account, chain=chain)
+        self.model = ""
+        with suppress(ConfigurationError):  # without its file, which is required when it is opened
+            self.model = model_of(model)
         self._given_model = model
-        self._account = account
-        self._given_chain = chain
         self._resend = resend
-        self.telemetry = Telemetry(self.settings.metrics_listen)
-        """Serves its metrics and its health if the settings say where."""
-        self.drops = Drops()
-        """Counts what was dropped, of what strangers sent."""
+        self._handlers = Handlers()
+        self._link: tuple[Network, Channel] | None = None
+        """While it is open: its session, and the channel of its market."""
+        self._runtime: AgentRuntime | None = None
 
     def __repr__(self) -> str:
         who = f", account={self.address}" if self._runtime is not None else ""
         return f"Agent(model={self.model or '(any)'}{who})"
+
+    @overload
+    def on(self, topic: str) -> Callable[[T], T]: ...
+
+    @overload
+    def on(self, topic: str, kind: type[K]) -> Callable[[Callable[[Job, K], V]], Callable[[Job, K], V]]: ...
+
+    def on(self, topic: str, kind: type | None = None) -> Callable[[Any], Any]:
+        """Handle what objectives play on `topic` (`*`: on topics without a handler): `async def handler(job, message)`.
+
+        The type of `message`, or `kind`, says what it is: a msgspec Struct, a dataclass, float, int, bool, str, bytes,
+        `Empty`, `String`, list, dict, or a union of these. An objective with other messages is refused before it is
+        played. Without a type, `message` is what was decoded: `Empty`, `String`, a number, JSON data, or bytes.
+
+        Messages are handled one at a time. When the last handler has returned, the job finishes with success;
+        an exception (best `JobFailed("why")`) ends it without, and the promisee is refunded.
+        """
+        check_topic(topic)
+
+        def register(handler: Any) -> Any:
+            self._handlers.topics.add(topic, handler, kind)
+            return handler
+
+        return register
+
+    def on_demand(self, handler: D) -> D:
+        """Handle each new Demand of the agent's model, several at once: `async def handler(demand)`."""
+        self._on_market(Demand, handler)
+        return handler
+
+    def on_offer(self, handler: O) -> O:
+        """Handle each new Offer of the agent's model: `async def handler(offer)`."""
+        self._on_market(Offer, handler)
+        return handler
+
+    def on_result(self, handler: R) -> R:
+        """Handle each new Result on the market: `async def handler(result)`."""
+        self._on_market(Result, handler)
+        return handler
+
+    def on_liability(self, handler: L) -> L:
+        """Handle each phase of each of the agent's jobs: `async def handler(phase, liability)`."""
+        check_handler(handler, "phase: Phase, liability: Liability", arguments=2)
+        self._handlers.liabilities.append(handler)
+        return handler
+
+    def on_report(self, handler: J) -> J:
+        """Handle each juror's report on a contract of the agent's account: `async def handler(report)`.
+
+        The report is signed, by a juror of the contract's validator; `success` is the verdict, `failures` the reasons.
+        """
+        check_handler(handler, "report: ValidatorReport", arguments=1)
+        self._handlers.reports.append(handler)
+        return handler
+
+    def on_reading(self, topic: str, *, agent: str = "*") -> Callable[[G], G]:
+        """Handle what agents, or one (address), publish on `topic` outside of jobs: `async def handler(reading)`.
+
+        A `Reading` has the `agent`, the `topic` and the `value`. They are handled one at a time.
+        """
+        try:
+            reading_selector(agent, topic)
+        except InvalidKey as error:
+            if error.text == agent:
+                raise RegistrationError(error.why, hint='write the address of an agent: agent="0x…"') from None
+            raise invalid_topic(error.text, error.why) from None
+
+        def register(handler: G) -> G:
+            check_handler(handler, "reading: Reading", arguments=1)
+            self._handlers.readings.append((topic, agent, handler))
+            return handler
+
+        return register
+
+    def every(self, seconds: float) -> Callable[[P], P]:
+        """Call the handler, which takes no argument, at the start and then every `seconds` seconds."""
+        check_period(seconds)
+
+        def register(handler: P) -> P:
+            check_handler(handler, "", arguments=0)
+            self._handlers.periodic.append((seconds, handler))
+            return handler
+
+        return register
+
+    def _on_market(self, kind: type[Demand | Offer | Result], handler: Handler) -> None:
+        name = kind.__name__
+        check_handler(handler, f"{name.lower()}: Verified[{name}]", arguments=1)
+        self._handlers.market.setdefault(kind, []).append(handler)
 
     def model_description(
         self, title: str, *, result: Mapping[str, Any] | None = None, **fields: Unpack[DescriptionFields]
@@ -95,90 +356,354 @@ class Agent(HandlerDecorators, ReadingAgent):
         """
         return derived(self._handlers.topics, result or {}, {"title": title, **fields})
 
-    def run(self) -> None:
-        """Serve until Ctrl-C or SIGTERM. Prints errors that people can fix in one line, with exit code 1 or 2."""
-        from mesh.running import run_until_stopped
+    @property
+    def runtime(self) -> AgentRuntime:
+        """The working side of a running agent. Raises `ClosedError` if it is not running or has no account."""
+        if self._runtime is None:
+            self._opened()
+            raise ConfigurationError(
+                "this agent has no account, it only watches",
+                hint="give it one: keyfile and keyfile_password_file in the settings",
+            )
+        return self._runtime
 
-        run_until_stopped(self.serve, settings=self.settings, role="agent")
+    @property
+    def parts(self) -> AgentComponents:
+        """The components of a running agent. Raises as `runtime` does."""
+        return self.runtime.parts
 
-    async def serve(self) -> None:
-        """Serve until cancelled, also when a development chain is started afresh."""
-        place: Path | None = None
+    @property
+    def chain(self) -> Chain:
+        """The open chain; `chain.web3` talks to any other contract. Raises as `runtime` does."""
+        return self.parts.chain
 
-        async def on_one_chain(settings: Settings) -> None:
-            nonlocal place
-            self.settings = settings
-            async with self:
-                place = None if self._runtime is None else self._runtime.parts.directory
-                await asyncio.Event().wait()
+    @property
+    def network(self) -> Network:
+        """The Zenoh session and its state. Raises `ClosedError` if the agent is not running."""
+        return self._opened()[0]
 
-        if self._given_chain is None:
-            await serve_on_each_chain(self.settings, on_one_chain, place=lambda: place)
-        else:
-            await on_one_chain(self.settings)
+    @property
+    def channel(self) -> Channel:
+        """The lighthouse's channel. Raises `ClosedError` if the agent is not running."""
+        return self._opened()[1]
 
-    async def _open(self, stack: AsyncExitStack) -> None:
-        stack.callback(self._closed)
-        await stack.enter_async_context(self.telemetry)
-        await wait_for_files(self.settings)
+    @property
+    def address(self) -> str:
+        """The account's address (EIP-55)."""
+        return self.parts.signer.address
+
+    async def offer(
+        self,
+        demand: Verified[Demand] | Demand | None = None,
+        *,
+        objective: str = "",
+        cost: int | str = 0,
+        token: str = "",
+        validator: str = "",
+        lighthouse_fee: int | str = 0,
+        lifetime: int | None = None,
+    ) -> str:
+        """Offer to do a job; returns the order's hash (hex). The offer is resent until it is matched or expires.
+
+        With a `demand` the offer agrees to its terms, once its objective was examined; an open offer with the same fee
+        for it, or in generation 5 for another version of it, is enough. Else `objective` (CID), `cost` (`"5 XRT"`, or a
+        number of the token's smallest unit), `token` and `validator` (names or addresses) are the terms, valid for
+        `lifetime` blocks, by default about ten minutes. `lighthouse_fee` (`"0.1 XRT"`, or wn) is paid to the provider.
+
+        An offer is for its terms: it matches every demand with equal ones. It is withdrawn when its demand has become a
+        contract with another offer or was withdrawn, when a handler declines a demand with equal terms, and when the
+        agent ends.
+
+        Raises `InsufficientTokens`, `InvalidAmount`, for an objective that can't be played `ObjectiveUnfit` or a
+        `ContentError`, an `AiraError` for a demand that is a contract, and `Declined` for one whose validator wants a
+        higher fee or is not one of the setting `accepted_validators`, or while an equal one is open that was declined.
+        """
+        trader, fee = self.runtime.trader, XRT.amount(lighthouse_fee)
+        if demand is None:
+            terms = await trader.writer.terms(
+                model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
+            )
+            return (await trader.post(Offer, terms, lighthouse_fee=fee)).hash
+        verified = demand if isinstance(demand, Verified) else verify_message(demand)
+        wanted, answered = verified.message, trader.answered.note(verified)
+        await self.runtime.validators.require_accepted(wanted, self.settings.accepted_validators)
+        await self.examine(wanted.objective)
+        await trader.require_open(answered)
+        offered = answered.offer
+        if offered is not None and offered.is_open and getattr(offered.signed, "lighthouse_fee", None) == fee:
+            return offered.identity
+        return (await trader.post(Offer, trader.writer.terms_of(wanted), answers=answered, lighthouse_fee=fee)).hash
+
+    async def examine(self, cid: str) -> Objective:
+        """The objective with that CID, fetched if needed, after it was checked as before a job.
+
+        Raises `ObjectiveUnfit`, whose `reason` is a word for programs, and branches of `ContentError`; while a demand
+        is handled also `ObjectiveNotFetched`, as what strangers make an agent fetch is limited.
+        """
+        # seconds without a new block
+        return await self.runtime.objectives.examine(cid, patience=10.0, buyer=HANDLED_FOR.get())
+
+    async def order(
+        self,
+        objective: str | Path | Messages,
+        *,
+        cost: int | str = 0,
+        model: str = "",
+        token: str = "",
+        validator: str = "",
+        validator_fee: int | str | None = None,
+        lifetime: int | None = None,
+    ) -> Order:
+        """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
+
+        `objective` is a CID, the path of a file (also as text), or messages that are played one after the other, such
+        as `[("/blink", "red"), ("/stop", Empty())]`; the agent serves it. The other terms are as for `offer`;
+        `validator_fee` is `"0.1 XRT"`, or wn; by default what the validator announces. The factory gets the allowance
+        that they need. A restarted agent sends the order again.
+
+        Raises `InputError`, `InsufficientTokens`, `ObjectiveUnfit` if a file is not playable, or
+        if the model's description is available and excludes the objective, `UnsafeValidator` and its like for a
+        validator that can't be named, and `ValidatorSilent` if its fee is not known because nobody answers.
+        """
+        writer = self.runtime.trader.writer
+        cid = await self._cid_of(objective)
+        terms = await writer.terms(
+            model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
+        )
+        await self.runtime.require_fit(cid, terms["model"])
+        fee = await self._announced_fee(terms) if validator_fee is None else XRT.amount(validator_fee)
+        return await self.runtime.trader.post(Demand, terms, validator_fee=fee)
+
+    async def demand(
+        self, objective: str | Path | Messages, *, on_progress: OnProgress = nothing, **terms: Unpack[DemandTerms]
+    ) -> Contract:
+        """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
+
+        The terms are those of `order`, `on_progress` that of `Order.contract`. Cancelling withdraws the demand. Raises
+        `OrderExpired`, `OrderClosed` (withdrawn elsewhere) and `InsufficientTokens`.
+        """
+        order = await self.order(objective, **terms)
+        try:
+            return await order.contract(on_progress=on_progress)
+        except asyncio.CancelledError:
+            if self._runtime is not None:
+                with suppress(OrderClosed):  # it has just become a contract
+                    await order.withdraw()
+            raise
+
+    @overload
+    async def validator(self, whose: str) -> AnnouncedValidator: ...
+
+    @overload
+    async def validator(self, whose: Verified[Demand] | Demand) -> AnnouncedValidator | None: ...
+
+    async def validator(self, whose: str | Verified[Demand] | Demand) -> AnnouncedValidator | None:
+        """How a validator (address or name), or that of a demand, judges, as its jurors announce it now.
+
+        `AnnouncedValidator.is_silent` if none answers. None for a demand without a validator. The answers are kept for
+        a minute. Raises `ChainError`, and for a name that can't be resolved what `demand` raises.
+        """
+        if not isinstance(whose, str):
+            named = (whose.message if isinstance(whose, Verified) else whose).validator
+            return None if named == ZERO_ADDRESS else await self.runtime.validators.find(named)
+        return await self.runtime.validators.find(await self.parts.chain.names.address(whose))
+
+    def orders(self, *states: OrderState) -> list[Order]:
+        """The account's orders in these states, oldest first; by default the open ones, those of earlier runs included.
+
+        Withdrawn ones are listed until their deadline. Matched and expired ones are not listed.
+        """
+        return self.runtime.trader.orders(*(states or (OrderState.OPEN,)))
+
+    async def contract(self, address: str) -> Contract:
+        """The contract at `address`, of any account; `outcome` waits for its end. Raises `NotALiability`."""
+        return await self.runtime.trader.contracts.read(address)
+
+    async def finish(self, address: str, *, success: bool) -> str:
+        """End the job of the liability at `address` now; returns the recording's CID. Raises `WrongPhase`."""
+        return await self.runtime.executor.finish(address, success=success)
+
+    def send(self, message: Demand | Offer | Result) -> str:
+        """Sign a message with the agent's account and put it on the market once; returns its key. It is not resent.
+
+        Raises `UnsafeValidator` for an order with a validator that was not checked on the chain before, as `demand` and
+        `offer` do.
+        """
+        if isinstance(message, Demand | Offer):
+            self.parts.chain.validators.check_known(message)
+        return self.channel.publish(self.parts.signer.sign(message))
+
+    async def add(self, path: str | Path) -> str:
+        """Copy a file to the agent's store, which serves it to others; returns its CID."""
+        return await asyncio.to_thread(self.parts.store.put_file, Path(path))
+
+    async def _announced_fee(self, terms: Terms) -> int:
+        """What the validator of these terms wants, in wn. Raises `ValidatorSilent`."""
+        if (validator := terms["validator"]) == ZERO_ADDRESS:
+            return 0
+        generation = self.settings.generation
+        await check_named(self.parts.chain, validator, lighthouse=terms["lighthouse"], generation=generation)
+        announced = await self.runtime.validators.find(validator)
+        if announced.is_silent:
+            raise ValidatorSilent(validator)
+        return announced.fee
+
+    async def _cid_of(self, objective: str | Path | Messages) -> str:
+        """The CID of an objective, once the agent's store has it. Raises `InputError`."""
+        if not isinstance(objective, str | Path):
+            return await asyncio.to_thread(put_values, self.parts.store, objective)
+        if isinstance(objective, str) and is_cid(objective):
+            return objective
+        if not await asyncio.to_thread(Path(objective).is_file):
+            raise InputError(
+                f"{str(objective)!r} is neither a CID nor a file",
+                hint="name an MCAP file or a ROS 1 bag that exists, or a CID of 46 characters (Qm…)",
+                code="not-an-objective",
+            )
+        await self.runtime.objectives.require_playable(Path(objective))
+        return await self.add(objective)
+
+    async def fetch(self, cid: str) -> Path:
+        """The file with that CID, from the store or fetched from others and checked. Raises a `ContentError`."""
+        limit, timeout = self.settings.objective_expanded_limit, self.settings.fetch_timeout
+        return await self.parts.exchange.fetch(cid, size_limit=limit, timeout=timeout)
+
+    def publish(self, topic: str, message: object) -> None:
+        """Publish a reading on a topic of the agent, outside any job. Those who listen now get it; nobody keeps it.
+
+        `message` is anything that `Job.publish` accepts. Raises `InputError` for an invalid topic or message, or one
+        that is too large, `ClosedError`, and `ConfigurationError` if the agent has no account.
+        """
+        session, key = self.parts.network.session, str(ReadingKey(self.address, topic))
+        payload, kind = _encoded(topic, message)
+        sending.put(session, key, payload, encoding=kind.zenoh_encoding)
+
+    def readings(self, topic: str = "/**", *, agent: str = "*") -> ReadingSubscription:
+        """What agents publish outside of jobs: `async with agent.readings("/battery") as readings`, then iterate.
+
+        By default on all topics, by all agents; `agent` is an address. Raises `InvalidKey`, `ClosedError`.
+        """
+        return ReadingSubscription(self.network.session, agent=agent, topic=topic, drops=self.drops)
+
+    async def answer(self, demand: Verified[Demand], value: object, *, topic: str = "/answer") -> str:
+        """Answer a demand without a contract; returns the CID of the recording with the `value`.
+
+        `value` is anything that `Job.publish` accepts. A Result that names the asker as its liability is put on the
+        market once; who asks with `ask` asks again if it is lost. Raises as `publish` does.
+        """
+        _encoded(topic, value)
+        options = {"time_ns": time.time_ns(), "metadata": metadata_of_answer(demand, self.address)}
+        cid = await asyncio.to_thread(put_values, self.parts.store, [(topic, value)], **options)
+        self.send(Result(liability=demand.signer, result=cid, success=True))
+        facts = log_event("demand-answered", demand=demand.hash.hex(), signer=demand.signer, result=cid)
+        log.info("answered %s without a contract: %s", demand.signer, cid, extra=facts)
+        return cid
+
+    async def ask(
+        self, model: str = "", objective: str | Path | Messages = "", *, agent: str = "", timeout: float = ASK_SECONDS
+    ) -> Answer:
+        """Ask the agents of a model, by default this agent's, and return the first answer: `(await agent.ask()).value`.
+
+        The question is a demand that pays nothing, asked again until an answer comes, and then withdrawn. Its
+        `objective`, as that of `order`, says what is asked, if the model needs that. With an `agent` (address) only its
+        answer counts. Anybody can answer: who did is `Answer.agent`. Legacy answers don't say which question they are
+        for.
+
+        Raises `Unanswered` after `timeout` seconds. A robot may make a contract of a question, one that costs nothing.
+        """
+        cid = await self._cid_of(objective) if objective else ""
+        writer = self.runtime.trader.writer
+        by = parse_address(agent) if agent else ""
+        try:
+            async with asyncio.timeout(timeout):
+                named = await self.parts.chain.names.model(model or self.model)
+                terms = await writer.terms(
+                    model=named, objective=cid or named, cost=0, token="", validator="", lifetime=None
+                )
+                return await Question(self.parts, writer, seconds=timeout, agent=by).ask(terms)
+        except TimeoutError:
+            raise Unanswered(model or self.model, timeout) from None
+
+    async def _open_role(self, stack: AsyncExitStack, account: Account | None) -> OpenRole:
+        """Open the components, and subscribe to what the handlers want."""
         self.model = await asyncio.to_thread(model_of, self._given_model)
-        account = self._account
-        if account is None and self.settings.keyfile:
-            account = await asyncio.to_thread(load_account, self.settings)
-        address, lighthouse = "" if account is None else account.address, self.settings.lighthouse_contract.lower()
-        source = LogSource("agent", address, lighthouse)
-        set_process_source(source)
-        with source_context(source):
-            await self._open_as(stack, account)
-
-    async def _open_as(self, stack: AsyncExitStack, account: Account | None) -> None:
-        """Open the components, then start the tasks."""
-        status: WatcherStatus | AgentRuntime
+        status: WatcherStatus | AgentStatus
         if account is None:
-            network, channel = await stack.enter_async_context(watching(self.settings, drops=self.drops))
+            network, channel = self._link = await stack.enter_async_context(watching(self.settings, drops=self.drops))
             status = WatcherStatus(network, channel, self.drops)
-            self._network, self._channel = network, channel
         else:
-            status = self._runtime = await self._open_runtime(stack, account)
-            network, channel = status.parts.network, status.parts.channel
-            self._network, self._channel = network, channel
+            runtime = self._runtime = await self._open_runtime(stack, account)
+            self._place, status = runtime.parts.directory, runtime.status
+            network, channel = self._link = runtime.parts.network, runtime.parts.channel
             channel.announce("agent", account.address)
         facts = log_event("agent-started", address=account and account.address, zenoh_id=network.id)
         who = f"account {account.address}" if account else "watching"
         log.info("%s on %s, Zenoh id %s", who, channel.lighthouse, network.id, extra=facts)
-        subscriptions = []
+        market = []
         for kind, handlers in self._handlers.market.items():
             model = self.model if kind is not Result and self.model else "*"
-            subscription = await stack.enter_async_context(channel.subscribe(kind, model=model))
-            subscriptions.append((kind, subscription, handlers))
-        measure = partial(status.measure, [subscription for _, subscription, _ in subscriptions])
-        stack.enter_context(self.telemetry.showing(measure=measure, health=status.health))
-        # The tasks are entered last, so they end first: what handlers and jobs use is open until then.
-        tasks = await stack.enter_async_context(Background())
-        if self._runtime is not None:
-            tasks.start(self._runtime.run(), "runtime")
-        tasks.start(self.drops.run(), "drops")
-        for kind, subscription, handlers in subscriptions:
-            tasks.start(subscription.recall(), "recall")
-            if kind is Demand and self._runtime is not None:
-                tasks.start(self._runtime.handle_demands(cast("Any", subscription), handlers), "demands")
-            else:
-                tasks.start(dispatch(subscription, handlers, concurrency=HANDLED if kind is Demand else 1), "handlers")
+            market.append((kind, await stack.enter_async_context(channel.subscribe(kind, model=model)), handlers))
+        readings = []
         for topic, agent, listener in self._handlers.readings:
-            heard = await stack.enter_async_context(self.readings(topic, agent=agent))
-            tasks.start(dispatch(heard, [listener], concurrency=1), f"readings on {topic}")
+            readings.append((await stack.enter_async_context(self.readings(topic, agent=agent)), listener))
+        measure = partial(status.measure, [subscription for _, subscription, _ in market])
+        return OpenRole(measure, status.health, partial(self._tasks, market, readings))
+
+    def _tasks(
+        self,
+        market: Sequence[tuple[type[Demand | Offer | Result], Subscription[Any], Sequence[Handler]]],
+        readings: Sequence[tuple[ReadingSubscription, ReadingHandler]],
+    ) -> Iterator[tuple[str, Coroutine[Any, Any, object]]]:
+        if self._runtime is not None:
+            yield from self._runtime.tasks()
+        for kind, subscription, handlers in market:
+            yield "recall", subscription.recall()
+            if kind is Demand and self._runtime is not None:
+                yield "demands", self._runtime.handle_demands(subscription, handlers)
+            else:
+                yield "handlers", dispatch(subscription, handlers, concurrency=HANDLED if kind is Demand else 1)
+        for heard, listener in readings:
+            yield "readings", dispatch(heard, [listener], concurrency=1)
         for seconds, handler in self._handlers.periodic:
-            tasks.start(repeat(seconds, handler), f"every {seconds:g} s")
+            yield f"every {seconds:g} s", repeat(seconds, handler)
 
     async def _open_runtime(self, stack: AsyncExitStack, account: Account) -> AgentRuntime:
-        from mesh.agent.runtime import AgentRuntime  # loads the chain, which an agent that watches does without
+        from mesh.agent._runtime import AgentRuntime  # loads the chain, which an agent that watches does without
 
         make = partial(working, self.settings, account, self._given_chain, resend=self._resend, drops=self.drops)
-        parts = await open_when_ready(stack, self.settings, make, role="agent", on_wait=self.telemetry.starting)
+        parts = await self._open_when_ready(stack, make)
         models = Models(parts.store, parts.exchange)
         description = await own_description(parts, models, self._given_model, self._handlers.topics)
         runtime = AgentRuntime(parts, self._handlers, models, description, model=self.model or "")
         return await stack.enter_async_context(runtime)
 
+    def _opened(self) -> tuple[Network, Channel]:
+        if self._link is None:
+            raise ClosedError("the agent is not running", hint="use it inside `async with`")
+        return self._link
+
     def _closed(self) -> None:
-        self._network = self._channel = self._runtime = None
+        self._link = self._runtime = None
+
+
+def put_values(store: Store, values: Messages, **options: Any) -> str:
+    """Put a recording of values into a store; returns its CID. Blocks on the disk. `options` are of `pack_values`."""
+    with tempfile.TemporaryDirectory(prefix="aira-values-") as folder:
+        path = Path(folder) / "values.mcap"
+        pack_values(values, path, **options)
+        return store.put_file(path)
+
+
+log = logging.getLogger(__name__)
+
+
+def _encoded(topic: str, value: object) -> tuple[bytes, PayloadType]:
+    """The payload of a reading and its type. Raises `InputError`."""
+    payload, kind = encode_described(value)
+    if len(payload) > LARGEST_READING:
+        raise InputError(
+            f"a reading on {topic} has {len(payload):,} bytes; the most are {LARGEST_READING:,}",
+            hint="send less at once, or put it into a file and publish the CID that `agent.add` returns",
+            code="reading-too-large",
+        )
+    return payload, kind

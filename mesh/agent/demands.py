@@ -1,36 +1,97 @@
 """Demands on their way to an agent's handlers: makers in turn, those who pay more first, nobody who can't pay.
 
 Anybody can sign demands, with any number of keys. What a handler does with one may be expensive (fetching the
-objective, offering), so few are handled at once, and those that pay nothing never take all places.
+objective, offering), so few are handled at once, and those that pay nothing never take all places. What an agent does
+not work for it declines: it says so, signed, and why.
 """
 
 from __future__ import annotations
 
 import asyncio
-from contextvars import ContextVar
+import logging
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from mesh.agent.declines import BUSY, grounds_of
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call
-from mesh.agent.offers import TooManyOffers
-from mesh.content import ContentUnavailable
-from mesh.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
-from mesh.work.database import LedgerUnusable
-from mesh.work.objectives import Buyer, ObjectiveNotFetched
+from mesh.agent.objectives import Buyer, ObjectiveNotFetched, ObjectiveUnfit
+from mesh.agent.orders import DEMAND_TAKEN, EQUAL_DECLINED, HANDLED_FOR, TooManyOffers
+from mesh.base.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
+from mesh.base.log_context import log_event
+from mesh.content import ContentTooLarge, ContentUnavailable
+from mesh.errors import ContentError, public_text
+from mesh.role.database import LedgerUnusable
+from schemas import DeclineKey
+from schemas.signing import LONGEST_DETAIL, Decline
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mesh.agent.declines import DeclinePublisher
+    from mesh.agent.components import AgentComponents
     from mesh.agent.handlers import Handler
-    from mesh.chain import Chain
+    from mesh.agent.trade import Trader
+    from mesh.base.flood import Drops
     from mesh.errors import AiraError
-    from mesh.flood import Drops, KnownSenders
-    from mesh.network import Subscription
-    from mesh.outage_log import OutageLog
-    from schemas import Demand, Verified
+    from mesh.network import Channel, Subscription
+    from schemas import Demand, Signer, Verified
+
+
+log = logging.getLogger(__name__)
+
+PER_MAKER: Final = Rate(per_second=1.0, burst=32)
+"""Declines of one maker's demands."""
+TOTAL: Final = Rate(per_second=10.0, burst=200)
+"""Declines in all: each is signed, logged and published."""
+
+
+class Grounds(NamedTuple):
+    """Why a demand is declined: a word for programs, and a line for people."""
+
+    code: str
+    detail: str
+
+
+BUSY: Final = Grounds("busy", "too many demands and offers wait; it looks at the demand again when it is sent again")
+
+
+def grounds_of(error: AiraError) -> Grounds | None:
+    """Why a demand is declined whose handler raised this error; None if the error says nothing about the demand."""
+    match error:
+        case Declined():
+            return Grounds(error.reason, error.detail)
+        case ObjectiveUnfit():
+            return Grounds(error.reason, error.detail)
+        case ObjectiveNotFetched(reason="rate" | "shared") | TooManyOffers():
+            return BUSY
+        case ContentTooLarge():
+            return Grounds("too-large", "the objective is larger than it allows")
+        case ContentError():  # its own text is about this agent's store and peers
+            return Grounds("objective-unavailable", "it could not fetch the objective from anybody")
+    return None
+
+
+class DeclinePublisher:
+    """Publishes an agent's declines on its market's `channel`; beyond a rate they are only counted in `drops`."""
+
+    def __init__(self, channel: Channel, signer: Signer, drops: Drops) -> None:
+        self._channel = channel
+        self._signer = signer
+        self._drops = drops
+        self._limiter = RateLimiter(per_sender=PER_MAKER, total=TOTAL)
+
+    def decline(self, demand: Verified[Demand], grounds: Grounds) -> None:
+        """Say to the maker of a demand why this agent does not work for it."""
+        if not self._limiter.allow(demand.signer):
+            self._drops.count("declines", demand.signer)
+            return
+        order, code = demand.hash.hex(), grounds.code
+        facts = log_event("demand-declined", order=order, maker=demand.signer, code=code)
+        log.info("declined the demand %s of %s (%s): %s", order, demand.signer, code, grounds.detail, extra=facts)
+        detail = public_text(grounds.detail, longest=LONGEST_DETAIL)
+        decline = Decline(order=order, code=code, detail=detail, agent=self._signer.address)
+        key = str(DeclineKey(self._channel.lighthouse, demand.signer))
+        self._channel.put(key, decline.signed_by(self._signer).encode())
+
 
 HANDLED: Final = 32
 """Demands that are handled at once: to fetch the objective of one may take long."""
@@ -38,51 +99,48 @@ FREE_HANDLED: Final = 16
 """Of these, demands that pay nothing."""
 FREE_RATE: Final = Rate(per_second=4.0, burst=64)
 """Demands that pay nothing and are handled. Each offer for one may become a job."""
-CHECKED: Final = 512
-"""Demands whose makers' funds are asked for at once."""
+UNFUNDED_OF_ONE: Final = 16
+"""Demands of one maker that wait for its funds …"""
+UNFUNDED: Final = 256
+"""… and in all: one request to the node asks for so many."""
 WAITING: Final = 16_384
 """Demands that wait for the check of their funds, and as many for a handler."""
 LOGGED: Final = Rate(per_second=0.2, burst=20)
 """Failures of handlers with the same code that are logged."""
 
-_handled: ContextVar[Buyer | None] = ContextVar("handled", default=None)
-"""Whose demand the running code handles."""
-
-
-def current_buyer() -> Buyer | None:
-    """Whose demand the running handler handles; None outside of a demand's handler."""
-    return _handled.get()
-
 
 class DemandDispatcher:
     """Calls `handlers` with the demands of a subscription: `await dispatcher.run()`.
 
-    A demand whose maker can't pay now is not handled, but its next copy is looked at again. Pay counts in `token` (an
-    address) only. What is not handled is counted in `drops`; what makers with money should know goes to `declines`.
+    A demand whose maker can't pay now waits for `UNFUNDED_POLLS` looks at the chain, because an approval or a payment
+    may be under way, or the node a block behind the maker's; after that its next copy is looked at. Pay counts in
+    `token` (an address) only. What is not handled is counted, what makers with money should know is declined, and what
+    the handlers decide goes to `trader`.
     """
 
     def __init__(
         self,
         subscription: Subscription[Demand],
         handlers: Sequence[Handler],
+        parts: AgentComponents,
+        trader: Trader,
         *,
-        chain: Chain,
         token: str,
-        customers: KnownSenders,
-        outages: OutageLog,
-        declines: DeclinePublisher,
-        drops: Drops,
     ) -> None:
         self._subscription = subscription
         self._handlers = handlers
-        self._chain = chain
+        self._chain = chain = parts.chain
         self._token = token
-        self._customers = customers
-        self._outages = outages
-        self._declines = declines
-        self._drops = drops
+        self._trader = trader
+        trader.ask_again = self._ask_again
+        self._pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
+        self._outages = parts.outages
+        self._declines = DeclinePublisher(parts.channel, parts.signer, parts.drops)
+        self._drops = parts.drops
         self._arrived: FairQueue[Verified[Demand]] = FairQueue(per_sender=WAITING, total=WAITING)
         self._funded: FairQueue[Verified[Demand]] = FairQueue(per_sender=WAITING, total=WAITING)
+        self._unfunded: FairQueue[tuple[Verified[Demand], int]] = FairQueue(per_sender=UNFUNDED_OF_ONE, total=UNFUNDED)
+        """Demands whose makers can't pay, and how often that was looked at."""
         self._changed = asyncio.Event()
         self._running = self._running_free = 0
         self._logged = RateLimiter(per_sender=LOGGED)
@@ -92,40 +150,56 @@ class DemandDispatcher:
         """Receive, check and handle demands, until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._receive(), name="demands")
-            tasks.create_task(self._check(), name="funds of demands")
+            tasks.create_task(self._check_arrived(), name="funds of demands")
+            tasks.create_task(self._check_unfunded(), name="funds that were missing")
             await self._handle(tasks)
 
     async def _receive(self) -> None:
         async for demand in self._subscription:
-            is_customer = demand.signer in self._customers
+            is_customer = demand.signer in self._trader.customers
             for dropped in self._arrived.put(demand.signer, demand, priority=int(is_customer)):
                 self._drop(dropped, "queue-full")
 
-    async def _check(self) -> None:
-        """Pass on the demands whose makers can pay."""
+    async def _check_arrived(self) -> None:
         while True:
-            batch = await self._arrived.get_batch(CHECKED)
-            question = partial(self._chain.costs.shortages, batch)
-            shortages = await self._chain.retrying(question, outages=self._outages)
-            for demand, shortage in zip(batch, shortages, strict=True):
-                if shortage:
-                    self._drop(demand, "unfunded", after=UNFUNDED_POLLS * self._chain.node.timing.poll_interval)
-                    continue
-                for dropped in self._funded.put(demand.signer, demand, priority=self._worth(demand)):
-                    self._drop(dropped, "queue-full")
-                    self._declines.decline(dropped, BUSY)
-            self._changed.set()
+            arrived = await self._arrived.get_batch(512)
+            await self._check([(demand, 0) for demand in arrived])
 
-    def _worth(self, demand: Verified[Demand]) -> int:
-        """The priority of a demand: by the magnitude of its pay, and of two alike the customer's."""
-        return 2 * self._chain.costs.worth(demand.message, token=self._token) + (demand.signer in self._customers)
+    async def _check_unfunded(self) -> None:
+        while True:
+            await asyncio.sleep(self._chain.node.timing.poll_interval)
+            await self._check(await self._unfunded.get_batch(UNFUNDED))
+
+    async def _check(self, demands: Sequence[tuple[Verified[Demand], int]]) -> None:
+        """Pass on the demands whose makers can pay; the others wait, by how often they were looked at before."""
+        question = partial(self._chain.funds.shortages, [demand for demand, _ in demands])
+        shortages = await self._chain.retrying(question, outages=self._outages)
+        for (demand, looks), shortage in zip(demands, shortages, strict=True):
+            if shortage and looks == UNFUNDED_POLLS:
+                self._subscription.forget(demand)
+            elif shortage:
+                if not looks:
+                    self._drops.count("unfunded", demand.signer)
+                for dropped, _ in self._unfunded.put(demand.signer, (demand, looks + 1)):
+                    self._subscription.forget(dropped, after=self._pause)
+            else:
+                self._pass_on(demand)
+        self._changed.set()
+
+    def _pass_on(self, demand: Verified[Demand]) -> None:
+        """Let a demand wait for the handlers, by the magnitude of its pay, and of two alike a customer's first."""
+        worth = self._chain.funds.worth(demand.message, token=self._token)
+        priority = 2 * worth + (demand.signer in self._trader.customers)
+        for dropped in self._funded.put(demand.signer, demand, priority=priority):
+            self._drop(dropped, "queue-full")
+            self._declines.decline(dropped, BUSY)
 
     async def _handle(self, tasks: asyncio.TaskGroup) -> None:
         while True:
             self._changed.clear()
             while self._has_place():
                 demand = self._funded.get_nowait()
-                pays = self._chain.costs.worth(demand.message, token=self._token) > 0
+                pays = self._chain.funds.worth(demand.message, token=self._token) > 0
                 if not pays and not self._free_rate.allow(demand.signer):
                     self._drop(demand, "free-rate")
                     self._declines.decline(demand, BUSY)
@@ -141,29 +215,50 @@ class DemandDispatcher:
             return False
         return top > 1 or self._running_free < FREE_HANDLED
 
+    def _ask_again(self, demand: Verified[Demand]) -> None:
+        """Let the handlers decide again on a demand."""
+        self._pass_on(demand)
+        self._changed.set()
+
     async def _handle_one(self, demand: Verified[Demand], *, pays: bool) -> None:
-        _handled.set(Buyer(demand.signer, pays))
-        grounds = []
         try:
-            for handler in self._handlers:
-                error = await call(handler, demand, logged=self._is_logged)
-                if isinstance(error, ObjectiveNotFetched):
-                    self._drop(demand, f"objective-{error.reason}")
-                elif isinstance(error, ContentUnavailable):
-                    self._drop(demand, "objective-missing")
-                elif error is not None and _may_pass(error):
-                    self._drop(demand, error.code)
-                if error is not None and (reason := grounds_of(error)) is not None:
-                    grounds.append(reason)
-            if grounds:
-                self._declines.decline(demand, grounds[0])
+            for earlier in self._trader.answered.declined_like(demand.message):
+                if earlier.demand.hash != demand.hash and not await self._decide(earlier.demand, pays=pays):
+                    break  # still declined: no offer can be made that does not match it, too
+            await self._decide(demand, pays=pays)
         finally:
             self._running -= 1
             self._running_free -= not pays
             self._changed.set()
 
+    async def _decide(self, demand: Verified[Demand], *, pays: bool) -> bool:
+        """Call the handlers with a demand; False if they decline it."""
+        HANDLED_FOR.set(Buyer(demand.signer, pays))
+        answered, grounds = self._trader.answered.note(demand), []
+        answered.is_declined = False
+        for handler in self._handlers:
+            error = await call(handler, demand, logged=self._is_logged)
+            if isinstance(error, ObjectiveNotFetched):
+                self._drop(demand, f"objective-{error.reason}")
+            elif isinstance(error, ContentUnavailable):
+                self._drop(demand, "objective-missing")
+            elif isinstance(error, Declined) and error.reason == EQUAL_DECLINED:
+                self._drop(demand, EQUAL_DECLINED, after=self._pause)
+            elif error is not None and _may_pass(error):
+                self._drop(demand, error.code)
+            if error is not None and (reason := grounds_of(error)) is not None:
+                grounds.append(reason)
+        if grounds and not answered.is_answered:
+            self._declines.decline(demand, grounds[0])
+            if not answered.is_over and grounds[0].code not in (BUSY.code, EQUAL_DECLINED):
+                await self._trader.decline(answered)
+        if not answered.is_answered:
+            self._trader.answered.forget(answered)
+        return not answered.is_declined
+
     def _is_logged(self, error: AiraError) -> bool:
-        return not isinstance(error, ObjectiveNotFetched | Declined) and self._logged.allow(error.code)
+        is_expected = isinstance(error, ObjectiveNotFetched | Declined) or error.code == DEMAND_TAKEN
+        return not is_expected and self._logged.allow(error.code)
 
     def _drop(self, demand: Verified[Demand], reason: str, *, after: float = 0.0) -> None:
         """Count a demand that is not handled now, and let its next copy through, `after` seconds."""

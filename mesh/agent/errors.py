@@ -1,4 +1,4 @@
-"""Errors of trading and of an agent's services. `JobFailed`, which handlers raise, is in `mesh.work.job`."""
+"""Errors of trading and of an agent's services. `JobFailed`, which handlers raise, is in `mesh.agent.handlers`."""
 
 from __future__ import annotations
 
@@ -57,26 +57,3 @@ class LiabilityReverted(AiraError, code="liability-reverted"):
         )
         self.liability = liability
         self.deadline = deadline
-
-
-class ServiceClosed(AiraError, code="service-closed"):
-    """A service that the agent's settings don't open to others: it signs, spends or drives jobs."""
-
-    def __init__(self, service: str) -> None:
-        super().__init__(
-            f"this agent does not offer {service} to others",
-            hint="set open_services = true on the agent, if only those who may use its account reach its router",
-        )
-        self.service = service
-
-
-__all__ = ["Declined", "LiabilityReverted", "OrderClosed", "OrderExpired", "ServiceClosed"]
-
-
-class NotAnObjective(InputError, code="not-an-objective"):
-    """What is demanded is neither a CID nor an existing file."""
-
-    def __init__(self, text: str) -> None:
-        hint = "name an MCAP file or a ROS 1 bag that exists, or a CID of 46 characters (Qm…)"
-        super().__init__(f"{text!r} is neither a CID nor a file", hint=hint)
-        self.text = text

@@ -1,22 +1,56 @@
-"""Orders of an account: their terms, and what users see of them."""
+"""Orders: what users see of them, their terms, and the demands and offers that an agent must keep together.
+
+    open ──► matched                it became a contract; open again if a reorganisation reverts that
+      ├────► withdrawn              by its maker; until its deadline it may become a contract all the same
+      └────► expired                the chain has reached its deadline
+
+An order of generation 5 is signed again when another order has used its nonce. Its versions differ in their nonce only;
+a reorganisation may free the nonce of an earlier one, which then may become the contract that its maker waits for.
+
+An offer names no demand: it matches whatever demand has equal terms. So an agent must take an offer back when nothing
+that it has agreed to is left for it: when the demand has become a contract with another offer or was withdrawn, and
+when the agent has declined a demand with equal terms. What strangers make an agent offer costs it and the market
+messages until the deadline, so the open offers are bounded for each maker and in total.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import secrets
+from collections import Counter, OrderedDict
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent.contract import fail_future
+from msgspec.structs import replace
+
+from mesh.agent.contracts import (
+    Contract,
+    Progress,
+    fail_future,
+    report,
+    stated,
+)
 from mesh.agent.errors import OrderClosed, OrderExpired
-from mesh.agent.progress import Progress, nothing, report, stated
-from mesh.market.refusals import Refusal
-from schemas import Demand, Offer, message_hash
+from mesh.base.flood import BoundedDict
+from mesh.errors import AiraError, InputError
+from schemas import ZERO_ADDRESS, Demand, Offer, Withdrawal, message_hash
+from schemas.messages import equal_terms, lasting_hash
+from schemas.signing import Refusal
 
 if TYPE_CHECKING:
-    from mesh.agent.contract import Contract
-    from mesh.agent.progress import OnProgress
+    from collections.abc import Iterable, Mapping
+
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.contracts import OnProgress
+    from mesh.agent.objectives import Buyer
+    from mesh.chain import Chain
+    from schemas import Liability, Verified
     from schemas.signing import Decline, Rejection
+
+    Terms = Mapping[str, Any]
+
 
 STATEMENTS_KEPT: Final = 64
 """Most providers whose rejection of an order is remembered, and most agents whose decline is."""
@@ -35,6 +69,11 @@ class OrderState(StrEnum):
     """The chain has reached its deadline."""
 
 
+def withdrawal_of(order: Demand | Offer) -> Withdrawal:
+    """The withdrawal of an order, to be signed by its maker."""
+    return Withdrawal(order=message_hash(order).hex(), lighthouse=order.lighthouse, deadline=order.deadline)
+
+
 @dataclass(eq=False)
 class TradedOrder:
     """An order as its trader follows it."""
@@ -50,6 +89,8 @@ class TradedOrder:
     declines: dict[str, Decline] = field(default_factory=dict)
     """The last decline by each agent."""
     on_progress: list[OnProgress] = field(default_factory=list)
+    is_ours: bool = False
+    """Whether this agent has posted it, in this run: not an earlier one, nor another program of the account."""
 
     def __str__(self) -> str:
         return f"{self.signed.kind} {self.identity}"
@@ -79,6 +120,11 @@ class TradedOrder:
         return used is not None and self.nonce is not None and self.nonce <= used
 
     @property
+    def honoured_by(self) -> frozenset[str]:
+        """The providers (addresses) that have signed that they honour its withdrawal."""
+        return frozenset(who for who, said in self.rejections.items() if said.reason == Refusal.WITHDRAWN)
+
+    @property
     def why_closed(self) -> OrderClosed | OrderExpired:
         """The error of those who wait for the contract of an order that is not open."""
         if self.state is OrderState.EXPIRED:
@@ -89,18 +135,6 @@ class TradedOrder:
         """It won't become a contract, as far as is known: those who wait for that get an error."""
         self.state = state
         fail_future(self.created, self.why_closed)
-
-    def shown(self, actions: OrderActions) -> Order:
-        """The order as users see it."""
-        return Order(
-            message=self.signed,
-            hash=self.identity,
-            state=self.state,
-            posted=self.posted,
-            liability=self.liability,
-            _traded=self,
-            _actions=actions,
-        )
 
     def reject(self, rejection: Rejection) -> bool:
         """Remember a rejection and report it to those who wait. False if the provider said the same before."""
@@ -140,78 +174,274 @@ class TradedOrder:
             report(on_progress, progress)
 
 
-class OrderActions(Protocol):
-    """What can be done with orders; the trader does it."""
-
-    async def withdraw(self, order: TradedOrder) -> Order:
-        """See `Order.withdraw`."""
-
-    async def withdraw_on_chain(self, order: TradedOrder) -> Order:
-        """See `Order.withdraw_on_chain`."""
-
-    async def contract_of(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
-        """See `Order.contract`."""
+NEAR: Final = 16
+"""Nonces before and after an order's that another version of it may have."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
-    """An order of the agent's account at one moment: `agent.orders()`, `agent.order(…)`."""
+def is_version(order: Demand, digest: str) -> bool:
+    """Whether an order with the hash `digest` is a version of this one, or the same."""
+    if message_hash(order).hex() == digest:
+        return True
+    nonces = range(max(0, int(order.nonce) - NEAR), int(order.nonce) + NEAR + 1) if order.generation == 5 else ()
+    return any(message_hash(replace(order, nonce=nonce)).hex() == digest for nonce in nonces)
 
-    message: Demand | Offer
-    """The signed demand or offer."""
-    hash: str
-    """Its hash: 64 hexadecimal digits."""
-    state: OrderState
-    posted: float
-    """When it was posted first: Unix time."""
-    liability: str
-    """The address of the contract that it became; empty if it became none."""
-    _traded: TradedOrder = field(repr=False, compare=False)
-    _actions: OrderActions = field(repr=False, compare=False)
 
-    def __repr__(self) -> str:
-        terms = f"model={self.message.model}, objective={self.message.objective}, cost={self.message.cost}"
-        became = f", liability={self.liability}" if self.liability else ""
-        return f"Order({self.kind} {self.hash}, {self.state}, {terms}, deadline={self.deadline}{became})"
+def is_alike(order: Demand | Offer, liability: Liability) -> bool:
+    """Whether a liability can be made from an order, by the terms that cost nothing to compare."""
+    return (order.objective, order.cost) == (liability.objective, liability.cost)
+
+
+def earlier_version(orders: Iterable[TradedOrder], liability: Liability, digest: str) -> TradedOrder | None:
+    """The demand among `orders` that had the hash `digest` before it was signed again, of a liability's demand."""
+    for order in orders:
+        signed = order.signed
+        if isinstance(signed, Demand) and is_alike(signed, liability) and is_version(signed, digest):
+            return order
+    return None
+
+
+REPEATED: Final = ("model", "objective", "token", "cost", "lighthouse", "validator", "sender")
+"""The fields that are the same when an order is posted again; its nonce and perhaps its deadline are new."""
+LIFETIME: Final = 600.0
+"""Seconds for which an order is valid by default."""
+FEWEST_BLOCKS, MOST_BLOCKS = 50, 20_000
+"""The bounds of the default lifetime, whatever block time was measured."""
+MEASURED_BLOCKS: Final = 100
+"""The latest blocks, whose times give the block time."""
+
+
+class TermsWriter:
+    """Fills in and signs the orders of one account, in the generation of its settings. `known` has its others."""
+
+    def __init__(self, parts: AgentComponents, known: Mapping[str, TradedOrder]) -> None:
+        self._settings, self._signer, self._known = parts.settings, parts.signer, known
+        self._signed: BoundedDict[str, None] = BoundedDict(256)
+        """The lasting hashes of the latest orders of generation 5."""
+        self._chain, self._chain_head = parts.chain, parts.chain_head
+
+    async def terms(
+        self, *, model: str, objective: str, cost: int | str, token: str, validator: str, lifetime: int | None
+    ) -> Terms:
+        """The fields that a demand and an offer share, with names resolved, valid for `lifetime` blocks.
+
+        By default they are valid for about `LIFETIME` seconds. Raises `InputError`, `ChainError`.
+        """
+        settings, names = self._settings, self._chain.names
+        if lifetime is not None and not 0 < lifetime <= settings.deadline_limit:
+            why = f"an order is valid for 1 to {settings.deadline_limit:,} blocks"
+            raise InputError(why, hint="give another lifetime", code="invalid-lifetime")
+        if not isinstance(cost, int):
+            cost = (await self._chain.tokens.unit(token or settings.erc20_token)).amount(cost)
+        blocks = await lifetime_of(self._chain) if lifetime is None else lifetime
+        return {
+            "model": await names.model(model),
+            "objective": objective,
+            "token": await names.address(token or settings.erc20_token),
+            "cost": cost,
+            "lighthouse": await names.address(settings.lighthouse_contract),
+            "validator": await names.address(validator) if validator else ZERO_ADDRESS,
+            "deadline": (await self._chain.node.heads.recent()).number + blocks,
+            "sender": None if settings.generation == 3 else self._signer.address,
+        }
+
+    def terms_of(self, order: Demand | Offer) -> Terms:
+        """The terms of a stranger's order, for one that answers it; its deadline counts up to `deadline_limit`."""
+        latest = self._chain_head.head + self._settings.deadline_limit
+        return {**self._repeated(order), "deadline": min(order.deadline, latest)}
+
+    def _repeated(self, order: Demand | Offer) -> Terms:
+        sender = None if order.generation == 3 else self._signer.address
+        return {field: getattr(order, field) for field in (*REPEATED, "deadline")} | {"sender": sender}
+
+    async def sign(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Demand | Offer:
+        """An order with these terms and a fresh nonce, signed. Raises `UnsafeValidator`."""
+        order = await self._complete(kind, terms, **fee)
+        if order.generation == 5:  # else it would be a version of another order
+            known = {lasting_hash(one.signed) for one in self._known.values()} | self._signed.keys()
+            while lasting_hash(order) in known:
+                order = replace(order, deadline=order.deadline - 1)
+            self._signed[lasting_hash(order)] = None
+        return self._signer.sign(order)
+
+    async def sign_again(self, order: Demand | Offer) -> Demand | Offer:
+        """An order like this one, with a fresh nonce."""
+        terms = self._repeated(order)
+        if isinstance(order, Demand):
+            return self._signer.sign(await self._complete(Demand, terms, validator_fee=order.validator_fee))
+        return self._signer.sign(await self._complete(Offer, terms, lighthouse_fee=order.lighthouse_fee))
+
+    async def _complete(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Demand | Offer:
+        is_counted = terms["sender"] is not None
+        nonce = await self._chain.liabilities.next_nonce(self._signer.address) if is_counted else secrets.token_hex(32)
+        order = kind(**terms, nonce=nonce, **fee)
+        await self._chain.validators.check(order)
+        return order
+
+
+def is_repeated(demand: Demand, terms: Terms, *, validator_fee: int) -> bool:
+    """Whether a demand differs from these terms in nonce and deadline only."""
+    return demand.validator_fee == validator_fee and all(getattr(demand, field) == terms[field] for field in REPEATED)
+
+
+async def lifetime_of(chain: Chain, seconds: float = LIFETIME) -> int:
+    """How many blocks make about `seconds`, by the time between the latest blocks: for how long an order is valid."""
+    block_time = await chain.node.heads.block_time(MEASURED_BLOCKS)
+    blocks = seconds if block_time is None else seconds / block_time
+    return min(max(round(blocks), FEWEST_BLOCKS), MOST_BLOCKS)
+
+
+PER_MAKER: Final = 256
+"""Open offers that answer demands of one maker."""
+TOTAL: Final = 2048
+"""Open offers that answer demands."""
+EQUAL_DECLINED: Final = "equal-declined"
+"""Why a demand is declined whose terms are those of an open demand that the agent has declined."""
+
+
+HANDLED_FOR: Final[ContextVar[Buyer | None]] = ContextVar("handled for", default=None)
+"""Whose demand the running handler handles; None outside of a demand's handler."""
+
+
+class TooManyOffers(AiraError, code="too-many-offers"):
+    """An agent has as many open offers as it may have, in all or for the demands of `maker`."""
+
+    def __init__(self, maker: str) -> None:
+        super().__init__(f"there are too many open offers for demands, also of {maker}", hint="try again later")
+        self.maker = maker
+
+
+DEMAND_TAKEN: Final = "demand-taken"
+"""The code of the error when a demand can't be offered for any more."""
+
+
+def demand_taken(order: str) -> AiraError:
+    """The error for a demand (hash) that has become a contract, or that its maker withdrew.
+
+    In generation 5 also for one whose nonce another order of its maker has used; it is signed again.
+    """
+    return AiraError(f"the demand {order[:16]}… is a contract already, or was withdrawn", code="demand-taken")
+
+
+class OpenOffers:
+    """The open offers that answer demands, oldest first."""
+
+    def __init__(self, *, per_maker: int = PER_MAKER, total: int = TOTAL) -> None:
+        self._per_maker = per_maker
+        self._total = total
+        self._offers: OrderedDict[TradedOrder, tuple[str, bool]] = OrderedDict()
+        self._makers: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        return len(self._offers)
+
+    def add(self, offer: TradedOrder, maker: str, *, pays: bool) -> TradedOrder | None:
+        """Count an offer for a demand of `maker`; returns one to give up for it, or None.
+
+        Given up is the newest offer for the maker with the most, or the oldest for a demand that pays nothing. Raises
+        `TooManyOffers`.
+        """
+        given_up = None
+        if self._makers[maker] >= self._per_maker:
+            raise TooManyOffers(maker)
+        if len(self._offers) >= self._total:
+            given_up = self._least(maker)
+            self.discard(given_up)
+        self._offers[offer] = maker, pays
+        self._makers[maker] += 1
+        return given_up
+
+    def discard(self, offer: TradedOrder) -> None:
+        """Stop counting an offer. Unknown ones are ignored."""
+        maker, _ = self._offers.pop(offer, (None, False))
+        if maker is not None:
+            self._makers[maker] -= 1
+            if not self._makers[maker]:
+                del self._makers[maker]
+
+    def _least(self, maker: str) -> TradedOrder:
+        (heaviest, most), *_ = self._makers.most_common(1)
+        if most > max(self._makers[maker], 1):
+            return next(offer for offer in reversed(self._offers) if self._offers[offer][0] == heaviest)
+        for offer, (_, pays) in self._offers.items():
+            if not pays:
+                return offer
+        raise TooManyOffers(maker)
+
+
+@dataclass(eq=False)
+class AnsweredDemand:
+    """A demand on which an agent's handlers decide, or have decided."""
+
+    demand: Verified[Demand]
+    """Its newest version."""
+    offer: TradedOrder | None = None
+    """The offer that answers it."""
+    is_declined: bool = False
+    is_over: bool = False
+    """Whether it has become a contract, or was withdrawn."""
 
     @property
-    def kind(self) -> str:
-        """`demand` or `offer`."""
-        return self.message.kind
+    def is_answered(self) -> bool:
+        """Whether it has an open offer, or was declined."""
+        return self.is_declined or (self.offer is not None and self.offer.is_open)
 
-    @property
-    def deadline(self) -> int:
-        """The block before which it can become a contract."""
-        return self.message.deadline
 
-    @property
-    def honoured_by(self) -> frozenset[str]:
-        """The providers (addresses) that have signed that they honour its withdrawal, as of now."""
-        said = self._traded.rejections.items()
-        return frozenset(provider for provider, rejection in said if rejection.reason == Refusal.WITHDRAWN)
+class AnsweredDemands:
+    """The open demands on which an agent's handlers decide, or have decided; the last `limit` of them."""
 
-    async def withdraw(self) -> Order:
-        """Withdraw the order; returns it in its new state. `honoured_by` names the providers that obey.
+    def __init__(self, limit: int = 8192) -> None:
+        self._limit = limit
+        self._known: OrderedDict[tuple[str, str], AnsweredDemand] = OrderedDict()
+        """By maker, and by what the versions of a demand share."""
+        self._makers: Counter[str] = Counter()
 
-        A signed withdrawal is sent until the deadline, instead of the order. A provider that is creating its contract,
-        or does not know or obey the withdrawal, may still use it, so the allowance covers it until the deadline. Raises
-        `OrderClosed` if the order has become a contract.
-        """
-        return await self._actions.withdraw(self._traded)
+    def __len__(self) -> int:
+        return len(self._known)
 
-    async def withdraw_on_chain(self) -> Order:
-        """Withdraw the order by a transaction too, after which no provider can create its contract.
+    def __contains__(self, maker: str) -> bool:
+        """Whether a demand of this account is known."""
+        return maker in self._makers
 
-        In generation 5 the transaction uses up the order's nonce. Raises `OrderClosed` if the order has become a
-        contract, `NotOffered` if the contracts are the originals, and the errors of sending a transaction.
-        """
-        return await self._actions.withdraw_on_chain(self._traded)
+    def note(self, demand: Verified[Demand]) -> AnsweredDemand:
+        """The demand, which is known from now on."""
+        key = demand.signer, lasting_hash(demand.message)
+        known = self._known.get(key)
+        if known is None:
+            if len(self._known) >= self._limit:
+                self.forget(next(iter(self._known.values())))
+            known = self._known[key] = AnsweredDemand(demand)
+            self._makers[demand.signer] += 1
+        elif known.demand.hash != demand.hash and int(known.demand.message.nonce) < int(demand.message.nonce):
+            known.demand = demand
+        return known
 
-    async def contract(self, *, on_progress: OnProgress = nothing) -> Contract:
-        """Wait until the order is a contract. Cancelling the wait changes nothing.
+    def forget(self, known: AnsweredDemand) -> None:
+        """Forget a demand that is not open any more, or was not answered. Unknown ones are ignored."""
+        maker = known.demand.signer
+        if self._known.pop((maker, lasting_hash(known.demand.message)), None) is not None:
+            self._makers[maker] -= 1
+            if not self._makers[maker]:
+                del self._makers[maker]
 
-        `on_progress` is called with offers for a demand, agents' declines, providers' rejections (both also earlier
-        ones), and the contract. After a decline or a rejection the order stays valid. Raises `OrderClosed` if the order
-        was withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
-        """
-        return await self._actions.contract_of(self._traded, on_progress)
+    def expire(self, block: int) -> None:
+        """The chain has `block`: forget the demands with an earlier deadline."""
+        for known in [one for one in self._known.values() if one.demand.message.deadline <= block]:
+            self.forget(known)
+
+    def find(self, maker: str, digest: str, liability: Liability | None = None) -> AnsweredDemand | None:
+        """The demand of an account of which a version has the hash `digest`, perhaps that of a liability."""
+        for known in self._known.values() if maker in self else ():
+            demand = known.demand.message
+            is_candidate = known.demand.signer == maker and (liability is None or is_alike(demand, liability))
+            if is_candidate and is_version(demand, digest):
+                return known
+        return None
+
+    def offered_by(self, offer: TradedOrder) -> AnsweredDemand | None:
+        """The demand that an offer answers."""
+        return next((one for one in self._known.values() if one.offer is offer), None)
+
+    def declined_like(self, order: Demand | Offer) -> list[AnsweredDemand]:
+        """The declined demands with the terms of an order, the oldest first."""
+        terms = equal_terms(order)
+        return [one for one in self._known.values() if one.is_declined and equal_terms(one.demand.message) == terms]

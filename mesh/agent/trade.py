@@ -1,57 +1,205 @@
-"""Trading: signs and posts the orders of an account, follows them over restarts, and waits for their contracts."""
+"""Trading: signs and posts the orders of an account, follows them over restarts, and waits for their contracts.
+
+A demand outlives its program; an offer does not: a robot that is off must not collect contracts. So offers are
+withdrawn when the agent ends, and those of an earlier run, which was killed, when it begins. Orders are sent again once
+the factory may take what they cost. Withdrawals on the chain that a reorganisation reverts are made
+again, and the nonces that it freed used up.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import time
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent.contract import Contract, WatchedContracts, fail_future
-from mesh.agent.covering import CoveredOrders
-from mesh.agent.demands import current_buyer
-from mesh.agent.offers import OpenOffers
-from mesh.agent.orders import Order, OrderState, TradedOrder
-from mesh.agent.progress import Progress, report, seen_offers
-from mesh.agent.statements import received_declines, received_rejections
-from mesh.agent.terms import TermsWriter
-from mesh.agent.versions import earlier_version
-from mesh.agent.withdrawing import ChainWithdrawals
-from mesh.background import Background
+from mesh.agent.contracts import (
+    Contract,
+    Progress,
+    WatchedContracts,
+    fail_future,
+    nothing,
+    received,
+    report,
+    seen_offers,
+)
+from mesh.agent.errors import Declined
+from mesh.agent.orders import (
+    EQUAL_DECLINED,
+    HANDLED_FOR,
+    AnsweredDemand,
+    AnsweredDemands,
+    OpenOffers,
+    OrderState,
+    TermsWriter,
+    TradedOrder,
+    demand_taken,
+    earlier_version,
+    withdrawal_of,
+)
+from mesh.base.background import Background
+from mesh.base.flood import SENDERS, KnownSenders, Rate, RateLimiter
+from mesh.base.lifecycle import Lifecycle
+from mesh.base.log_context import log_event
 from mesh.chain import Allowances, OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
-from mesh.flood import SENDERS, KnownSenders
-from mesh.log_context import log_event
-from mesh.market.refusals import Refusal
-from mesh.market.versions import lasting_hash
-from mesh.role import Lifecycle
-from mesh.work.database import LedgerUnusable
+from mesh.network import PresentAgents
+from mesh.role.database import LedgerUnusable
 from schemas import Demand, Offer, Withdrawal, decode
+from schemas.messages import equal_terms, lasting_hash
+from schemas.signing import Decline, Refusal, Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Container, Iterable, Mapping
     from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
-    from mesh.agent.progress import OnProgress
-    from mesh.agent.reports import ContractReports
-    from mesh.agent.terms import Terms
-    from schemas import Liability
-    from schemas.signing import Rejection
+    from mesh.agent.contracts import ContractReports, OnProgress
+    from mesh.agent.ledger import StoredOrder
+    from mesh.agent.orders import Terms
+    from schemas import Liability, Verified
+
 
 log = logging.getLogger(__name__)
-ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: orders stay open until their deadline")
+
+PER_AGENT: Final = Rate(per_second=1.0, burst=32)
+"""Declines by one agent that are looked at: it may decline many demands."""
+HEARD: Final = Rate(per_second=20.0, burst=200)
+"""Declines in all that are looked at."""
+
+
+@asynccontextmanager
+async def received_rejections(
+    parts: AgentComponents, orders: Container[str], on_rejection: Callable[[Rejection], Awaitable[None]]
+) -> AsyncIterator[None]:
+    """Meanwhile call `on_rejection` with each rejection of one of `orders` that a provider of the lighthouse signed.
+
+    A full order book is only logged. It is called again if it raises that the node is away.
+    """
+
+    async def check(rejection: Rejection) -> None:
+        lighthouse = await parts.chain.lighthouses.get(parts.settings.lighthouse_contract)
+        order, signer, reason = rejection.order, rejection.provider, rejection.reason
+        if signer not in lighthouse.stakes:
+            facts = log_event("rejection-ignored", signer=signer, reason=reason)
+            log.warning("%s is not a provider, but rejects: %s", signer, reason, extra=facts)
+        elif reason == Refusal.FULL:
+            facts = log_event("order-deferred", order=order, provider=signer, reason=reason)
+            log.warning("provider %s has no room for the order %s now", signer, order, extra=facts)
+        else:
+            await on_rejection(rejection)
+
+    async def check_until_known(rejection: Rejection) -> None:
+        await parts.chain.retrying(partial(check, rejection), outages=parts.outages)
+
+    async with received(parts, "reject", Rejection, lambda one: one.order in orders, check_until_known) as subscribe:
+        subscribe()
+        yield
+
+
+@asynccontextmanager
+async def received_declines(
+    parts: AgentComponents, orders: Mapping[str, TradedOrder]
+) -> AsyncIterator[Callable[[], None]]:
+    """Meanwhile report to the waiters of `orders` each decline that an agent or a bridge signed that is present.
+
+    Yields a function to call when there is a demand: a robot that never demands does not subscribe.
+    """
+    agents, limiter = PresentAgents(parts.channel), RateLimiter(per_sender=PER_AGENT, total=HEARD)
+
+    async def check(decline: Decline) -> None:
+        if not limiter.allow(decline.agent) or not await agents.is_present(decline.agent):
+            parts.drops.count("declines", decline.agent)
+        elif (order := orders.get(decline.order)) is not None and order.is_open and order.decline(decline):
+            facts = log_event("order-declined", order=decline.order, agent=decline.agent, code=decline.code)
+            log.info("agent %s declines the %s (%s)", decline.agent, order, decline.code, extra=facts)
+
+    async with received(parts, "decline", Decline, lambda one: one.order in orders, check) as subscribe:
+        yield subscribe
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """An order of the agent's account at one moment: `agent.orders()`, `agent.order(…)`."""
+
+    message: Demand | Offer
+    """The signed demand or offer."""
+    hash: str
+    """Its hash: 64 hexadecimal digits."""
+    state: OrderState
+    posted: float
+    """When it was posted first: Unix time."""
+    liability: str
+    """The address of the contract that it became; empty if it became none."""
+    _traded: TradedOrder = field(repr=False, compare=False)
+    _trader: Trader = field(repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        terms = f"model={self.message.model}, objective={self.message.objective}, cost={self.message.cost}"
+        became = f", liability={self.liability}" if self.liability else ""
+        return f"Order({self.kind} {self.hash}, {self.state}, {terms}, deadline={self.deadline}{became})"
+
+    @property
+    def kind(self) -> str:
+        """`demand` or `offer`."""
+        return self.message.kind
+
+    @property
+    def deadline(self) -> int:
+        """The block before which it can become a contract."""
+        return self.message.deadline
+
+    @property
+    def honoured_by(self) -> frozenset[str]:
+        """The providers (addresses) that have signed that they honour its withdrawal, as of now."""
+        return self._traded.honoured_by
+
+    async def withdraw(self) -> Order:
+        """Withdraw the order; returns it in its new state. `honoured_by` names the providers that obey.
+
+        A signed withdrawal is sent until the deadline, instead of the order. A provider that is creating its contract,
+        or does not know or obey the withdrawal, may still use it, so the allowance covers it until the deadline. Raises
+        `OrderClosed` if the order has become a contract.
+        """
+        return await self._trader.withdraw(self._traded)
+
+    async def withdraw_on_chain(self) -> Order:
+        """Withdraw the order by a transaction too, after which no provider can create its contract.
+
+        In generation 5 the transaction uses up the order's nonce. Raises `OrderClosed` if the order has become a
+        contract, `NotOffered` if the contracts are the originals, and the errors of sending a transaction.
+        """
+        return await self._trader.withdraw_on_chain(self._traded)
+
+    async def contract(self, *, on_progress: OnProgress = nothing) -> Contract:
+        """Wait until the order is a contract. Cancelling the wait changes nothing.
+
+        `on_progress` is called with offers for a demand, agents' declines, providers' rejections (both also earlier
+        ones), and the contract. After a decline or a rejection the order stays valid. Raises `OrderClosed` if the order
+        was withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
+        """
+        return await self._trader.contract_of(self._traded, on_progress)
+
+
+ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: demands stay open until their deadline")
+STOP_SECONDS: Final = 3.0
+"""For which an agent that ends waits until the providers have confirmed that they use none of its offers."""
 
 
 class Trader(Lifecycle):
     """Trades for one account: `async with Trader(components) as trader`.
 
-    Entering takes up the ledger's orders, those of earlier runs and of the account's other programs, and sends them
-    once their allowance is ensured. Leaving ends every wait with `ClosedError`; open orders stay in the ledger.
+    Entering takes up the ledger's orders, those of earlier runs and of the account's other programs, and sends the
+    demands once their allowance is ensured. Leaving withdraws the offers of this run, for `STOP_SECONDS` at most; what
+    no provider has heard by then is sent by the next run. It ends every wait with `ClosedError`; demands stay open.
     """
 
     title = "trader"
+    _hear_declines: Callable[[], None] | None = None
+    """Subscribes to declines, once there is a demand; None before it is open: `aira order` only reads and withdraws."""
 
     def __init__(self, parts: AgentComponents, reports: ContractReports) -> None:
         self._parts = parts
@@ -59,12 +207,16 @@ class Trader(Lifecycle):
         self._address = parts.signer.address
         self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address)
         self._orders: dict[str, TradedOrder] = {}
-        self._covered = CoveredOrders(parts, self._orders, self._allowances)
         self.writer = TermsWriter(parts, self._orders)
-        self._hear_declines: Callable[[], None] = lambda: None
         self.answers = OpenOffers()
+        self.answered = AnsweredDemands()
+        self.ask_again: Callable[[Verified[Demand]], object] = lambda _demand: None
+        """Called with a demand whose offer was taken back, or used for another one: its handlers decide again."""
+        self._heard = asyncio.Event()
+        """Set when a provider has said that it honours a withdrawal."""
         self._changing = asyncio.Lock()
-        self._chain_withdrawals = ChainWithdrawals(parts, self._orders)
+        self._withdrawing = asyncio.Lock()
+        """Held while it withdraws on the chain unasked."""
         self.contracts = WatchedContracts(parts, reports)
         self.customers = KnownSenders()
         """Who demanded the contracts of this account."""
@@ -72,7 +224,18 @@ class Trader(Lifecycle):
     def orders(self, *states: OrderState) -> list[Order]:
         """The orders that can still become contracts, oldest first: open or withdrawn."""
         by_age = sorted(self._orders.values(), key=lambda order: order.posted)
-        return [order.shown(self) for order in by_age if order.state in states]
+        return [self._shown(order) for order in by_age if order.state in states]
+
+    def _shown(self, order: TradedOrder) -> Order:
+        return Order(
+            message=order.signed,
+            hash=order.identity,
+            state=order.state,
+            posted=order.posted,
+            liability=order.liability,
+            _traded=order,
+            _trader=self,
+        )
 
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.push_async_callback(self._close)
@@ -80,33 +243,72 @@ class Trader(Lifecycle):
             self.customers.add(promisee)
         self._hear_declines = await stack.enter_async_context(received_declines(self._parts, self._orders))
         resumed = [order for order in await self.load() if order.is_open]
+        offers = [order for order in resumed if isinstance(order.signed, Offer)]
+        self._parts.outbox.hold(order.identity for order in offers)  # those of another program, it sends
+        resumed = [order for order in resumed if order not in offers]
         for order in resumed:
-            if isinstance(order.signed, Offer):
-                await self._give_up(self.answers.add(order, "", pays=False))
             facts = log_event("order-resumed", order=order.identity, kind=order.signed.kind, deadline=order.deadline)
             log.info("the %s of an earlier run is open until block %d", order, order.deadline, extra=facts)
         await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
-        self._tasks = self._covered.tasks = await stack.enter_async_context(Background())
-        self._covered.send([order for order in resumed if order.is_open])
+        self._tasks = await stack.enter_async_context(Background())
+        self._send_covered(resumed)
+        stack.push_async_callback(self._withdraw_at_end)
+
+    async def withdraw_earlier_offers(self) -> None:
+        """Withdraw the offers of an earlier run, which was killed: what handlers still agree to is offered again."""
+        await self._withdraw([order for order in self._offers() if not order.is_ours])
+
+    async def _withdraw_at_end(self) -> None:
+        """Withdraw the offers of this run, and wait until the providers that are present have confirmed that."""
+        offers = [order for order in self._offers() if order.is_ours]
+        if not offers:
+            return
+        try:
+            async with asyncio.timeout(STOP_SECONDS):
+                await self._withdraw(offers)
+                if self._parts.network.connected:
+                    present = {key.agent for key in await self._parts.channel.present("provider")}
+                    while not all(present <= {one.lower() for one in order.honoured_by} for order in offers):
+                        self._heard.clear()
+                        await self._heard.wait()
+        except (TimeoutError, AiraError) as error:
+            facts = log_event("offers-not-withdrawn", offers=len(offers), code=getattr(error, "code", "timeout"))
+            text = "not all providers confirmed to use none of the %d offers; the next start withdraws them again"
+            log.warning(text, len(offers), extra=facts)
+
+    def _offers(self) -> list[TradedOrder]:
+        return [order for order in self._orders.values() if order.is_open and isinstance(order.signed, Offer)]
 
     async def _close(self) -> None:
         for order in self._orders.values():
             fail_future(order.created, ENDED())
         self.contracts.fail(ENDED())
 
-    async def post(self, kind: type[Demand | Offer], terms: Terms, answers: Demand | None = None, **fee: Any) -> Order:
+    async def post(
+        self, kind: type[Demand | Offer], terms: Terms, answers: AnsweredDemand | None = None, **fee: Any
+    ) -> Order:
         """Sign an order, which perhaps answers a demand, ensure its allowance, and post it. Cancelling withdraws it.
 
-        Raises `InsufficientTokens`, and `TooManyOffers` for an offer that answers a demand.
+        Raises `InsufficientTokens`, and for an offer that answers a demand `TooManyOffers`, the error of a demand that
+        is taken, and `Declined` while a demand with equal terms is open that the agent has declined.
         """
-        order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time())
-        if kind is Offer and (buyer := current_buyer()) is not None:
+        order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time(), is_ours=True)
+        if answers is not None:
+            if answers.is_over:
+                raise demand_taken(answers.demand.hash.hex())
+            for declined in self.answered.declined_like(order.signed):
+                if declined is not answers:
+                    text = f"it declined the demand {declined.demand.hash.hex()[:16]}… with equal terms, which is open"
+                    raise Declined(EQUAL_DECLINED, text)
+        if kind is Offer and (buyer := HANDLED_FOR.get()) is not None:
             await self._give_up(self.answers.add(order, buyer.maker, pays=buyer.pays))
         self._orders[order.identity] = order
-        if kind is Demand:
+        if answers is not None:
+            answers.offer, answers.is_declined = order, False
+        if kind is Demand and self._hear_declines is not None:
             self._hear_declines()
         try:
-            await self._allowances.ensure(order, self._chain.costs.of(order.signed))
+            await self._allowances.ensure(order, self._chain.funds.cost_of(order.signed))
         except BaseException:
             self._forget(order)
             raise
@@ -119,8 +321,94 @@ class Trader(Lifecycle):
         except LedgerUnusable:
             self._forget(order)
             raise
-        self.answers.answer(answers, order)
-        return order.shown(self)
+        return self._shown(order)
+
+    async def require_open(self, answered: AnsweredDemand) -> None:
+        """Raise the error of a demand that is taken if one has become a contract, or was withdrawn on the chain.
+
+        What happens after this call is noticed: by then the demand is one of `answered`.
+        """
+        demand, digest, maker = answered.demand.message, answered.demand.hash, answered.demand.signer
+        ask = partial(self._chain.liabilities.is_used, demand, order_hash=digest, signer=maker)
+        if answered.is_over or await self._chain.retrying(ask, outages=self._parts.outages):
+            self.answered.forget(answered)
+            raise demand_taken(digest.hex())
+
+    async def decline(self, declined: AnsweredDemand) -> None:
+        """The handlers have declined a demand: withdraw the offers with equal terms, which match it, too.
+
+        The handlers decide again on the other demands that these offers answered.
+        """
+        declined.is_declined, terms = True, equal_terms(declined.demand.message)
+        offers = [order for order in self._offers() if equal_terms(order.signed) == terms]
+        await self._take_back(offers, "a demand with equal terms was declined")
+        for order in offers:
+            self._ask_again(self.answered.offered_by(order), declined)
+
+    async def taken(self, liability: Liability, demand: bytes, offer: TradedOrder | None = None) -> None:
+        """A demand became a contract, with our `offer` or another's: withdraw an offer of ours that is left over.
+
+        If our offer was made for another demand with equal terms, what was made for this one now answers that.
+        """
+        taken = self.answered.find(liability.promisee, demand.hex(), liability)
+        left = None if taken is None else taken.offer
+        if taken is not None:
+            self._end(taken)
+        if offer is not None and offer is not left and (other := self.answered.offered_by(offer)) is not None:
+            other.offer, left = left, None
+            if not other.is_answered:
+                self._ask_again(other)
+        if left is not None and left is not offer:
+            await self._take_back([left], "its demand became a contract with another offer")
+
+    async def demand_withdrawn(self, withdrawal: Verified[Withdrawal]) -> None:
+        """The maker of a demand has withdrawn it: withdraw the offer that answers it."""
+        known = self.answered.find(withdrawal.signer, withdrawal.message.order)
+        if known is not None:
+            self._end(known)
+            await self._take_back([known.offer] if known.offer else [], "its demand was withdrawn")
+
+    def _end(self, known: AnsweredDemand) -> None:
+        known.is_over = True
+        self.answered.forget(known)
+
+    def _ask_again(self, answered: AnsweredDemand | None, but: AnsweredDemand | None = None) -> None:
+        if answered is not None and answered is not but:
+            self.ask_again(answered.demand)
+
+    async def _take_back(self, offers: Iterable[TradedOrder], why: str) -> None:
+        """Withdraw the open ones of these offers."""
+        left = [offer for offer in offers if offer.is_open]
+        for offer in left:
+            log.debug("%s is taken back: %s", offer, why)
+        try:
+            await self._withdraw(left)
+        except LedgerUnusable as error:
+            self._parts.outbox.hold(offer.identity for offer in left)
+            facts = log_event("offers-not-withdrawn", offers=len(left), code=error.code)
+            log.warning("%d offers are sent no more, but can't be withdrawn now: %s", len(left), error, extra=facts)
+
+    def _send_covered(self, orders: Collection[TradedOrder]) -> None:
+        """Send these orders of the ledger when the factory has the allowance for them, in a task."""
+        outbox, cost_of = self._parts.outbox, self._chain.funds.cost_of
+        outbox.hold(order.identity for order in orders)
+        costly = [order for order in orders if any(cost_of(order.signed).values())]
+        if free := {order.identity for order in orders} - {order.identity for order in costly}:
+            self._tasks.start(outbox.release(free), "resume free orders")
+        for order in costly:
+            self._tasks.start(self._cover_and_send(order), f"resume {order.identity}")
+
+    async def _cover_and_send(self, order: TradedOrder) -> None:
+        chain = self._chain
+        ensure = partial(self._allowances.ensure, order, chain.funds.cost_of(order.signed))
+        try:
+            await chain.retrying(ensure, outages=self._parts.outages)
+        except AiraError as error:
+            facts = log_event("order-not-covered", order=order.identity, code=error.code)
+            log.warning("the %s is open, but no provider can use it now: %s", order, error, extra=facts)
+        if order.identity not in self._orders:
+            self._allowances.release(order)
+        await self._parts.outbox.release([order.identity])
 
     async def contract_of(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
         """See `Order.contract`."""
@@ -138,15 +426,23 @@ class Trader(Lifecycle):
         """See `Order.withdraw`."""
         if order.state is OrderState.MATCHED:
             raise order.why_closed
-        if order.is_open:
-            self._allowances.withdraw(order)
-            order.close(OrderState.WITHDRAWN)
-            facts = log_event("order-withdrawn", order=order.identity, deadline=order.deadline)
-            log.info("the %s is withdrawn", order, extra=facts)
-        if order.state is OrderState.WITHDRAWN:  # also if it was before: the disk may have failed then
-            withdrawal = Withdrawal(order=order.identity, lighthouse=order.signed.lighthouse, deadline=order.deadline)
-            await self._parts.outbox.withdraw(self._parts.signer.sign(withdrawal))
-        return order.shown(self)
+        await self._withdraw([order])
+        return self._shown(order)
+
+    async def _withdraw(self, orders: Iterable[TradedOrder]) -> None:
+        """Withdraw those of some orders that are not contracts, and have not expired."""
+        withdrawals = []
+        for order in orders:
+            if order.is_open:
+                self._allowances.withdraw(order)
+                self.answers.discard(order)
+                order.close(OrderState.WITHDRAWN)
+                facts = log_event("order-withdrawn", order=order.identity, deadline=order.deadline)
+                log.info("the %s is withdrawn", order, extra=facts)
+            if order.state is OrderState.WITHDRAWN:  # also if it was before: the disk may have failed then
+                withdrawals.append(self._parts.signer.sign(withdrawal_of(order.signed)))
+        if withdrawals:
+            await self._parts.outbox.withdraw(*withdrawals)
 
     async def withdraw_on_chain(self, order: TradedOrder) -> Order:
         """See `Order.withdraw_on_chain`."""
@@ -159,7 +455,64 @@ class Trader(Lifecycle):
             tx = "an earlier transaction"
         await self._parts.ledger.use_up(order.identity, tx)
         self._forget(order)
-        return order.shown(self)
+        return self._shown(order)
+
+    async def _withdraw_again(self) -> None:
+        """Withdraw each order again whose withdrawal the chain has lost, until its deadline.
+
+        Without that, somebody could still make a contract of it. In generation 5, no later order of the account would
+        be valid, either: their nonces are ahead of the chain's.
+        """
+        parts = self._parts
+        async with self._withdrawing:
+            for order in await parts.ledger.withdrawn_on_chain(head=parts.chain_head.head):
+                try:
+                    await parts.chain.retrying(partial(self._ensure_withdrawn, order), outages=parts.outages)
+                except AiraError as error:
+                    facts = log_event("order-not-withdrawn", order=order.identity, code=error.code)
+                    log.warning("order %s is not withdrawn on the chain now: %s", order.identity, error, extra=facts)
+
+    async def _use_up_nonces(self, order: TradedOrder) -> None:
+        """Use up the nonces before that of an open order, unless another open order of the account has one.
+
+        In generation 5 a reorganisation may free them: it reverts the contract of an earlier order, which has expired
+        or was withdrawn since. The open order may not be signed again with such a nonce: both could become contracts.
+        """
+        if self._withdrawing.locked():
+            return
+        parts = self._parts
+        async with self._withdrawing:
+            await asyncio.sleep(3 * parts.chain.node.timing.poll_interval)  # the node may have been a block behind
+            try:
+                while order.is_open:
+                    nonce = await parts.chain.liabilities.next_nonce()
+                    is_waiting = any(one.is_open and one.nonce == nonce for one in self._orders.values())
+                    if is_waiting or order.nonce is None or order.nonce <= nonce:
+                        return
+                    await parts.chain.liabilities.withdraw(await self.writer.sign_again(order.signed))
+                    facts = log_event("nonce-used-up", order=order.identity, nonce=nonce)
+                    log.warning("the nonce %d before that of the %s was free; used up", nonce, order, extra=facts)
+            except OrderAlreadyUsed:
+                return  # another program of the account was faster
+            except AiraError as error:
+                facts = log_event("nonce-not-used-up", order=order.identity, code=error.code)
+                log.warning("the nonce before that of the %s can't be used up now: %s", order, error, extra=facts)
+
+    async def _ensure_withdrawn(self, withdrawn: StoredOrder) -> None:
+        parts, order = self._parts, decode(withdrawn.payload)
+        assert isinstance(order, Demand | Offer)
+        digest = bytes.fromhex(withdrawn.identity)
+        if await parts.chain.liabilities.is_used(order, order_hash=digest, signer=parts.signer.address):
+            return
+        if await parts.chain.node.has_transaction(withdrawn.tx):
+            return  # it waits in the pool
+        try:
+            tx = (await parts.chain.liabilities.withdraw(order)).tx
+        except OrderAlreadyUsed:
+            return
+        await parts.ledger.use_up(withdrawn.identity, tx)
+        facts = log_event("order-withdrawn-again", order=withdrawn.identity, tx=tx)
+        log.warning("a reorganisation reverted the withdrawal of %s; withdrawn again", withdrawn.identity, extra=facts)
 
     async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract was created from orders with these hashes: stop sending ours.
@@ -182,6 +535,8 @@ class Trader(Lifecycle):
                 self._forget(order)
             await self._parts.outbox.spend(identity if order is None else order.identity, liability.address)
             if order is not None:
+                if isinstance(order.signed, Offer):
+                    await self.taken(liability, demand_hash, order)
                 if order.created is not None and not order.created.done():
                     order.created.set_result(known or self.contracts.watch(liability, order=lasts))
                 is_earlier = order.nonce is not None and order.identity != identity
@@ -194,14 +549,16 @@ class Trader(Lifecycle):
             return
         self.contracts.reverted(address, min(order.deadline or 0 for order in orders))
         again = [order for order in await self.load() if order.is_open]
-        self._covered.send(again)
+        for order in again:
+            order.is_ours = True
+        self._send_covered(again)
         await self._parts.outbox.release({order.identity for order in orders} - {order.identity for order in again})
 
     def reorganised(self) -> None:
         """A reorganisation may have reverted the allowance of open orders, which wait for it, and withdrawals."""
-        self._covered.send([order for order in self._orders.values() if order.is_open])
         if self.is_open:
-            self._tasks.start(self._chain_withdrawals.make_again(), "withdraw again on the chain")
+            self._send_covered([order for order in self._orders.values() if order.is_open])
+            self._tasks.start(self._withdraw_again(), "withdraw again on the chain")
 
     async def new_head(self, block: int) -> None:
         """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
@@ -211,6 +568,7 @@ class Trader(Lifecycle):
                 if order.is_open:
                     order.close(OrderState.EXPIRED)
         self.contracts.expire(block)
+        self.answered.expire(block)
         await self.load()
 
     async def load(self) -> list[TradedOrder]:
@@ -224,8 +582,8 @@ class Trader(Lifecycle):
                     continue
                 if order is None:
                     order = self._orders[stored.identity] = TradedOrder(signed, stored.posted)
-                    self._allowances.count(order, self._chain.costs.of(signed))
-                    if isinstance(signed, Demand):
+                    self._allowances.count(order, self._chain.funds.cost_of(signed))
+                    if isinstance(signed, Demand) and self._hear_declines is not None:
                         self._hear_declines()
                     new.append(order)
                 if stored.is_withdrawn and order.is_open:
@@ -242,6 +600,7 @@ class Trader(Lifecycle):
         order = self._orders.get(identity)
         if order is not None and reason == Refusal.WITHDRAWN:
             order.reject(rejection)
+            self._heard.set()
         if order is None or not order.is_open:
             return
         used = 0 if order.nonce is None else await self._chain.liabilities.next_nonce(self._address)
@@ -250,9 +609,9 @@ class Trader(Lifecycle):
             return
         if reason == "ERC20InsufficientAllowance" and not order.is_overtaken(used - 1):
             # A reorganisation took the allowance in a block that was not read here.
-            self._covered.send([order])
+            self._send_covered([order])
         if order.nonce is not None and order.nonce > used:
-            self._tasks.start(self._chain_withdrawals.use_up_nonces(order), f"use up the nonces before {identity}")
+            self._tasks.start(self._use_up_nonces(order), f"use up the nonces before {identity}")
         if order.is_overtaken(used - 1):
             await self._renew_overtaken(used - 1)
         elif order.reject(rejection):
@@ -276,7 +635,7 @@ class Trader(Lifecycle):
         """Replace an order by one with the same terms and a fresh nonce."""
         async with self._changing:
             signed = await self.writer.sign_again(order.signed)
-            await self._allowances.ensure(order, self._chain.costs.of(order.signed))
+            await self._allowances.ensure(order, self._chain.funds.cost_of(order.signed))
             identity = order.identity
             if not order.is_open or self._orders.pop(identity, None) is None:
                 return

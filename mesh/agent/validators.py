@@ -6,39 +6,36 @@ import asyncio
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from mesh.agent.errors import Declined
 from mesh.amounts import XRT
+from mesh.base.flood import BoundedDict
 from mesh.errors import RemoteError
-from mesh.flood import BoundedDict
-from mesh.watching.queries import query_all
+from mesh.watching.market import query_all
 from schemas import ZERO_ADDRESS, Demand, InvalidRecord
 from schemas.keys import ValidatorKey
+from schemas.signing import SignedRecord
 from schemas.verdicts import LONGEST_REPORT, PolicyNote, ValidatorAnnouncement
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     import zenoh
 
     from mesh.chain import Chain
     from mesh.network import Channel
 
+S = TypeVar("S", bound=SignedRecord)
+
 KEPT: Final = 60.0
 """Seconds for which the announcements of a validator are not asked again, …"""
 KEPT_SILENCE: Final = 5.0
 """… and those for which a validator without any is not."""
-REMEMBERED: Final = 256
-"""Validators whose announcements are kept."""
-LOOKUPS: Final = 8
-"""Validators that are asked at once: strangers' demands may name any number."""
 OLDEST: Final = 24 * 3600.0
 """Seconds since a juror signed an announcement after which it does not count."""
 CLOCK_ERROR: Final = 300.0
 """Seconds by which a juror's clock may be ahead."""
-MOST_UNKNOWN: Final = 16
-"""Most jurors that are looked at of a validator whose jurors the chain does not list."""
 
 
 class ValidatorSilent(RemoteError, code="validator-silent"):
@@ -109,8 +106,8 @@ class ValidatorDirectory:
         self._session = session
         self._channel = channel
         self._chain = chain
-        self._found: BoundedDict[str, tuple[AnnouncedValidator, float]] = BoundedDict(REMEMBERED)
-        self._turns = asyncio.Semaphore(LOOKUPS)
+        self._found: BoundedDict[str, tuple[AnnouncedValidator, float]] = BoundedDict(256)
+        self._turns = asyncio.Semaphore(8)  # strangers' demands may name any number
 
     async def find(self, validator: str) -> AnnouncedValidator:
         """The validator (EIP-55 address) as its jurors announce it now. Raises `ChainError`."""
@@ -139,9 +136,19 @@ class ValidatorDirectory:
             raise Declined("validator-underpaid", why)
 
     async def _ask(self, validator: str) -> AnnouncedValidator:
-        key = str(ValidatorKey(self._channel.lighthouse, validator))
-        replies = await query_all(self._session, [key], timeout=self._channel.answer_timeout)
-        said = await asyncio.to_thread(_signed, replies, validator)
+        key, now = str(ValidatorKey(self._channel.lighthouse, validator)), time.time()
+
+        def is_wanted(one: ValidatorAnnouncement) -> bool:
+            return one.validator == validator and now - OLDEST <= one.made_at <= now + CLOCK_ERROR
+
+        said = await signed_answers(
+            self._session,
+            key,
+            ValidatorAnnouncement,
+            is_wanted,
+            timeout=self._channel.answer_timeout,
+            made_at=lambda one: one.made_at,
+        )
         jurors = await accepted_of(self._chain, validator, said)
         announcements = tuple(said[juror] for juror in jurors)
         jury = await self._chain.validators.jury(validator)
@@ -154,7 +161,7 @@ async def accepted_of(chain: Chain, validator: str, signers: Iterable[str]) -> l
     """Those of the signers (addresses) whose judgement the validator accepts, sorted. Raises `ChainError`."""
     if (jury := await chain.validators.jury(validator)) is not None:
         return sorted(set(signers) & set(jury.jurors))
-    some = sorted(signers, key=lambda signer: (signer != validator, signer))[:MOST_UNKNOWN]
+    some = sorted(signers, key=lambda signer: (signer != validator, signer))[:16]
     return [signer for signer in some if await chain.validators.accepts(validator, signer)]
 
 
@@ -174,17 +181,28 @@ async def refund_delay(chain: Chain) -> int | None:
     return int(await chain.node.read(chain.node.contract("Factory", chain.factory).refundDelay()))
 
 
-def _signed(replies: Iterable[zenoh.Reply], validator: str) -> dict[str, ValidatorAnnouncement]:
-    """The signed and recent announcements of a validator, the latest of each juror."""
-    said: dict[str, ValidatorAnnouncement] = {}
-    now = time.time()
-    for sample in (reply.ok for reply in replies if reply.ok is not None):
-        if len(sample.payload) > LONGEST_REPORT:
-            continue
-        with suppress(InvalidRecord):
-            one = ValidatorAnnouncement.decode(sample.payload.to_bytes())
-            is_recent = now - OLDEST <= one.made_at <= now + CLOCK_ERROR
-            is_newer = one.juror not in said or said[one.juror].made_at < one.made_at
-            if one.validator == validator and is_recent and is_newer and one.is_signed:
-                said[one.juror] = one
-    return said
+async def signed_answers(
+    session: zenoh.Session,
+    selector: str,
+    record: type[S],
+    is_wanted: Callable[[S], bool],
+    *,
+    timeout: float,
+    made_at: Callable[[S], float] = lambda _record: 0.0,
+) -> dict[str, S]:
+    """The wanted records in the answers to a query, by signer: of each the latest by `made_at`, or the first."""
+    replies = await query_all(session, [selector], timeout=timeout)
+
+    def read() -> dict[str, S]:
+        found: dict[str, S] = {}
+        for sample in (reply.ok for reply in replies if reply.ok is not None):
+            if len(sample.payload) > LONGEST_REPORT:
+                continue
+            with suppress(InvalidRecord):
+                one = record.decode(sample.payload.to_bytes())
+                before = found.get(one.signer)
+                if is_wanted(one) and (before is None or made_at(before) < made_at(one)) and one.is_signed:
+                    found[one.signer] = one
+        return found
+
+    return await asyncio.to_thread(read)

@@ -1,21 +1,26 @@
-"""What an Ethereum node answers: the type of each answer, and its limits.
+"""What an Ethereum node answers: the type of each answer, its limits, and why a contract reverted.
 
 Nothing that a node says is used before it has its type: `decode_answer` raises `SpoiledAnswer` for a null, a missing
 field or a value of another type, and then the request is sent again, to the next node if there are several.
+
+Revert data is the 4-byte selector of an error and its ABI-encoded arguments: one of our custom errors, `Error(string)`
+or `Panic(uint256)`. Geth, anvil and the embedded chain put it into the `data` of the JSON-RPC error, others deeper.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+import re
+from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
+from eth_utils.abi import abi_to_signature, get_abi_input_types
 from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
-from mesh.chain.abi import MalformedAbi, decode
-from mesh.chain.errors import RequestRefused
+from mesh.chain._abi import NAMES, SpoiledAnswer, decode, load_artifact
+from mesh.chain.errors import RequestRefused, Reverted
 from mesh.errors import ChainError
 from schemas import keccak256
 from schemas.address import checksum_address, parse_address
@@ -24,7 +29,8 @@ from schemas.errors import InvalidCid
 from schemas.records import Liability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping
+
 
 MAX_ANSWER: Final = 32 << 20
 """Bytes of one answer."""
@@ -35,6 +41,36 @@ NO_TRANSACTIONS: Final = bytes.fromhex("56e81f171bcc55a6ff8345e692c0f86e5b48e01b
 BLOOM_BITS: Final = 2_048
 LONGEST_TEXT: Final = 1_000
 """Characters of a text, such as an error message, that are kept."""
+REVERTED: Final = 3
+"""The JSON-RPC code that geth and anvil give to a call which the contract reverted."""
+LOGS: Final = "eth_getLogs"
+TOO_MANY: Final = 429
+"""The status of HTTP, which some providers have as the code of a JSON-RPC error."""
+QUOTA_CODES: Final = frozenset({429, -32005, -32007, -32016, -32029, -32097})
+"""JSON-RPC errors of providers whose customer asks too much, where their texts don't speak of something else."""
+_QUOTA: Final = re.compile(
+    r"rate.?limit|too many requests?|(?:request|call)s? (?:count|rate|limit)|/s(?:ec|econd)?\b|per second|quota|throttl"
+    r"|compute units|\bRPS\b|over rate|credits|slow down"
+    r"|(?:exceed\w*|over|out of|reached) .{0,40}(?:capacity|plan\b|daily|monthly)",
+    re.IGNORECASE,
+)
+_OTHER_LIMIT: Final = re.compile(
+    r"results|logs|range|response size|blocks?\b|\bgas\b|nonce|authori[sz]ed|balance|funds|fee\b", re.IGNORECASE
+)
+"""What texts with one of `QUOTA_CODES` are about, if not a quota: blocks and logs in an answer, a transaction."""
+BEHIND: Final = re.compile(
+    r"header not found|missing trie node|unknown block|block not found|header for hash not found|beyond (current )?head"
+    r"|block #?\d+ (is )?not (found|available)|resource not found|state (is )?(not available|unavailable|missing)",
+    re.IGNORECASE,
+)
+"""What a machine says that lacks a block, or its state, which another one behind the same address has."""
+_REVERTED: Final = re.compile(
+    r"execution (?:was )?reverted|(?:transaction|call) (?:was |has been )?reverted|vm (?:exception|error)\b.*\brevert"
+    r"|\breverted with |contract[ _]revert|revert opcode|^reverted\b(?! to\b)|^(?:error: )?vm reverted|^revert$",
+    re.IGNORECASE,
+)
+"""What nodes say of a call that a contract reverted: geth, Hardhat, Ganache, Hedera, Tron, Parity."""
+
 LIABILITY_GETTERS: Final = (
     *("model", "objective", "result", "promisee", "promisor", "lighthouse", "lighthouseFee"),
     *("token", "cost", "validator", "validatorFee", "isSuccess", "isFinalized", "demandHash", "offerHash"),
@@ -42,8 +78,15 @@ LIABILITY_GETTERS: Final = (
 """The functions of a liability that return its record, and the hashes of its orders."""
 
 
-class SpoiledAnswer(ValueError):
-    """An answer is not what its method returns. Asking again, or another node, may help."""
+class OverQuota(ValueError):
+    """The node answers later, or another one now: so many requests are more than it answers this customer.
+
+    `wait` is how many seconds it asks to wait, 0 if it does not say.
+    """
+
+    def __init__(self, why: str, *, wait: float = 0.0) -> None:
+        super().__init__(why)
+        self.wait = wait
 
 
 class InvalidAnswer(RequestRefused, code="invalid-answer"):
@@ -101,11 +144,23 @@ class BlockHeader(_Answer, frozen=True):
     base_fee: Quantity | None = msgspec.field(default=None, name="baseFeePerGas")
     transactions_root: Word | None = None
     logs_bloom: Data | None = None
+    transactions: list[Word] | None = None
+    """Their hashes; None in a header that the node has pushed."""
 
     @property
     def has_transactions(self) -> bool:
         """Whether the block holds transactions, as far as its header says."""
         return self.transactions_root != NO_TRANSACTIONS
+
+    def may_hold(self, hashes: Iterable[str]) -> bool:
+        """Whether one of these transactions may be in the block (0x and 64 hexadecimal digits)."""
+        known = self.transactions
+        return known is None or any(bytes.fromhex(tx[2:]) in known for tx in hashes)
+
+    @property
+    def has_bloom(self) -> bool:
+        """Whether the Bloom filter says anything: some chains leave it out, or fill it with zeros or ones."""
+        return bool(self.logs_bloom) and set(self.logs_bloom or b"") not in ({0}, {0xFF})
 
     def may_log(self, *alternatives: Iterable[bytes]) -> bool:
         """Whether the block may hold a log with all the members of one of the alternatives: its address and topics.
@@ -114,9 +169,9 @@ class BlockHeader(_Answer, frozen=True):
         """
         if not self.has_transactions:
             return False
-        if self.logs_bloom is None or not any(self.logs_bloom):  # some chains don't fill it in
+        if not self.has_bloom:
             return True
-        bloom = int.from_bytes(self.logs_bloom, "big")
+        bloom = int.from_bytes(self.logs_bloom or b"", "big")
         return any(all(bloom & bits == bits for bits in map(_bloom_bits, members)) for members in alternatives)
 
 
@@ -133,14 +188,31 @@ class Log(_Answer, frozen=True):
 
 
 class MinedTransaction(_Answer, frozen=True):
-    """The receipt of a transaction. `status` is 1 if it succeeded."""
+    """The receipt of a transaction. `status` is 1 if it succeeded.
+
+    Some nodes don't say at which price: then `effective_gas_price` is None.
+    """
 
     block_number: Count
     block_hash: Word
     gas_used: Count
-    effective_gas_price: Quantity
     status: Count
     logs: Annotated[list[Log], Meta(max_length=MAX_LOGS)]
+    effective_gas_price: Quantity | None = None
+
+
+class BlockReceipt(_Answer, frozen=True):
+    """What the receipt of a mined transaction says of its block and its logs."""
+
+    block_hash: Word
+    logs: Annotated[list[Log], Meta(max_length=MAX_LOGS)]
+
+
+class BlockBody(_Answer, frozen=True):
+    """The transactions of a block, by their hashes."""
+
+    hash: Word
+    transactions: list[Word]
 
 
 class KnownTransaction(_Answer, frozen=True):
@@ -167,7 +239,9 @@ ANSWERS: Final[Mapping[str, Any]] = MappingProxyType(
         "eth_estimateGas": Count,
         "eth_gasPrice": Quantity,
         "eth_getBalance": Quantity,
+        "eth_getBlockByHash": BlockBody | None,
         "eth_getBlockByNumber": BlockHeader | None,
+        "eth_getBlockReceipts": list[BlockReceipt] | None,
         "eth_getCode": Data,
         "eth_getLogs": Annotated[list[Log], Meta(max_length=MAX_LOGS)],
         "eth_getTransactionByHash": KnownTransaction | None,
@@ -188,7 +262,7 @@ def decode_answer(method: str, response: object, kind: Any = Any) -> Any:
         raise SpoiledAnswer(f"its answer to {method} is not an object")
     try:
         if response.get("error") is not None:
-            return _failure(response["error"])
+            return _passed_on(method, _failure(response["error"]))
         if "result" not in response:
             raise SpoiledAnswer(f"its answer to {method} holds no result")
         return _plain(msgspec.convert(response["result"], kind, dec_hook=_decode_value))
@@ -196,29 +270,23 @@ def decode_answer(method: str, response: object, kind: Any = Any) -> Any:
         raise SpoiledAnswer(f"its answer to {method} is invalid: {error}") from None
 
 
-def decode_values(types: Sequence[str], data: bytes) -> tuple[Any, ...]:
-    """ABI-encoded values that a contract returned. Raises `SpoiledAnswer`."""
-    try:
-        return decode(types, data)
-    except MalformedAbi as error:
-        raise SpoiledAnswer(f"{len(data)} bytes are no {', '.join(types)}: {error}") from None
-
-
-def decode_cid(data: bytes) -> str:
-    """The CID of a multihash that a contract returned; empty for other bytes, which the originals take from anybody."""
-    try:
-        return format_cid(data)
-    except InvalidCid:
-        return ""
-
-
 def liability_record(address: str, held: Mapping[str, Any]) -> Liability:
-    """The record of a liability, by what its `LIABILITY_GETTERS` returned."""
+    """The record of a liability, by what its `LIABILITY_GETTERS` returned.
+
+    CIDs are empty where the multihash is none: the originals take other bytes from anybody.
+    """
+
+    def cid(name: str) -> str:
+        try:
+            return format_cid(held[name])
+        except InvalidCid:
+            return ""
+
     return Liability(
         address=address,
-        model=decode_cid(held["model"]),
-        objective=decode_cid(held["objective"]),
-        result=decode_cid(held["result"]),
+        model=cid("model"),
+        objective=cid("objective"),
+        result=cid("result"),
         promisee=parse_address(held["promisee"]),
         promisor=parse_address(held["promisor"]),
         lighthouse=parse_address(held["lighthouse"]),
@@ -245,6 +313,45 @@ def _failure(error: object) -> RpcFailure:
         return RpcFailure(message=error[:LONGEST_TEXT])
     failure = msgspec.convert(error, RpcFailure)
     return RpcFailure(failure.code, failure.message[:LONGEST_TEXT], failure.data)
+
+
+def _passed_on(method: str, failure: RpcFailure) -> RpcFailure:
+    """The error, if it is about the request. Raises `OverQuota`, `SpoiledAnswer` if it is about the node of now.
+
+    Who reads logs knows what to do about a block that a machine lacks, and "limit exceeded" is what some nodes answer
+    to every request for logs.
+    """
+    text = failure.message
+    if says_reverted(failure):
+        return failure
+    is_known = failure.code in QUOTA_CODES and not _OTHER_LIMIT.search(text)
+    if _QUOTA.search(text) or failure.code == TOO_MANY or (is_known and method != LOGS):
+        raise OverQuota(f"over its quota: {text}", wait=stated_wait(failure.data))
+    if method != LOGS and BEHIND.search(text):
+        raise SpoiledAnswer(f"it is behind: {text}")
+    return failure
+
+
+def says_reverted(failure: RpcFailure) -> bool:
+    """Whether an error says that a contract reverted. Nodes also use the word for themselves and for blocks."""
+    texts = (failure.message, failure.data if isinstance(failure.data, str) else "")
+    return failure.code == REVERTED or any(_REVERTED.search(text) for text in texts)
+
+
+def stated_wait(data: object) -> float:
+    """The seconds to wait that a provider states in the data of its error; 0 if it states none."""
+    found = data
+    if isinstance(data, dict):
+        found = data.get("backoff_seconds", data.get("retry_after"))
+        if found is None:
+            return next(
+                (wait for inner in data.values() if isinstance(inner, dict) and (wait := stated_wait(inner))), 0.0
+            )
+    try:
+        wait = float(found)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return 0.0
+    return wait if 0 < wait < float("inf") else 0.0
 
 
 def _decode_value(kind: type, value: object) -> Any:
@@ -279,3 +386,57 @@ def _plain(value: Any) -> Any:
         case Address():
             return str(value)
     return value
+
+
+PLAIN: Final = bytes.fromhex("08c379a0")
+"""Selector of `Error(string)`, a revert with a text."""
+
+PANIC: Final = bytes.fromhex("4e487b71")
+"""Selector of `Panic(uint256)`, a failed assertion of the compiler."""
+
+
+def decode_revert(failure: RpcFailure) -> Reverted | None:
+    """The revert in a node's JSON-RPC error; None if it is another kind of error."""
+    data = _revert_data(failure.data)
+    if not says_reverted(failure) and (data or b"")[:4] not in {PLAIN, PANIC, *custom_errors()}:
+        return None  # data alone proves nothing: nodes put other things there
+    return explain(data or b"", message=failure.message)
+
+
+def explain(data: bytes, *, message: str = "") -> Reverted:
+    """The revert in revert data; `message` is the node's, for a revert without data."""
+    selector, body = data[:4], data[4:]
+    try:
+        if selector == PLAIN:
+            return Reverted(str(decode(["string"], body)[0])[:LONGEST_TEXT], data=data)
+        if selector == PANIC:
+            return Reverted("Panic", arguments=decode(["uint256"], body), data=data)
+        if selector in custom_errors():
+            name, types = custom_errors()[selector]
+            return Reverted(name, arguments=decode(types, body), data=data)
+    except SpoiledAnswer:
+        return Reverted("", data=data)
+    _, _, reason = message.partition("execution reverted: ")
+    return Reverted("" if data else reason, data=data)
+
+
+@cache
+def custom_errors() -> dict[bytes, tuple[str, list[str]]]:
+    """Name and argument types of every custom error of our contracts, by selector."""
+    errors = (entry for name in NAMES for entry in load_artifact(name).abi if entry["type"] == "error")
+    return {
+        keccak256(abi_to_signature(entry).encode())[:4]: (entry["name"], get_abi_input_types(entry)) for entry in errors
+    }
+
+
+def _revert_data(data: object) -> bytes | None:
+    """The revert data, which nodes put in different places; None if there is none."""
+    if isinstance(data, dict):
+        data = data.get("data") or data.get("result")
+    if not isinstance(data, str):
+        return None
+    _, found, digits = data.rpartition("0x")
+    try:
+        return bytes.fromhex(digits) if found else None
+    except ValueError:
+        return None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Final
 
-from mesh.errors import ChainError, ConfigurationError, InputError
+from mesh.amounts import ETH
+from mesh.errors import ChainError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
 METHOD_NOT_FOUND: Final = -32601
 """The JSON-RPC code of a method that the node does not have."""
@@ -45,49 +45,32 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
 
 
 class NodeUnreachable(ChainError, code="node-unreachable"):
-    """No Ethereum node answers at the endpoint. Trying again later may help."""
+    """No Ethereum node answers at the endpoint. Trying again later may help.
 
-    def __init__(self, endpoint: str, why: str) -> None:
+    Its code is `missing-logs` if one answers, but has no logs for a block whose header says that it may have some.
+    """
+
+    def __init__(self, endpoint: str, why: str, *, code: str = "") -> None:
         super().__init__(
             f"no Ethereum node answers at {endpoint} ({why})",
             hint="start a node there (`aira chain up` runs one to develop on), or name another with web3_http_provider",
+            code=code,
         )
         self.endpoint = endpoint
         self.why = why
 
 
-class InvalidEndpoint(ConfigurationError, code="invalid-endpoint"):
-    """A text is not the address of an Ethereum node."""
-
-    def __init__(self, endpoint: str) -> None:
-        super().__init__(
-            f"{endpoint!r} is not the address of a node",
-            hint="an address begins with http://, https://, ws:// or wss://; several are separated by commas",
-        )
-        self.endpoint = endpoint
-
-
-class WrongChain(ConfigurationError, code="wrong-chain"):
-    """One of several nodes is on another chain; `found` and `expected` are EIP-155 numbers."""
-
-    def __init__(self, endpoint: str, *, found: int, expected: int) -> None:
-        super().__init__(
-            f"the node {endpoint} is on the chain {found}, the others are on the chain {expected}",
-            hint="name nodes of one chain only",
-        )
-        self.endpoint = endpoint
-        self.found = found
-        self.expected = expected
-
-
 class RequestRefused(ChainError, code="request-refused"):
-    """The node answered with an error that has no class of its own here. `rpc_code` is JSON-RPC's."""
+    """The node answered with an error that has no class of its own here. `rpc_code` is JSON-RPC's.
 
-    def __init__(self, method: str, code: int, message: str) -> None:
-        super().__init__(f"the node refused {method}: {message} (code {code})")
+    Its code is `above-nodes-cap` if the node takes no transaction that may cost so much.
+    """
+
+    def __init__(self, method: str, rpc_code: int, detail: str, *, hint: str = "", code: str = "") -> None:
+        super().__init__(f"the node refused {method}: {detail} (code {rpc_code})", hint=hint, code=code)
         self.method = method
-        self.rpc_code = code
-        self.detail = message
+        self.rpc_code = rpc_code
+        self.detail = detail
 
 
 class NoContracts(ChainError, code="no-contracts"):
@@ -146,7 +129,7 @@ class InsufficientFunds(ChainError, code="insufficient-funds"):
 
     def __init__(self, address: str, *, balance: int, needed: int) -> None:
         super().__init__(
-            f"{address} has {_ether(balance)}, and the transaction may need {_ether(needed)}",
+            f"{address} has {ETH.show(balance)}, and the transaction may need {ETH.show(needed)}",
             hint="send ETH to the account; gas is paid in it",
         )
         self.address = address
@@ -165,18 +148,6 @@ class InsufficientTokens(ChainError, code="insufficient-tokens"):
         self.account, self.token = account, token
         self.balance = balance
         self.needed = needed
-
-
-class StakeTooSmall(InputError, code="stake-too-small"):
-    """The stake is below the lighthouse's minimum. Amounts are wn."""
-
-    def __init__(self, stake: int, minimal_stake: int) -> None:
-        super().__init__(
-            f"a stake of {stake} wn is below the lighthouse's minimum of {minimal_stake} wn",
-            hint=f"stake {minimal_stake} wn or more: each such amount is one transaction a turn",
-        )
-        self.stake = stake
-        self.minimal_stake = minimal_stake
 
 
 class FeeTooHigh(ChainError, code="fee-too-high"):
@@ -235,69 +206,26 @@ class TransactionTimeout(ChainError, code="transaction-timeout"):
 
 
 class ChainWentBack(ChainError, code="chain-went-back"):
-    """The chain is shorter than what was already read of it: it was started afresh, or the node is still syncing."""
+    """The chain is shorter than what was already read of it: it was started afresh, or the node is still syncing.
 
-    is_final: ClassVar[bool] = False
-    """Whether waiting does not help: the blocks that were read are on no chain of the node's."""
-
-    def __init__(self, cursor: int, head: int) -> None:
-        super().__init__(
-            f"the next block to read is {cursor}, but the chain ends at block {head}",
-            hint="wait for the node to sync; if the chain was started afresh, start with a fresh data_dir too",
-        )
-        self.cursor, self.head = cursor, head
-
-
-class ReorganisedTooDeep(ChainWentBack, code="reorganised-too-deep"):
-    """None of the remembered blocks is on the chain: it is another chain, or was restarted from its beginning.
-
-    `cursor` is the oldest block that is remembered.
+    Or it is long enough, and has no block as it was read (`reorganised-too-deep`): it is another chain, or was started
+    afresh. Then waiting does not help (`is_final`), and `cursor` is the oldest block that is remembered.
     """
 
-    is_final = True
-
-    def __init__(self, cursor: int, head: int) -> None:
-        why = f"the chain has no block {cursor} as it was read, nor any read after it; it ends at block {head}"
-        hint = "check which chain the node is on; if the chain was started afresh, start with a fresh data_dir too"
-        ChainError.__init__(self, why, hint=hint)
-        self.cursor, self.head = cursor, head
-
-
-class NoAccount(ConfigurationError, code="no-account"):
-    """A transaction needs an account, and none was given."""
-
-    def __init__(self) -> None:
-        super().__init__("this needs an account", hint="set keyfile and keyfile_password_file")
-
-
-class TransactionsNotKept(ConfigurationError, code="transactions-not-kept"):
-    """The disk refuses sent transactions, or the orders in them; `folder` is their folder or file."""
-
-    def __init__(self, folder: Path, why: str) -> None:
-        super().__init__(
-            f"can't keep sent transactions in {folder}: {why}",
-            hint="make room on that disk, let this user write there, or name another folder with --data-dir",
-        )
-        self.folder = folder
-        self.why = why
-
-
-class TransactionDamaged(ConfigurationError, code="transaction-damaged"):
-    """The file of a sent transaction is damaged."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(f"{path} does not contain a sent transaction", hint="it is damaged; move it away")
-        self.path = path
-
-
-class UnknownContracts(ConfigurationError, code="unknown-contracts"):
-    """The settings name contracts, or a generation of them, that do not exist."""
-
-
-def _ether(wei: int) -> str:
-    """An amount of wei in ETH, all its digits."""
-    whole, part = divmod(wei, 10**18)
-    return f"{whole}.{part:018}".rstrip("0").rstrip(".") + " ETH"
+    def __init__(self, cursor: int, head: int, *, is_final: bool = False) -> None:
+        afresh = "if the chain was started afresh, start with a fresh data_dir too"
+        if is_final:
+            super().__init__(
+                f"the chain has no block {cursor} as it was read, nor any read after it; it ends at block {head}",
+                hint=f"check which chain the node is on; {afresh}",
+                code="reorganised-too-deep",
+            )
+        else:
+            super().__init__(
+                f"the next block to read is {cursor}, but the chain ends at block {head}",
+                hint=f"wait for the node to sync; {afresh}",
+            )
+        self.cursor, self.head, self.is_final = cursor, head, is_final
 
 
 def _show(argument: object) -> str:

@@ -1,4 +1,4 @@
-"""Following the chain, and what happens in a reorganisation. Whatever reads events as they happen does it here.
+"""Events: decoding and reading them, and following the chain with its reorganisations.
 
     async with aclosing(chain.follow(cursor, history=history)) as blocks:
         async for block in blocks:
@@ -29,34 +29,426 @@ meantime are then reverted first. Without one, only a reorganisation that happen
 
 **When the node fails**, the failure is logged once (`OutageLog`) and reading continues from the cursor as soon as the
 node answers, with the backoff `Timing.outage_retry`. What stops `follow` is a chain that can't be the one that was
-read: `ChainWentBack` (the cursor is past its end) and `ReorganisedTooDeep` (no block of the history is on it).
+read: `ChainWentBack` (the cursor is past its end, or no block of the history is on it).
+
+**Reading.** An answer should prove which block it is for: the node may be many machines, and one that lacks the newest
+blocks answers `[]` to `eth_getLogs`, or leaves logs out, and that looks like a true answer. So the newest blocks
+(`RECENT`) are read one by one: their headers are a chain of hashes that ends at the head, and `Node.block_logs` asks
+for the logs of a hash. This is a proof, at the price of a header for each block. Older blocks are read in ranges, which
+is none: a range is asked for `ASKED` times at once, and the answer with the most logs is taken. So a log is lost if all
+these answers come from machines that are more than `RECENT` blocks behind: an eighth of the ranges if half of the
+machines are, a thousandth if a tenth are. The node keeps no filters for us: a restart on either side loses nothing.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from contextlib import aclosing
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from itertools import groupby, pairwise
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar, get_args
 
 import msgspec
+from eth_utils.abi import event_abi_to_log_topic
 
-from mesh.chain.errors import ChainWentBack, NoContracts, NodeUnreachable, ReorganisedTooDeep, RequestRefused
-from mesh.chain.events import EVENT_CLASSES, ChainEvent
-from mesh.chain.policy import REORG_DEPTH
-from mesh.chain.reader import RangeReader, ReplacedWhileReading, SeenBlock
+from mesh.base.log_context import log_event
+from mesh.base.outage_log import OutageLog
+from mesh.base.retry import Backoff
+from mesh.chain._abi import SpoiledAnswer, decode, load_artifact
+from mesh.chain._policy import REORG_DEPTH
+from mesh.chain.answers import InvalidAnswer
+from mesh.chain.errors import ChainWentBack, NoContracts, NodeUnreachable, RequestRefused
 from mesh.errors import ConfigurationError, InputError
-from mesh.outage_log import OutageLog
-from mesh.retry import Backoff
+from schemas.address import ZERO_ADDRESS, address_bytes
+from schemas.cid import format_cid
+from schemas.decoding import decode_json
+from schemas.errors import InvalidCid
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Awaitable, Callable
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 
-    from mesh.chain.answers import BlockHeader
-    from mesh.chain.node import Node
-    from mesh.chain.reader import ReadRange
+    from mesh.chain._contracts import ContractVersion
+    from mesh.chain._node import Node
+    from mesh.chain.answers import BlockHeader, Log
     from mesh.errors import AiraError
+
+
+E = TypeVar("E")
+
+LONGEST_NAME: Final = 255
+"""Characters of a lighthouse's name; the original factories take any text."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewLiability:
+    """A liability was created."""
+
+    liability: str
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Finalized:
+    """A liability was finalized. `result` is a CID, empty when it was refunded."""
+
+    liability: str
+    success: bool
+    result: str
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class NewLighthouse:
+    """A lighthouse was created; `name` is its label."""
+
+    lighthouse: str
+    name: str
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """Tokens were transferred: XRT (`value` in wn) or the followed token. The zero address mints and burns."""
+
+    sender: str
+    recipient: str
+    value: int
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Approval:
+    """An owner allowed a spender to take up to `value` of its tokens: XRT (wn) or the followed token."""
+
+    owner: str
+    spender: str
+    value: int
+    tx: str
+
+
+ChainEvent: TypeAlias = NewLiability | Finalized | NewLighthouse | Transfer | Approval
+
+EVENT_CLASSES: Final[Mapping[str, type[ChainEvent]]] = {kind.__name__: kind for kind in get_args(ChainEvent)}
+"""By name, as a saved history has them."""
+
+
+def decode_log(log: Log) -> ChainEvent | None:
+    """The event in a log; None for a log of other contracts that only looks similar."""
+    layout = _layouts().get(log.topics[0]) if log.topics else None
+    if layout is None or len(log.topics) != 1 + len(layout.indexed):
+        return None
+    try:
+        keys = [decode([kind], topic)[0] for kind, topic in zip(layout.indexed, log.topics[1:], strict=True)]
+        # The original factory of generation 3 does not pad its string to whole words.
+        data = log.data + bytes(-len(log.data) % 32) if layout.plain == ["string"] else log.data
+        values = (*keys, *decode(layout.plain, data))
+        if layout.event is Finalized:
+            success, result = values
+            values = success, format_cid(result) if result else ""
+    except (SpoiledAnswer, InvalidCid):
+        return None
+    if layout.event is NewLighthouse and len(values[1]) > LONGEST_NAME:
+        return None
+    emitter = (log.address,) if layout.has_emitter else ()
+    event: ChainEvent = layout.event(*emitter, *values, "0x" + log.transaction_hash.hex())
+    return event
+
+
+@cache
+def topics_of(*contracts: str) -> tuple[str, ...]:
+    """The topics (0x…) of the events of these contracts (keys of `EVENTS`)."""
+    names = {name for contract in contracts for name in EVENTS[contract]}
+    return tuple("0x" + topic.hex() for topic, layout in _layouts().items() if layout.event.__name__ in names)
+
+
+def first_event(logs: Iterable[Log], kind: type[E], *, emitter: str = "") -> E:
+    """What a transaction created, by its logs: those of one contract, as others, such as tokens, may log the same.
+
+    Raises `InvalidAnswer` if they don't say it.
+    """
+    for log in logs:
+        event = decode_log(log) if emitter in ("", log.address) else None
+        if isinstance(event, kind):
+            return event
+    raise InvalidAnswer("the transaction", f"no event {kind.__name__} is in its receipt")
+
+
+def xrt_minted(logs: Iterable[Log], *, xrt: str, account: str) -> int:
+    """The XRT (wn) that a transaction minted for an account. Other tokens may log the same event."""
+    transfers = (decode_log(log) for log in logs if log.address == xrt)
+    return sum(
+        transfer.value
+        for transfer in transfers
+        if isinstance(transfer, Transfer) and (transfer.sender, transfer.recipient) == (ZERO_ADDRESS, account)
+    )
+
+
+EVENTS: Final = {
+    "Factory": ("NewLiability", "NewLighthouse"),
+    "Liability": ("Finalized",),
+    "XRT": ("Transfer", "Approval"),
+}
+
+
+class _Layout(NamedTuple):
+    """How a contract logs an event: the types of its indexed members and of the others."""
+
+    event: type[Any]
+    """One of `EVENT_CLASSES`."""
+    has_emitter: bool
+    """Whether the event begins with the contract that logged it."""
+    indexed: list[str]
+    plain: list[str]
+
+
+@cache
+def _layouts() -> dict[bytes, _Layout]:
+    """Those of `EVENTS`, by topic."""
+    layouts = {}
+    for contract, names in EVENTS.items():
+        for entry in load_artifact(contract).abi:
+            if entry["type"] == "event" and entry["name"] in names:
+                layouts[event_abi_to_log_topic(entry)] = _Layout(
+                    EVENT_CLASSES[entry["name"]],
+                    contract == "Liability",
+                    [member["type"] for member in entry["inputs"] if member["indexed"]],
+                    [member["type"] for member in entry["inputs"] if not member["indexed"]],
+                )
+    return layouts
+
+
+MAX_RANGE: Final = 2_000
+"""Blocks in one request. Halved each time a node refuses, and grown by a quarter each time it answers."""
+
+RECENT: Final = 256
+"""Blocks up to the head that are read one by one, by their hashes; a machine of the node may lack them."""
+
+AT_ONCE: Final = 32
+"""Blocks whose headers are asked for at the same time."""
+
+ASKED: Final = 3
+"""How often the logs of a range are asked for."""
+
+LIST_ATTEMPTS: Final = 5
+"""How often blocks are read again that were replaced meanwhile, where nothing is followed."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenBlock:
+    """A block that was read: its number, its hash (32 bytes) and its events, in order."""
+
+    block_number: int
+    block_hash: bytes
+    events: tuple[ChainEvent, ...]
+
+
+class ReplacedWhileReading(Exception):
+    """The chain was reorganised between two requests: the answers don't belong together."""
+
+
+Choose: TypeAlias = "Callable[[Sequence[str], Sequence[str]], Awaitable[Collection[str]]]"
+"""Returns, of the liabilities (addresses) that were created and of those that ended, the ones whose events are read."""
+
+DecodedLog: TypeAlias = "tuple[Log, ChainEvent | None]"
+"""A log and its event, if it is one of the contracts'."""
+
+ReadRange: TypeAlias = "Callable[[int, int, BlockHeader | None], Awaitable[list[SeenBlock]]]"
+"""Reads the blocks from one to another, both included, as `read_events` does; of a single block it gets the header."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventSources:
+    """The contracts whose events are read: the factory, a token, and the factory's liabilities.
+
+    The token's transfers and approvals are those that concern `parties` (addresses), or all.
+    """
+
+    factory: str
+    token: str
+    parties: frozenset[str] | None = None
+    choose: Choose | None = None
+    """Which liabilities' events are read; those of all by default."""
+    version: ContractVersion
+    """Told each liability that the factory's events name, before it is asked about its events."""
+
+    def logs_in(self, header: BlockHeader | None) -> bool:
+        """Whether a block may hold a log of the named contracts; with None, it is not known."""
+        wanted = [(address_bytes(self.factory), topic) for topic in _topics("Factory")]
+        of_token = [(address_bytes(self.token), topic) for topic in _topics("XRT")]
+        if self.parties is None:
+            return header is None or header.may_log(*wanted, *of_token)
+        parties = [bytes(12) + address_bytes(party) for party in self.parties]
+        return header is None or header.may_log(*wanted, *((*one, party) for one in of_token for party in parties))
+
+    async def chosen(self, decoded: Sequence[DecodedLog]) -> list[DecodedLog]:
+        """The same logs, with None for each event that is not one of those that are read."""
+        liabilities: Collection[str] | None = None
+        if self.choose is not None:
+            created = [event.liability for _, event in decoded if isinstance(event, NewLiability)]
+            ended = [event.liability for _, event in decoded if isinstance(event, Finalized)]
+            liabilities = await self.choose(created, ended) if created or ended else ()
+        return [(log, event if self._is_read(event, liabilities) else None) for log, event in decoded]
+
+    def _is_read(self, event: ChainEvent | None, liabilities: Collection[str] | None) -> bool:
+        match event:
+            case Transfer(one, other) | Approval(one, other):
+                return self.parties is None or one in self.parties or other in self.parties
+            case NewLiability(liability) | Finalized(liability):
+                return liabilities is None or liability in liabilities
+        return True
+
+
+class RangeReader:
+    """Reads long ranges of blocks in requests that are as long as the node answers."""
+
+    def __init__(self, node: Node, read: ReadRange) -> None:
+        self._node = node
+        self._read = read
+        self._span = MAX_RANGE
+
+    async def read_to(self, first: int, head: BlockHeader) -> AsyncGenerator[SeenBlock, None]:
+        """The blocks with events from `first` to the head, and the last block of each request.
+
+        The hash of an older block without events is empty. Raises `NodeUnreachable`, `RequestRefused`,
+        `ReplacedWhileReading`.
+        """
+        while first <= head.number:
+            last = min(head.number - RECENT, first + self._span - 1)
+            if last <= first:
+                last = min(head.number, first + AT_ONCE - 1)
+                async with aclosing(self._read_singly(first, last, head)) as singles:
+                    async for block in singles:
+                        yield block
+                first = last + 1
+                continue
+            try:
+                blocks = await self._read(first, last, None)
+            except (RequestRefused, NodeUnreachable) as error:
+                if isinstance(error, NodeUnreachable):
+                    # A node may drop the connection because the range is long; one that is gone raises again here.
+                    await self._node.block_number()
+                self._span = (last - first + 1) // 2
+                continue
+            # If the node only claims to have that head, reading towards it would never end.
+            await self._node.block_hash(last)
+            await self._check_head(head)
+            for block in blocks:
+                yield block
+            first = last + 1
+            self._span = min(MAX_RANGE, self._span + max(1, self._span // 4))
+
+    async def _read_singly(self, first: int, last: int, head: BlockHeader) -> AsyncGenerator[SeenBlock, None]:
+        """The blocks with events from `first` to `last`, at most `AT_ONCE` of them, and `last` itself."""
+        found = await asyncio.gather(*map(self._node.header, range(first, min(last + 1, head.number))))
+        headers = [header for header in found if header is not None]
+        if len(headers) != len(found):
+            raise NodeUnreachable(self._node.endpoint, f"it lacks a block before {last + 1}")
+        if last == head.number:
+            headers.append(head)
+        else:
+            await self._check_head(head)
+        # The first block is never replaced, but anvil makes it anew when it loads a chain from a file.
+        if any(later.parent_hash != earlier.hash for earlier, later in pairwise(headers) if earlier.number):
+            raise ReplacedWhileReading
+        for header in headers:
+            for block in await self._read(header.number, header.number, header):
+                if block.events or header.number == last:
+                    yield replace(block, block_hash=header.hash)
+
+    async def _check_head(self, head: BlockHeader) -> None:
+        """Raise `ReplacedWhileReading` if the answers may be of blocks that were replaced, or of both."""
+        if await self._node.block_hash(head.number) != head.hash:
+            raise ReplacedWhileReading
+
+
+async def read_events(
+    node: Node, sources: EventSources, first: int, last: int, header: BlockHeader | None
+) -> list[SeenBlock]:
+    """The blocks with events from `first` to `last`, both included, and `last` itself.
+
+    With the `header` of a single block, the node is asked only for logs that the block may hold. Raises
+    `ReplacedWhileReading` when the logs of a block are of two different blocks.
+    """
+    logs: list[Log] = []
+    if sources.logs_in(header):
+        contracts = [sources.factory, sources.token]
+        logs = await _logs(node, first, last, header, contracts, topics_of("Factory", "XRT"))
+    decoded = [(log, decode_log(log)) for log in logs]
+    for log, event in decoded:
+        if isinstance(event, NewLiability) and log.address == sources.factory:
+            sources.version.recognise(event.liability)
+    endings: list[Log] = []
+    if header is None or header.may_log(_topics("Liability")):
+        endings = await _logs(node, first, last, header, (), topics_of("Liability"))
+    # Any contract can log the same event, and as often as it likes.
+    newest = max(last, node.heads.latest.number if node.heads.latest else 0)  # the state of old blocks may be gone
+    ours = await sources.version.recognised({log.address for log in endings}, newest) if endings else ()
+    decoded += [(log, decode_log(log)) for log in endings if log.address in ours]
+    return _by_block(await sources.chosen(decoded), last)
+
+
+async def _logs(
+    node: Node, first: int, last: int, header: BlockHeader | None, addresses: Collection[str], topics: Sequence[str]
+) -> list[Log]:
+    if header is not None:
+        return await node.block_logs(header, addresses=addresses, topics=topics)
+    asked = [node.logs(first, last, addresses=addresses, topics=topics) for _ in range(ASKED)]
+    most: list[Log] = []
+    for answer in await asyncio.gather(*asked, return_exceptions=True):
+        if isinstance(answer, BaseException):
+            raise answer
+        most = max(most, answer, key=len)
+    return most
+
+
+async def read_created(node: Node, factory: str, first: int, last: int, header: BlockHeader | None) -> list[SeenBlock]:
+    """The same with the events of the factory only."""
+    if header is not None and not header.may_log(*((address_bytes(factory), topic) for topic in _topics("Factory"))):
+        return _by_block((), last)
+    logs = await _logs(node, first, last, header, [factory], topics_of("Factory"))
+    return _by_block(((log, decode_log(log)) for log in logs), last)
+
+
+async def list_created(node: Node, factory: str, from_block: int) -> list[NewLiability | NewLighthouse]:
+    """What the factory created from a block to the latest one. Raises `NodeUnreachable`, `RequestRefused`."""
+    for _ in range(LIST_ATTEMPTS):
+        ranges = RangeReader(node, partial(read_created, node, factory))
+        head = await node.heads.look()
+        try:
+            async with aclosing(ranges.read_to(from_block, head)) as blocks:
+                events = [event async for block in blocks for event in block.events]
+            if await node.block_hash(head.number) != head.hash:
+                raise ReplacedWhileReading
+        except ReplacedWhileReading:
+            await asyncio.sleep(node.timing.poll_interval)
+        else:
+            return [event for event in events if isinstance(event, NewLiability | NewLighthouse)]
+    raise NodeUnreachable(node.endpoint, "its blocks are replaced whenever they are read")
+
+
+def _topics(*contracts: str) -> list[bytes]:
+    return [bytes.fromhex(topic[2:]) for topic in topics_of(*contracts)]
+
+
+def _by_block(decoded: Iterable[DecodedLog], last: int) -> list[SeenBlock]:
+    """The blocks of some logs that have events, and the last one."""
+    ordered = sorted(decoded, key=lambda one: (one[0].block_number, one[0].log_index))
+    blocks = []
+    for number, group in groupby(ordered, key=lambda one: one[0].block_number):
+        of_block = list(group)
+        hashes = {log.block_hash for log, _ in of_block}
+        if len(hashes) > 1:
+            raise ReplacedWhileReading
+        events = tuple(event for _, event in of_block if event is not None)
+        if events or number == last:
+            blocks.append(SeenBlock(number, hashes.pop(), events))
+    if not blocks or blocks[-1].block_number != last:
+        blocks.append(SeenBlock(last, b"", ()))
+    return blocks
+
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +459,12 @@ NODE_ERRORS: Final = (NodeUnreachable, RequestRefused)
 
 READ_ERRORS: Final = (*NODE_ERRORS, NoContracts)
 """A node that is behind the one that was asked before also lacks its newest contracts."""
+
+
+TELL_EVERY: Final = 10.0
+"""Seconds between two log lines that say how far a long catching up has come."""
+LAGGING: Final = 3
+"""Failures one after the other of a node that answers otherwise, before they are an outage: its machines may differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +530,7 @@ class History:
     def decode(cls, data: bytes) -> History:
         """The history that `encode` returned as `data`. Raises `InputError` for anything else."""
         try:
-            decoded = msgspec.json.decode(data)
+            decoded = decode_json(data)
             history = cls(decoded["depth"])
             for number, block_hash, events in decoded["blocks"]:
                 of_block: Any = tuple(msgspec.convert(fields, EVENT_CLASSES[name]) for name, fields in events)
@@ -161,25 +559,41 @@ async def follow(
 ) -> AsyncGenerator[BlockEvents, None]:
     """The events from the block `cursor` on, as `read` finds them, without end; see the module.
 
-    Raises `ChainWentBack` and `ReorganisedTooDeep`. Other failures of the node are retried and logged to `outages`.
+    Raises `ChainWentBack`. Other failures of the node are retried and logged to `outages`.
     """
     follower = _Follower(node, read, cursor, history or History(node.timing.reorg_depth))
     outages = outages or OutageLog(log, "chain")
     backoff = Backoff(node.timing.outage_retry)
+    lagging = 0
     while True:
         try:
             async with aclosing(follower.read_to_head()) as blocks:
                 async for block in blocks:
                     outages.recovered(f"the chain can be read again, from block {block.block_number}")
                     backoff.reset()
+                    lagging = 0
                     yield block
         except READ_ERRORS as error:
-            outages.failed(error, f"the chain can't be read on from block {follower.cursor}, trying again")
             follower.must_check_cursor = True
+            if lagging < LAGGING and not outages.is_down and await _answers(node):
+                lagging += 1  # one of the node's machines may be a block behind
+                await asyncio.sleep(node.timing.poll_interval)
+                continue
+            outages.failed(error, f"the chain can't be read on from block {follower.cursor}, trying again")
             await backoff.wait()
         else:
             outages.recovered(f"the chain can be read again, from block {follower.cursor}")
             backoff.reset()
+            lagging = 0
+
+
+async def _answers(node: Node) -> bool:
+    """Whether the node answers at all, so that what failed may only be one of its machines that is behind."""
+    try:
+        await node.block_number()
+    except NODE_ERRORS:
+        return False
+    return True
 
 
 async def retrying(
@@ -229,16 +643,20 @@ class _Follower:
         if replaced is not None:
             self.cursor = min(self.cursor, replaced.block_number + 1)
             yield replaced
-        self._history.forget_above(self.cursor - 1)
         if not self._history.blocks and 0 < self.cursor <= head.number + 1:
             for block in (await history_at(self._node, self.cursor - 1)).blocks:
                 self._history.remember(block)
+        told = time.monotonic()
         try:
             async with aclosing(self._ranges.read_to(self.cursor, head)) as blocks:
                 async for block in blocks:
                     if block.block_hash:
                         self._history.remember(block)
                     self.cursor = block.block_number + 1
+                    if head.number > block.block_number and time.monotonic() - told >= TELL_EVERY:
+                        told = time.monotonic()
+                        facts = log_event("chain-catching-up", block=block.block_number, head=head.number)
+                        log.info("catching up: read to block %d of %d", block.block_number, head.number, extra=facts)
                     yield BlockEvents(block.block_number, block.events)
         except ReplacedWhileReading:
             self.must_check_cursor = True  # the next call finds what was replaced
@@ -263,7 +681,7 @@ class _Follower:
                     return None
                 return Reorganisation(block.block_number, (), self._history.forget_above(block.block_number))
         if known:
-            raise ReorganisedTooDeep(known[0].block_number, head.number)
+            raise ChainWentBack(known[0].block_number, head.number, is_final=True)
         return None
 
     async def _is_on_chain(self, block: SeenBlock, head: BlockHeader) -> bool:

@@ -8,28 +8,27 @@ from functools import partial
 from itertools import compress
 from typing import TYPE_CHECKING, Final
 
+from mesh.chain._contracts import result_arguments
+from mesh.chain._node import getters
 from mesh.chain.answers import LIABILITY_GETTERS, liability_record
 from mesh.chain.errors import NoContracts, NotALiability, OrderAlreadyUsed, Reverted
-from mesh.chain.events import NewLiability, liability_created, xrt_minted
-from mesh.chain.following import retrying
-from mesh.chain.multicall import getters
-from mesh.chain.reader import list_created
+from mesh.chain.following import NewLiability, first_event, list_created, retrying, xrt_minted
 from mesh.errors import InvalidMessage
+from schemas.messages import cancellation_hash, message_hash, order_abi
 from schemas.signing import recover
-from schemas.wire import cancellation_hash, message_hash, order_abi
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from mesh.chain.abi import ContractCall
-    from mesh.chain.contracts import Contracts
-    from mesh.chain.node import Node
+    from mesh.chain._abi import ContractCall
+    from mesh.chain._contracts import Contracts
+    from mesh.chain._node import Node
     from mesh.chain.transactions import Receipt
     from schemas.messages import Demand, Offer, Order, Result
     from schemas.records import Liability
 
-READ_AT_ONCE: Final = 8
-"""How many records a listing asks the node for at the same time."""
+READ_AT_ONCE: Final = 60
+"""How many records a listing reads at a time, in ten calls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +63,6 @@ class RefundState:
     block_number: int
     refundable_from: int
     """The first block in which anybody may refund it, if it has not ended by then."""
-
     is_finalized: bool
 
     @property
@@ -77,19 +75,20 @@ class Liabilities:
     """Liabilities, and the orders that they are created from."""
 
     def __init__(self, contracts: Contracts) -> None:
-        self._contracts = contracts
+        self._contracts, self._node = contracts, contracts.node
+        self._names, self._version = contracts.names, contracts.version
 
     async def exists(self, address: str) -> bool:
         """Whether the factory created the contract at an address."""
-        return await self._contracts.version.is_liability(address)
+        return await self._version.is_liability(address)
 
     async def next_nonce(self, address: str | None = None) -> int:
         """The nonce that an account's next generation-5 order must have."""
-        return await self._contracts.version.nonce_of(await self._contracts.address_or_own(address))
+        return await self._version.nonce_of(await self._contracts.address_or_own(address))
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
         """Whether a generation-3 order of `signer` (address) was used or withdrawn; generation 5 uses nonces."""
-        return await self._contracts.version.is_order_used(order_hash, signer)
+        return await self._version.is_order_used(order_hash, signer)
 
     async def is_used(self, order: Order, *, order_hash: bytes, signer: str) -> bool:
         """Whether an order has become a liability, or was withdrawn on the chain."""
@@ -99,22 +98,22 @@ class Liabilities:
 
     async def get_with_orders(self, address: str) -> tuple[Liability, tuple[bytes, bytes]]:
         """The same as `get`, and the hashes of the demand and of the offer that it was created from."""
-        return await _read(self._contracts.node, await self._recognised(address))
+        return (await _read_all(self._node, [await self._recognised(address)]))[0]
 
     async def get_all_with_orders(self, addresses: Sequence[str]) -> list[tuple[Liability, tuple[bytes, bytes]]]:
         """The same for several liabilities, six or more of them in one call."""
         recognised = [await self._recognised(address) for address in addresses]
-        return await _read_all(self._contracts.node, recognised)
+        return await _read_all(self._node, recognised)
 
     async def find_all(self, addresses: Sequence[str]) -> dict[str, Liability]:
         """The records of those among these addresses that are liabilities, in few calls."""
-        found = list(compress(addresses, await self._contracts.version.are_liabilities(addresses)))
-        return {record.address: record for record, _ in await _read_all(self._contracts.node, found)}
+        found = list(compress(addresses, await self._version.are_liabilities(addresses)))
+        return {record.address: record for record, _ in await _read_all(self._node, found)}
 
     async def parties(self, addresses: Sequence[str]) -> list[tuple[str, str]]:
         """Promisee and promisor of each of these, which are known to be liabilities, in one call for fifty."""
         calls = [call for address in addresses for call in getters("Liability", address, ("promisee", "promisor"))]
-        found = await self._contracts.node.read_all(calls, block="latest")
+        found = await self._node.read_all(calls, block="latest")
         return list(zip(found[::2], found[1::2], strict=True))
 
     async def get(self, address: str) -> Liability:
@@ -126,17 +125,26 @@ class Liabilities:
     ) -> Sequence[Liability]:
         """The liabilities created since a block, in order; only those of a promisee, promisor, lighthouse if given."""
         wanted = {"promisee": promisee, "promisor": promisor}
-        filters = {getter: await self._contracts.names.address(whose) for getter, whose in wanted.items() if whose}
+        filters = {getter: await self._names.address(whose) for getter, whose in wanted.items() if whose}
         if lighthouse:
-            filters["lighthouse"] = await self._contracts.names.lighthouse(lighthouse)
-        events = await list_created(self._contracts.node, self._contracts.factory, from_block)
+            filters["lighthouse"] = await self._names.lighthouse(lighthouse)
+        events = await list_created(self._node, self._contracts.factory, from_block)
         made = [event.liability for event in events if isinstance(event, NewLiability)]
-        found = []
+        for address in made:
+            self._version.recognise(address)
+        found: list[Liability] = []
         for start in range(0, len(made), READ_AT_ONCE):
-            some = made[start : start + READ_AT_ONCE]
-            records = await asyncio.gather(*(self._matching(address, filters) for address in some))
-            found += [record for record in records if record is not None]
+            records = [record for record, _ in await self._read_existing(made[start : start + READ_AT_ONCE])]
+            found += [one for one in records if all(getattr(one, name) == whose for name, whose in filters.items())]
         return found
+
+    async def _read_existing(self, addresses: Sequence[str]) -> Sequence[tuple[Liability, tuple[bytes, bytes]]]:
+        """As `_read_all`, without those that a reorganisation has reverted."""
+        try:
+            return await _read_all(self._node, addresses)
+        except NoContracts:
+            some = [await self._read_existing([address]) for address in addresses] if len(addresses) > 1 else []
+            return [one for found in some for one in found]
 
     async def watch(self, address: str) -> Liability:
         """Wait until a liability has ended; its record then.
@@ -144,12 +152,12 @@ class Liabilities:
         The end needs `Timing.confirmations`. Outages of the node are survived, except at the start.
         Raises `NotALiability`, `NodeUnreachable`.
         """
-        address, node = await self._recognised(address), self._contracts.node
+        address = await self._recognised(address)
         while True:
-            record = await retrying(node, partial(self._ended, address))
+            record = await retrying(self._node, partial(self._ended, address))
             if record is not None:
                 return record
-            await asyncio.sleep(node.timing.poll_interval)
+            await asyncio.sleep(self._node.timing.poll_interval)
 
     async def create(self, lighthouse: str, demand: Demand, offer: Offer) -> Created:
         """Create a liability from two signed orders, as a provider of the lighthouse.
@@ -157,11 +165,11 @@ class Liabilities:
         Raises `InvalidMessage` for an unsigned order or one with a name that is not resolved.
         """
         for order in (demand, offer):
-            self._contracts.version.check_order(order)
+            self._version.check_order(order)
         functions = await self._contracts.lighthouse_contract(lighthouse)
         receipt = await self._contracts.send(functions.createLiability(order_abi(demand), order_abi(offer)))
-        made = liability_created(receipt.logs, factory=self._contracts.factory)
-        self._contracts.version.recognise(made.liability)
+        made = first_event(receipt.logs, NewLiability, emitter=self._contracts.factory)
+        self._version.recognise(made.liability)
         return Created(made.liability, receipt.tx, receipt.nonce, receipt.gas_used, receipt.wei)
 
     async def withdraw(self, order: Order) -> Receipt:
@@ -175,8 +183,11 @@ class Liabilities:
         signer, own = recover(digest, order.signature), self._contracts.own_address
         if signer != own:
             raise InvalidMessage("sender", f"the order is signed by {signer}, and this account is {own}")
+        factory = self._version.ours("withdrawal of orders")
         try:
-            return await self._contracts.send(self._contracts.version.withdrawal(order))
+            return await self._contracts.send(
+                factory.withdrawNonce(int(order.nonce)) if order.generation == 5 else factory.withdrawOrder(digest)
+            )
         except Reverted as error:
             match error.reason, *error.arguments:
                 case ("WrongNonce", int(given), int(following)) if given > following:
@@ -188,14 +199,18 @@ class Liabilities:
     async def finalize(self, lighthouse: str, result: Result, *others: Result) -> Settled:
         """Finalize a liability by its signed result, as a provider; `others` are the same, signed by more jurors."""
         functions = await self._contracts.lighthouse_contract(lighthouse)
-        return await self._settle(self._contracts.version.finalization(functions, result, *others))
+        return await self._settle(self._version.finalization(functions, result, *others))
 
     async def finalize_without_turn(self, result: Result, *others: Result) -> Settled:
         """Finalize a liability as `finalize` does, as any account, when no provider does; nothing is minted.
 
         Raises `NotOffered` for the original contracts, `Reverted` (`WrongSigner`, `AlreadyFinalized`, …).
         """
-        return await self._settle(self._contracts.version.finalization_without_turn(result, *others))
+        return await self._settle(
+            self._version.ours("finalization without a turn").finalize(
+                result.liability, *result_arguments(result, *others)
+            )
+        )
 
     async def validate(self, result: Result, *, agree: bool) -> Settled:
         """Finalize a generation-3 liability as the validator that it names.
@@ -203,7 +218,7 @@ class Liabilities:
         Without `agree` the promisee is paid back, as for a result without success. Raises `NotOffered` for that on the
         original contracts, which would pay the promisor.
         """
-        return await self._settle(self._contracts.version.validation(result, agree=agree))
+        return await self._settle(self._version.validation(result, agree=agree))
 
     async def cancel(
         self, liability: str, *, promisee_signature: str | bytes, promisor_signature: str | bytes
@@ -214,28 +229,62 @@ class Liabilities:
         digits. The promisee gets everything back. Raises `InvalidMessage` for an invalid signature, `NotALiability`,
         `NotOffered`, `Reverted` (`WrongSigner`, `AlreadyFinalized`).
         """
-        address = await self._contracts.names.address(liability)
+        address = await self._names.address(liability)
         signatures = [_signature_bytes(address, given) for given in (promisee_signature, promisor_signature)]
-        return await self._settle(self._contracts.version.cancellation(await self._recognised(address), *signatures))
+        return await self._settle(
+            self._version.ours("cancellation").cancel(await self._recognised(address), *signatures)
+        )
 
     async def refund_state(self, liability: str) -> RefundState:
         """Whether a liability can be refunded, and from which block on. Raises `NotALiability`, `NotOffered`."""
         address = await self._recognised(liability)
-        block = await self._contracts.node.block_number()
+        block = await self._node.block_number()
         return RefundState(
             liability=address,
             block_number=block,
-            refundable_from=await self._contracts.version.refundable_from(address),
+            refundable_from=await self.refundable_from(address),
             is_finalized=await self._is_finalized(address, block),
         )
 
     async def refundable_from(self, liability: str) -> int:
-        """The first block in which anybody may refund a liability, if it is not finalized by then."""
-        return await self._contracts.version.refundable_from(liability)
+        """The first block in which anybody may refund a liability, unless it is finalized. Raises `NotOffered`."""
+        self._version.ours("refund")
+        functions = self._node.contract("Liability", liability)
+        return int(await self._node.read(functions.refundableFrom()))
 
     async def refund(self, liability: str) -> Settled:
         """Pay back the promisee of a liability that was never finalized."""
-        return await self._settle(self._contracts.version.refund(liability))
+        return await self._settle(self._version.ours("refund").refund(liability))
+
+    async def owed(self, token: str, account: str | None = None) -> int:
+        """Units of a token that it refused to pay to an account (one's own by default).
+
+        The factory keeps them until they are claimed. XRT refuses nobody.
+        """
+        token = await self._names.address(token)
+        if token == self._contracts.xrt:
+            return 0
+        return await self._version.owed(token, await self._contracts.address_or_own(account))
+
+    async def owed_after(self, liability: Liability) -> int:
+        """Units of its token that whom a liability's end should have paid is owed now, by this one and others."""
+        if not liability.is_finalized or not liability.cost:
+            return 0
+        return await self.owed(liability.token, cost_receiver(liability))
+
+    async def claim(self, token: str, account: str | None = None, *, to: str | None = None) -> Receipt:
+        """Pay an account (one's own by default) all that it is owed in a token; anybody may.
+
+        `to` is another account that receives it, for a token that still refuses one's own. Raises `Reverted`
+        (`NothingOwed`, or as the token does), `NotOffered`, `ValueError` for `to` with another account.
+        """
+        token, factory = await self._names.address(token), self._version.ours("claims")
+        account = await self._contracts.address_or_own(account)
+        if to is None:
+            return await self._contracts.send(factory.claim(token, account))
+        if account != self._contracts.own_address:
+            raise ValueError("only an account itself can have what it is owed paid to another one")
+        return await self._contracts.send(factory.claimTo(token, await self._names.address(to)))
 
     async def _settle(self, call: ContractCall) -> Settled:
         receipt = await self._contracts.send(call)
@@ -243,41 +292,29 @@ class Liabilities:
         return Settled(receipt.tx, receipt.gas_used, receipt.wei, minted)
 
     async def _recognised(self, address: str) -> str:
-        address = await self._contracts.names.address(address)
+        address = await self._names.address(address)
         if not await self.exists(address):
             raise NotALiability(address)
         return address
 
-    async def _matching(self, address: str, filters: Mapping[str, str]) -> Liability | None:
-        """The record of a liability; None if it does not match the filters, or a reorganisation reverted it."""
-        self._contracts.version.recognise(address)
-        functions = self._contracts.node.contract("Liability", address)
-        try:
-            for getter, whose in filters.items():
-                if await self._contracts.node.read(functions[getter]()) != whose:
-                    return None
-            return (await _read(self._contracts.node, address))[0]
-        except NoContracts:
-            return None
-
     async def _ended(self, address: str) -> Liability | None:
         """The record of a liability if its end is confirmed."""
-        block = await self._contracts.node.block_number() - self._contracts.node.timing.confirmations + 1
+        block = await self._node.block_number() - self._node.timing.confirmations + 1
         try:
             if block < 0 or not await self._is_finalized(address, block):
                 return None
-            return (await _read(self._contracts.node, address, block=block))[0]
+            return (await _read_all(self._node, [address], block=block))[0][0]
         except NoContracts:  # not created yet in that block
             return None
 
     async def _is_finalized(self, address: str, block: int) -> bool:
-        functions = self._contracts.node.contract("Liability", address)
-        return bool(await self._contracts.node.read(functions.isFinalized(), block=block))
+        functions = self._node.contract("Liability", address)
+        return bool(await self._node.read(functions.isFinalized(), block=block))
 
 
-async def _read(node: Node, address: str, *, block: int | str = "latest") -> tuple[Liability, tuple[bytes, bytes]]:
-    """As `_read_all`, for one. Raises `NoContracts` for a block before its creation."""
-    return (await _read_all(node, [address], block=block))[0]
+def cost_receiver(liability: Liability) -> str:
+    """The address that a liability's end pays the cost to."""
+    return liability.promisor if liability.is_success else liability.promisee
 
 
 async def _read_all(

@@ -6,11 +6,8 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Mapping  # msgspec reads the annotations
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
-
-import msgspec
 
 from mesh.errors import AiraError
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge
@@ -41,74 +38,37 @@ class TransactionOutcome(StrEnum):
     """Another transaction was mined with its nonce."""
 
 
-class NodeStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """Transactions by outcome, the gas that they used and what it cost (wei), and how well the node answers.
-
-    `failures` are requests that no node answered in any attempt; `losses` is how often outages began.
-    """
-
-    transactions: Mapping[TransactionOutcome, int]
-    gas_used: int
-    wei: int
-    failures: int
-    losses: int
-
-
 class NodeMetrics:
-    """The counters of one node. Used by one event loop."""
+    """The counters of one node: transactions by outcome, their cost, and how well the node answers."""
 
     def __init__(self) -> None:
-        self._transactions = Counter(dict.fromkeys(TransactionOutcome, 0))
-        self._gas_used = 0
-        self._wei = 0
-        self._failures = 0
-        self._losses = 0
+        self.transactions = Counter(dict.fromkeys(TransactionOutcome, 0))
+        self.gas_used = 0
+        self.wei = 0
+        """What that gas has cost."""
+        self.failures = 0
+        """Requests that no node answered in any attempt."""
+        self.losses = 0
+        """How often outages began."""
         self._answers = True
 
-    def count(self, outcome: TransactionOutcome) -> None:
-        """Count the outcome of a transaction."""
-        self._transactions[outcome] += 1
-
-    def paid(self, *, gas_used: int, wei: int) -> None:
-        """Add the cost of a mined transaction."""
-        self._gas_used += gas_used
-        self._wei += wei
-
-    def answered(self) -> None:
-        """Note that the node answered."""
-        self._answers = True
-
-    def failed(self) -> None:
-        """Count a request that no attempt got answered."""
-        self._failures += 1
-        self._losses += self._answers
-        self._answers = False
-
-    def statistics(self) -> NodeStatistics:
-        """The counters now."""
-        return NodeStatistics(
-            transactions=dict(self._transactions),
-            gas_used=self._gas_used,
-            wei=self._wei,
-            failures=self._failures,
-            losses=self._losses,
-        )
+    def count(self, *, answered: bool) -> None:
+        """Count a request, which was answered in some attempt or in none."""
+        if not answered:
+            self.failures += 1
+            self.losses += self._answers
+        self._answers = answered
 
     def families(self) -> tuple[MetricFamily, ...]:
         """The counters in Prometheus terms."""
-        outcomes = {outcome.value: float(count) for outcome, count in self._transactions.items()}
+        outcomes = {outcome.value: float(count) for outcome, count in self.transactions.items()}
+        meaning = "Transactions of this account, by what became of them"
         return (
-            by_label(
-                "aira_transactions_total",
-                "counter",
-                "Transactions of this account, by what became of them",
-                "outcome",
-                outcomes,
-            ),
-            counter("aira_gas_used_total", "Gas that transactions on the chain have used", self._gas_used),
-            counter("aira_gas_spent_wei_total", "What that gas has cost, wei", self._wei),
-            counter("aira_node_failures_total", "Questions that no node of the chain answered", self._failures),
-            counter("aira_node_losses_total", "How often the nodes of the chain fell silent", self._losses),
+            by_label("aira_transactions_total", "counter", meaning, "outcome", outcomes),
+            counter("aira_gas_used_total", "Gas that transactions on the chain have used", self.gas_used),
+            counter("aira_gas_spent_wei_total", "What that gas has cost, wei", self.wei),
+            counter("aira_node_failures_total", "Questions that no node of the chain answered", self.failures),
+            counter("aira_node_losses_total", "How often the nodes of the chain fell silent", self.losses),
         )
 
 

@@ -14,7 +14,7 @@ COMMANDS: Final = {
     "chain": ("mesh.cli.chain:command", "run a development chain; deploy and inspect contracts"),
     "cid": ("mesh.cli.cid:command", "print the CIDv0 of files"),
     "completion": ("mesh.cli.completion:command", "print the completion script of a shell"),
-    "demand": ("mesh.cli.demand:command", "order a job and wait for its result"),
+    "demand": ("mesh.cli.demand:demand", "order a job and wait for its result"),
     "demo": ("mesh.cli.demo:command", "run one job from demand to payment in one process"),
     "doctor": ("mesh.cli.doctor:command", "find problems on this machine and suggest fixes"),
     "health": ("mesh.cli.health:command", "check a server's health (exit code)"),

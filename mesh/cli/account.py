@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from mesh.amounts import ETH, XRT
 from mesh.cli.chain_client import address_in_keyfile, open_chain, required_address
-from mesh.cli.errors import FileExists, FileUnwritable, InvalidOptions, InvalidPrivateKey, PasswordFileUnusable
 from mesh.cli.options import FILE, with_chain_settings, with_json
-from mesh.cli.output import print_facts, print_json, print_line
-from mesh.errors import AiraError
-from mesh.running import fail, run_to_end
+from mesh.cli.output import print_result
+from mesh.errors import ConfigurationError, InputError
+from mesh.role.running import run_to_end
+from schemas.decoding import InvalidData, first_line, text_of
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -39,10 +39,7 @@ def new(keyfile: Path, password_file: Path, as_json: bool) -> None:
     """Create an account and write its encrypted key to KEYFILE. Prints the address. Never overwrites a file."""
     from mesh.chain import new_private_key, write_keyfile
 
-    try:
-        address = write_keyfile(free_path(keyfile), new_private_key(), password_in(password_file))
-    except AiraError as error:
-        fail(error)
+    address = write_keyfile(free_path(keyfile), new_private_key(), password_in(password_file))
     print_account(address, keyfile, as_json)
 
 
@@ -58,68 +55,84 @@ def new(keyfile: Path, password_file: Path, as_json: bool) -> None:
 @click.option("--from-keyfile", type=FILE, help="another keyfile, from which to copy the key")
 @click.option("--from-password-file", type=FILE, help="file with the password of that keyfile [prompted for]")
 @with_json
-def import_account(keyfile: Path, password_file: Path, as_json: bool, **source: Any) -> None:
+def import_account(
+    keyfile: Path,
+    password_file: Path,
+    private_key_file: Path | None,
+    from_keyfile: Path | None,
+    from_password_file: Path | None,
+    as_json: bool,
+) -> None:
     """Write an existing key, encrypted, to KEYFILE. Prints the address. Never overwrites a file.
 
     The key comes from --private-key-file or from another keyfile. Without either, it is read from standard input; a
     terminal prompts for it without echo. It is never an argument, because every user of the machine can see those.
     """
-    try:
-        _check_no_key(keyfile)
-        address = _import(free_path(keyfile), password_file, **source)
-    except AiraError as error:
-        fail(error)
-    print_account(address, keyfile, as_json)
-
-
-def _import(
-    keyfile: Path,
-    password_file: Path,
-    *,
-    private_key_file: Path | None,
-    from_keyfile: Path | None,
-    from_password_file: Path | None,
-) -> str:
-    """Write the keyfile with the key from the given source; returns its address."""
     from mesh.chain import copy_keyfile, write_keyfile
 
-    if private_key_file is not None and from_keyfile is not None:
-        raise InvalidOptions("--private-key-file and --from-keyfile can't be used together")
-    if from_keyfile is None:
-        if from_password_file is not None:
-            raise InvalidOptions("--from-password-file needs --from-keyfile")
-        key = private_key_in(private_key_file)
-        return write_keyfile(keyfile, key, password_in(password_file))
-    opened_by, where = password_of(from_keyfile, from_password_file)
-    password = password_in(password_file)
-    return copy_keyfile(from_keyfile, keyfile, opened_by=opened_by, password=password, password_from=where)
-
-
-def _check_no_key(keyfile: Path) -> None:
-    """Raise `InvalidPrivateKey` if the file's name is a private key."""
     digits = keyfile.name.removeprefix("0x")
     if len(digits) == 64 and not digits.strip("0123456789abcdefABCDEF"):
-        raise InvalidPrivateKey(
+        raise InputError(
             "the keyfile's name looks like a private key",
             hint="your shell's history may contain this key now, so use a new one, and give it on standard input",
+            code="invalid-private-key",
         )
+    free_path(keyfile)
+    if private_key_file is not None and from_keyfile is not None:
+        raise InputError("--private-key-file and --from-keyfile can't be used together", code="invalid-options")
+    if from_keyfile is None:
+        if from_password_file is not None:
+            raise InputError("--from-password-file needs --from-keyfile", code="invalid-options")
+        key = private_key_in(private_key_file)
+        address = write_keyfile(keyfile, key, password_in(password_file))
+    else:
+        if from_password_file is not None:
+            opened_by, where = _first_line(from_password_file, what="password file"), str(from_password_file)
+        else:
+            opened_by, where = _asked(f"password of {from_keyfile}: "), "the answer"
+        password = password_in(password_file)
+        address = copy_keyfile(from_keyfile, keyfile, opened_by=opened_by, password=password, password_from=where)
+    print_account(address, keyfile, as_json)
 
 
 @command.command("show", short_help="show an account's address and balances")
 @click.argument("file", metavar="[KEYFILE]", required=False, type=FILE)
+@click.option("--password-file", type=FILE, help="file with KEYFILE's password, to check its address [the settings']")
 @click.option("--balance", is_flag=True, help="also show its ETH, its XRT and its next order nonce, from the chain")
 @with_json
 @with_chain_settings()
-def show(settings: Settings, file: Path | None, balance: bool, as_json: bool) -> None:
-    """Print the address of the account in KEYFILE (by default the keyfile in the settings). Needs no password."""
-    try:
-        address = required_address(settings) if file is None else address_in_keyfile(file)
-    except AiraError as error:
-        fail(error)
+def show(settings: Settings, file: Path | None, password_file: Path | None, balance: bool, as_json: bool) -> None:
+    """Print the address of the account in KEYFILE (by default the keyfile in the settings).
+
+    Without a password, that is what the file says; with one, the key is checked to have this address.
+    """
+    address = required_address(settings) if file is None else address_in_keyfile(file)
+    _check_address(settings, file or Path(settings.keyfile).expanduser(), password_file)
     if balance:
         run_to_end(lambda: _show_balance(settings, address, as_json))
     else:
         print_account(address, file or Path(settings.keyfile), as_json)
+
+
+def _check_address(settings: Settings, keyfile: Path, password_file: Path | None) -> None:
+    """Raise `KeyfileError` (`keyfile-address-wrong`) if a keyfile does not have the key of the address that it states.
+
+    The settings' password may be of another keyfile, or not readable here: then nothing is checked.
+    """
+    from mesh.base.extras import PackageMissing
+    from mesh.chain import Account, KeyfileError
+
+    configured = Path(settings.keyfile_password_file).expanduser()
+    if password_file is not None:
+        Account.from_keyfile(keyfile, password_file)
+    elif settings.keyfile_password_file and os.access(configured, os.R_OK):
+        try:
+            Account.from_keyfile(keyfile, configured)
+        except PackageMissing:
+            pass
+        except KeyfileError as error:
+            if error.code != "wrong-password":
+                raise
 
 
 async def _show_balance(settings: Settings, address: str, as_json: bool) -> None:
@@ -131,37 +144,28 @@ async def _show_balance(settings: Settings, address: str, as_json: bool) -> None
             nonce = await chain.liabilities.next_nonce(address)
         except NotOffered:
             nonce = None
-    if as_json:
-        print_json({"address": address, "wei": str(wei), "wn": str(wn), "nonce": nonce})
-    else:
-        facts: dict[str, Any] = {
-            "address": address,
-            "ETH": ETH.number(wei),
-            "XRT": XRT.number(wn),
-            "order nonce": nonce,
-        }
-        print_facts(facts)
+    result = {"address": address, "wei": str(wei), "wn": str(wn), "nonce": nonce}
+    facts = {"address": address, "ETH": ETH.number(wei), "XRT": XRT.number(wn), "order nonce": nonce}
+    print_result(result, facts, as_json=as_json)
 
 
 def print_account(address: str, keyfile: Path, as_json: bool) -> None:
     """Print an account's address, in JSON with its keyfile."""
-    if as_json:
-        print_json({"address": address, "keyfile": str(keyfile)})
-    else:
-        print_line(address)
-
-
-KEY_DIGITS = 64
+    print_result({"address": address, "keyfile": str(keyfile)}, address, as_json=as_json)
 
 
 def free_path(keyfile: Path) -> Path:
-    """Return the path after creating its folder. Raises `FileExists`, `FileUnwritable`."""
+    """Return the path after creating its folder. Raises `InputError`, `ConfigurationError`."""
     if keyfile.exists():
-        raise FileExists(f"{keyfile} already exists", hint="keyfiles are never overwritten; choose another name")
+        raise InputError(
+            f"{keyfile} already exists", hint="keyfiles are never overwritten; choose another name", code="file-exists"
+        )
     try:
         keyfile.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileUnwritable(f"can't create the folder of {keyfile}: {error.strerror}") from None
+        raise ConfigurationError(
+            f"can't create the folder of {keyfile}: {error.strerror}", code="file-unwritable"
+        ) from None
     return keyfile
 
 
@@ -175,17 +179,23 @@ def password_in(path: Path) -> str:
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
                 file.write(secrets.token_urlsafe(24) + "\n")
     except OSError as error:
-        raise PasswordFileUnusable(f"can't use the password file {path}: {error.strerror}") from None
+        raise ConfigurationError(
+            f"can't use the password file {path}: {error.strerror}", code="password-file-unusable"
+        ) from None
     password = _first_line(path, what="password file")
     if not password:
-        raise PasswordFileUnusable(f"the password file {path} is empty", hint="write the password to its first line")
+        raise ConfigurationError(
+            f"the password file {path} is empty",
+            hint="write the password to its first line",
+            code="password-file-unusable",
+        )
     return password
 
 
 def private_key_in(path: Path | None) -> bytes:
     """The private key in a file; without a file, from standard input or a terminal prompt without echo.
 
-    Raises `InvalidPrivateKey`, which never shows the text, and `PasswordFileUnusable` for a file that can't be read.
+    Raises `InputError`, which never shows the text, and `ConfigurationError` for a file that can't be read.
     """
     if path is None:
         text, where = _asked("private key: "), "the input"
@@ -196,19 +206,13 @@ def private_key_in(path: Path | None) -> bytes:
         key = bytes.fromhex(digits)
     except ValueError:  # its message would show a part of the key
         key = b""
-    if len(digits) != KEY_DIGITS or len(key) != KEY_DIGITS // 2:
-        raise InvalidPrivateKey(
+    if len(digits) != 64 or len(key) != 32:
+        raise InputError(
             f"{where} is not a private key",
             hint="a private key has 64 hexadecimal digits, with or without the prefix 0x",
+            code="invalid-private-key",
         )
     return key
-
-
-def password_of(keyfile: Path, path: Path | None) -> tuple[str, str]:
-    """The password of a keyfile, and its source: a file, standard input or a terminal."""
-    if path is not None:
-        return _first_line(path, what="password file"), str(path)
-    return _asked(f"password of {keyfile}: "), "the answer"
 
 
 def _asked(question: str) -> str:
@@ -216,20 +220,27 @@ def _asked(question: str) -> str:
     import getpass
 
     try:
-        line = getpass.getpass(question) if sys.stdin.isatty() else sys.stdin.readline()
-    except (EOFError, UnicodeDecodeError):
+        line = getpass.getpass(question) if sys.stdin.isatty() else text_of(first_line(sys.stdin.buffer.readline()))
+    except EOFError:
         line = ""
-    line = line.rstrip("\r\n")
     if not line:
-        raise InvalidPrivateKey(f"the {question.removesuffix(': ')} is empty", hint="enter one line on standard input")
+        raise InputError(
+            f"the {question.removesuffix(': ')} is empty",
+            hint="enter one line on standard input",
+            code="invalid-private-key",
+        )
     return line
 
 
 def _first_line(path: Path, *, what: str) -> str:
-    """The first line of a file. Raises `PasswordFileUnusable`, which shows no part of the file."""
+    """The first line of a file. Raises `ConfigurationError`, which shows no part of the file."""
     try:
-        return path.read_text(encoding="utf-8").split("\n", 1)[0].rstrip("\r")
+        return text_of(first_line(path.read_bytes()))
     except OSError as error:
-        raise PasswordFileUnusable(f"can't use the {what} {path}: {error.strerror}") from None
-    except UnicodeDecodeError:  # its message would show a part of the secret
-        raise PasswordFileUnusable(f"can't use the {what} {path}: it is not UTF-8 text") from None
+        raise ConfigurationError(
+            f"can't use the {what} {path}: {error.strerror}", code="password-file-unusable"
+        ) from None
+    except InvalidData as error:
+        raise ConfigurationError(
+            f"can't use the {what} {path}: {error}", hint=error.hint, code="password-file-unusable"
+        ) from None

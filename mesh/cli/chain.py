@@ -10,20 +10,20 @@ import click
 
 from mesh.amounts import ETH, XRT, Unit
 from mesh.cli.chain_client import READ_ATTEMPTS, open_chain, own_address
-from mesh.cli.errors import AlreadyDeployed
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.lighthouse import check_lighthouse
 from mesh.cli.options import with_chain_settings, with_json, with_lighthouse_options, with_signing_settings
-from mesh.cli.output import print_facts, print_json, print_line, printable
-from mesh.errors import ChainError
+from mesh.cli.output import print_line, print_result, printable
+from mesh.errors import ChainError, ConfigurationError
 
 if TYPE_CHECKING:
     from mesh.chain import Account, Chain, Deployment, Node
     from mesh.settings import Settings
 
 
-DEPLOYMENT_GAS: Final = 10_000_000
-"""Slightly more than a whole deployment uses. An account that can't pay for it is rejected at the start."""
+DEPLOYMENT_GAS: Final = 13_000_000
+"""Slightly more than a whole deployment uses where it costs most: 9.9 million today, a fifth more on geth's next fork.
+An account that can't pay for it is rejected at the start."""
 
 
 command = LazyGroup(
@@ -59,10 +59,12 @@ async def deploy_contracts(
     """Deploy the contracts: ENS registry and names, XRT, factory, and a first lighthouse.
 
     The settings' account pays the gas, owns the names and receives the first million XRT. Sends about twenty
-    transactions, one after another, and prints the settings that use the contracts.
+    transactions, one after another, and prints the settings that use the contracts. A deployment that was interrupted
+    is continued when the same is called again.
     """
     from mesh.chain import DeploymentPlan, deploy
-    from mesh.composition import chain_of, load_account
+    from mesh.chain.deploy import check_evm, interrupted_deployment
+    from mesh.role.composition import chain_of, load_account
 
     plan = DeploymentPlan(
         lighthouse=lighthouse,
@@ -74,9 +76,14 @@ async def deploy_contracts(
     account = await asyncio.to_thread(load_account, settings)
     node = chain_of(settings, account).node
     async with node:
-        if not again:
-            await _check_not_deployed(settings, node)
-        await _check_affordable(node, account)
+        await check_evm(node)
+        found = await interrupted_deployment(node, account.address, plan)
+        if found:  # what is left of it costs less
+            click.echo(f"continuing a deployment that was interrupted: {', '.join(found.values())}", err=True)
+        else:
+            if not again:
+                await _check_not_deployed(settings, node)
+            await _check_affordable(node, account)
         if not as_json:
             click.echo(f"deploying to the chain {node.chain_id} at {node.endpoint} with {account.address}:", err=True)
             click.echo("about twenty transactions, one after another", err=True)
@@ -86,13 +93,14 @@ async def deploy_contracts(
 
 async def _check_not_deployed(settings: Settings, node: Node) -> None:
     from mesh.chain import NoContracts
-    from mesh.composition import chain_of
+    from mesh.role.composition import chain_of
 
     try:
         async with chain_of(settings, None) as chain:
-            raise AlreadyDeployed(
+            raise ConfigurationError(
                 f"the chain {node.chain_id} already has the contracts (factory {chain.factory})",
                 hint="use them, or deploy a second set with --again; for another lighthouse: `aira lighthouse create`",
+                code="already-deployed",
             )
     except NoContracts:
         return
@@ -113,41 +121,35 @@ def _print_deployment(settings: Settings, deployment: Deployment, *, chain_id: i
         "ens_contract": deployment.ens,
         "lighthouse_contract": deployment.lighthouse_name,
     }
-    if as_json:
-        print_json(
-            {
-                "chainId": chain_id,
-                "ens": deployment.ens,
-                "resolver": deployment.resolver,
-                "xrt": deployment.xrt,
-                "factory": deployment.factory,
-                "lighthouse": deployment.lighthouse,
-                "lighthouseName": deployment.lighthouse_name,
-                "blockNumber": deployment.block_number,
-                "gasUsed": deployment.gas_used,
-                "settings": options,
-            }
-        )
-        return
-    print_facts(
-        {
-            "ENS registry": deployment.ens,
-            "resolver": deployment.resolver,
-            "XRT": deployment.xrt,
-            "factory": deployment.factory,
-            "lighthouse": f"{deployment.lighthouse}  {deployment.lighthouse_name}",
-            "block": f"{deployment.block_number:,}",
-            "gas used": f"{deployment.gas_used:,}",
-        }
-    )
-    print_line("\nsettings to use these contracts:\n")
-    for name, value in options.items():
-        print_line(f'{name} = "{value}"')
+    result = {
+        "chainId": chain_id,
+        "ens": deployment.ens,
+        "resolver": deployment.resolver,
+        "xrt": deployment.xrt,
+        "factory": deployment.factory,
+        "lighthouse": deployment.lighthouse,
+        "lighthouseName": deployment.lighthouse_name,
+        "blockNumber": deployment.block_number,
+        "gasUsed": deployment.gas_used,
+        "settings": options,
+    }
+    facts = {
+        "ENS registry": deployment.ens,
+        "resolver": deployment.resolver,
+        "XRT": deployment.xrt,
+        "factory": deployment.factory,
+        "lighthouse": f"{deployment.lighthouse}  {deployment.lighthouse_name}",
+        "block": f"{deployment.block_number:,}",
+        "gas used": f"{deployment.gas_used:,}",
+    }
+    print_result(result, facts, as_json=as_json)
+    if not as_json:
+        print_line("\nsettings to use these contracts:\n")
+        for name, value in options.items():
+            print_line(f'{name} = "{value}"')
 
 
 GWEI: Final = Unit("gwei", 9, "wei")
-
-
 CONTRACT_FACTS: Final = ("ens", "factory", "xrt", "isOurCode", "lighthouse", "lighthouseName", "wn")
 """The fields that are null in JSON if the chain has no contracts."""
 
@@ -160,7 +162,7 @@ async def status(settings: Settings, as_json: bool) -> None:
 
     The exit code is 1 if the chain has no contracts; everything else is still shown.
     """
-    from mesh.composition import chain_of
+    from mesh.role.composition import chain_of
 
     account = await asyncio.to_thread(own_address, settings)
     trouble: ChainError | None = None
@@ -171,16 +173,13 @@ async def status(settings: Settings, as_json: bool) -> None:
                 facts |= await _contract_facts(chain, settings.lighthouse_contract, account)
         except ChainError as error:
             trouble = error
-    if as_json:
-        print_json(facts)
-    else:
-        print_facts(_readable_status(facts))
+    print_result(facts, _readable_status(facts), as_json=as_json)
     if trouble is not None:
         raise trouble
 
 
 async def _node_facts(node: Node, account: str | None) -> dict[str, Any]:
-    block = await node.latest_header()
+    block = await node.heads.look()
     return {
         "node": node.endpoint,
         "client": printable(await node.client_version()),

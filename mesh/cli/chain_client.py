@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from mesh.amounts import Unit
-from mesh.cli.errors import AccountMissing, BalanceTooLow
 from mesh.cli.output import short_address
-from mesh.errors import ChainError
+from mesh.errors import ChainError, ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator
@@ -32,7 +31,7 @@ READ_ATTEMPTS: Final = 2
 @asynccontextmanager
 async def open_chain(settings: Settings) -> AsyncIterator[Chain]:
     """The chain of the settings, opened for reading. Raises `NodeUnreachable`, `NoContracts`."""
-    from mesh.composition import chain_of
+    from mesh.role.composition import chain_of
 
     async with chain_of(settings, None, attempts=READ_ATTEMPTS) as chain:
         yield chain
@@ -41,7 +40,7 @@ async def open_chain(settings: Settings) -> AsyncIterator[Chain]:
 @asynccontextmanager
 async def open_signing_chain(settings: Settings) -> AsyncIterator[Chain]:
     """The chain of the settings, opened with their account. Also raises `ConfigurationError` for the account."""
-    from mesh.composition import chain_of, load_account
+    from mesh.role.composition import chain_of, load_account
 
     account = await asyncio.to_thread(load_account, settings)
     async with chain_of(settings, account) as chain:
@@ -74,8 +73,10 @@ def required_address(settings: AccountSettings) -> str:
     """The address in the settings' keyfile. Raises `ConfigurationError` also if no keyfile is set."""
     address = own_address(settings)
     if address is None:
-        raise AccountMissing(
-            "no account: neither an address nor a keyfile is given", hint="give an address or --keyfile"
+        raise ConfigurationError(
+            "no account: neither an address nor a keyfile is given",
+            hint="give an address or --keyfile",
+            code="account-missing",
         )
     return address
 
@@ -86,9 +87,10 @@ def address_in_keyfile(keyfile: str | Path) -> str:
 
     address = keyfile_address(Path(keyfile).expanduser())
     if address is None:
-        raise AccountMissing(
+        raise ConfigurationError(
             f"{keyfile} does not contain its address",
             hint="the address is optional in keyfiles; use a keyfile with one",
+            code="account-missing",
         )
     return address
 
@@ -127,11 +129,12 @@ async def _unit_of(chain: Chain, token: str) -> Unit:
 
 
 async def check_balance(chain: Chain, unit: Unit, needed: int, *, token: str | None = None) -> None:
-    """Raise `BalanceTooLow` when the chain's account has less than `needed` of a token."""
+    """Raise `ChainError` when the chain's account has less than `needed` of a token."""
     assert chain.account is not None
     balance = await chain.tokens.balance(token=token)
     if balance < needed:
-        raise BalanceTooLow(
+        raise ChainError(
             f"{chain.account.address} has {unit.show(balance)}, but needs {unit.show(needed)}",
             hint="transfer more to the account, or use a smaller amount",
+            code="balance-too-low",
         )

@@ -1,46 +1,428 @@
-"""`aira demand`: publishes a demand and waits until its liability has ended."""
+"""`aira demand`: publishes a demand and waits until its liability has ended.
+
+Before it signs it says who judges, and what it does if an equal demand of the account is open or has become a contract.
+While it waits it prints the progress of the demand and its job, and losses of the router.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import json
 import shutil
-from contextlib import closing
-from dataclasses import replace
+import sys
+import threading
+from collections import Counter
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
 from mesh.agent.errors import OrderExpired
 from mesh.amounts import XRT
-from mesh.background import Background
-from mesh.cli.amounts import AmountText
+from mesh.base.background import Background
 from mesh.cli.chain_client import check_balance
-from mesh.cli.demand_validator import agreed_fee
-from mesh.cli.errors import InvalidOptions, JobNotDone, OutputFailed
-from mesh.cli.existing import take_existing
-from mesh.cli.files import file_or_cid, require_model, require_readable, require_writable
-from mesh.cli.options import ADDRESS, with_json, with_settings
+from mesh.cli.files import file_or_cid, model_named, require_writable
+from mesh.cli.options import ADDRESS, PATH, AmountText, with_json, with_settings
 from mesh.cli.order import withdraw_orders, withdrawal_lines
 from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress, wait_for_broken_pipe
-from mesh.cli.waiting import JobPrinter, print_connection_changes
-from mesh.errors import AiraError
-from mesh.settings import ChainSettings, NetworkSettings, options_of
+from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
+from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
 from schemas.address import ZERO_ADDRESS
+from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent, Contract, Order
+    from collections.abc import Callable, Iterator
+
+    from mesh import AnnouncedValidator
+    from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Contract, Progress
+    from mesh.agent.trade import Order
+    from mesh.agent.validators import ValidatorDirectory
+    from mesh.amounts import Unit
+    from mesh.chain import Chain
+    from mesh.network import Network
     from mesh.recording import Objective
     from mesh.settings import Settings
+
+
+A = TypeVar("A")
+
+STEP: Final = 10
+"""Percent of a playback after which another line is printed where there is no bar."""
 HELD_TIMEOUT: Final = 3.0
 """Seconds in which somebody on the mesh may say that it has the objective."""
+STOP_TIMEOUT: Final = 1.0
+"""Seconds that an interrupted command waits for the node, to say for how long the demand stays valid."""
+BEHIND: Final = 32
+"""Blocks that the agent has yet to read, above which the command says so."""
 SILENCE: Final = 5.0
 """Seconds without an offer and a decline after which the command says who is present."""
+CHOICES: Final = {
+    "wait": "wait for it",
+    "withdraw": "withdraw it, and post a new one",
+    "new": "post another one beside it",
+}
+
+
+async def take_existing(
+    agent: Agent, objective: str, existing: str | None, *, quiet: bool, lifetime: int | None = None, **terms: Any
+) -> Order | Contract | None:
+    """What to wait for instead of a new demand: the open one with these terms, or its contract. None: post a new one.
+
+    `existing` is the choice; without one, the user is asked. Raises `ConfigurationError` without a terminal.
+    """
+    demands, contract = await _equal(agent, objective, **terms)
+    if demands:  # perhaps one became a contract while nothing of the account ran
+        await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
+        demands, contract = await _equal(agent, objective, **terms)
+    if others := len(agent.orders()) - len(demands):
+        click.echo(f"this account also has {plural(others, 'other open order')}; see `aira order list`", err=True)
+    if not demands and contract is None:
+        return None
+    for order in demands:
+        click.echo(f"the equal demand {order.hash} is open until block {order.deadline:,}", err=True)
+    if contract is not None:
+        click.echo(f"an equal demand became the contract {contract.address}, which has not ended", err=True)
+    if existing is None and (quiet or not sys.stdin.isatty()):
+        choices = ", ".join(f"--existing {choice} ({meaning})" for choice, meaning in CHOICES.items())
+        raise ConfigurationError(
+            "an equal demand is open; a second one would be paid too", hint=f"choose: {choices}", code="demand-exists"
+        )
+    choice = existing
+    if choice is None:
+        click.echo("\n".join(f"  {word}: {meaning}" for word, meaning in CHOICES.items()), err=True)
+        choice = await answer_of(partial(click.prompt, "what now?", type=click.Choice(list(CHOICES)), err=True))
+    if choice == "wait":
+        return contract or demands[0]
+    for order in demands if choice == "withdraw" else ():
+        await order.withdraw()
+        click.echo(f"withdrew {order.hash}; a provider that is creating its contract now may still finish", err=True)
+    return None
+
+
+async def _equal(
+    agent: Agent, objective: str, *, cost: int, validator: str = "", validator_fee: int
+) -> tuple[list[Order], Contract | None]:
+    """The open demands with these terms, and the latest contract of one if it has not ended."""
+    from mesh.agent.orders import is_repeated
+    from schemas import Demand, decode
+
+    fields: dict[str, Any] = {"model": agent.model, "objective": objective, "cost": cost, "validator": validator}
+    wanted = await agent.runtime.trader.writer.terms(**fields, token="", lifetime=1)
+
+    def is_equal(message: object) -> bool:
+        return isinstance(message, Demand) and is_repeated(message, wanted, validator_fee=validator_fee)
+
+    contracts = await agent.parts.ledger.contracts("demand")
+    latest = next((address for payload, address in contracts if is_equal(decode(payload))), "")
+    demands = [order for order in agent.orders() if is_equal(order.message)]
+    liabilities = agent.parts.chain.liabilities
+    if not latest or not await liabilities.exists(latest) or (await liabilities.get(latest)).is_finalized:
+        return demands, None
+    return demands, await agent.contract(latest)
+
+
+class JobPrinter:
+    """Prints what happens to a demand and its job: lines, and a bar on a terminal; or, `as_json`, an object for each.
+
+    `unit` is that of the demand's token. Use it as `on_progress`, and `close` it at the end.
+    """
+
+    def __init__(self, unit: Unit, *, as_json: bool) -> None:
+        self._unit = unit
+        self.as_json = as_json
+        self.awaited = "the payment"
+        """What follows the robot's result."""
+        self._bar = ExitStack()
+        self._move: Callable[[int, int | None], None] | None = None
+        self._percent = -STEP
+        self._offers: set[str] = set()
+        self._declines: dict[str, str] = {}
+
+    def __call__(self, seen: Progress) -> None:
+        """Print what happened. What can't be printed because the reader has gone is lost."""
+        with suppress(BrokenPipeError):  # `wait_for_broken_pipe` ends the command
+            self._print(seen)
+
+    def _print(self, seen: Progress) -> None:
+        if seen.kind == "offer" and not seen.code:
+            self._offers.add(seen.agent)
+        if seen.kind == "declined":
+            self._declines[seen.agent] = seen.code
+        if self.as_json:
+            print_json(_json(seen))
+        elif seen.kind == "playing":
+            self._playing(seen)
+        elif words := self._words(seen):
+            self.close()
+            print_line(words)
+
+    def line(self, text: str, **facts: Any) -> None:
+        """Print a line for people or, as JSON, its facts, if it has any."""
+        if not self.as_json:
+            print_line(text)
+        elif facts:
+            print_json(facts)
+
+    def close(self) -> None:
+        """End the bar."""
+        self._bar.close()
+        self._move = None
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether no robot has offered or declined."""
+        return not self._offers and not self._declines
+
+    def summary(self) -> str:
+        """How many robots offered and declined, with the declines' codes."""
+        reasons = ", ".join(f"{count} {code}" for code, count in Counter(self._declines.values()).most_common())
+        declines = f"{plural(len(self._declines), 'robot')} declined" + (f" ({reasons})" if reasons else "")
+        return f"{plural(len(self._offers), 'robot')} offered, {declines}"
+
+    def _words(self, seen: Progress) -> str:
+        who, why = seen.agent, f"{printable(seen.detail)} ({printable(seen.code)})".lstrip()
+        match seen.kind:
+            case "offer":
+                return f"offer by {who}{self._difference(seen)}"
+            case "declined":
+                return f"declined by {who}: {why}"
+            case "rejected":
+                return f"provider {who} can't use the demand now: {why}"
+            case "contract":
+                return f"contract {seen.detail} with {who}"
+            case "ready":
+                return "the robot is ready"
+            case "gone" if seen.code == "unseen":
+                return (
+                    f"robot {who} can't be watched from here: it is on the legacy network and works there, or it is "
+                    "off; the contract holds the cost while it waits for it"
+                )
+            case "gone":
+                return f"robot {who} is gone; the contract holds the cost while it waits for it"
+            case "back":
+                return f"robot {who} is back"
+            case "result" if seen.code:
+                return "the robot has given up; waiting for the chain to return the cost"
+            case "result":
+                return f"the robot is done; waiting for {self.awaited}"
+            case "judged":
+                votes = f", {seen.position} of {seen.total} needed" if seen.total > 1 else ""
+                return f"juror {who} judged{votes}: {printable(seen.detail)}"
+            case "unjudged" if seen.code == "disagree":
+                return f"the jurors of {who} disagree: {seen.detail}"
+            case "unjudged":
+                return f"the validator {who} is silent: {seen.detail}"
+        return ""
+
+    def _difference(self, offer: Progress) -> str:
+        if not offer.code:
+            return ""
+        wants = self._unit.show(int(offer.detail)) if offer.code == "other-cost" else printable(offer.detail)
+        return f" for other terms: {offer.code.removeprefix('other-')} {wants}"
+
+    def _playing(self, seen: Progress) -> None:
+        percent = 100 * seen.position // max(seen.total, 1)
+        if sys.stderr.isatty():
+            if self._move is None:
+                self._move = self._bar.enter_context(progress("playing"))
+            self._move(seen.position, seen.total)
+        elif percent // STEP != self._percent // STEP:
+            self._percent = percent
+            print_line(f"playing: {percent} %, {seen.position:,} of {plural(seen.total, 'message')}")
+
+
+def _json(seen: Progress) -> dict[str, Any]:
+    facts: dict[str, Any] = {"kind": seen.kind, "agent": seen.agent}
+    if seen.kind == "playing":
+        return facts | {"position": seen.position, "total": seen.total}
+    if seen.kind in ("judged", "unjudged"):
+        facts |= {"votes": seen.position, "needed": seen.total}
+    return facts | {"code": seen.code, "detail": seen.detail}
+
+
+async def answer_of(ask: Callable[[], A]) -> A:
+    """What `ask` returns, which asks in the terminal, in a thread that does not keep an interrupted program alive."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[A] = loop.create_future()
+
+    def ask_there() -> None:
+        try:
+            given = ask()
+        except click.Abort:
+            loop.call_soon_threadsafe(answer.cancel)
+        else:
+            loop.call_soon_threadsafe(answer.set_result, given)
+
+    threading.Thread(target=ask_there, name="prompt", daemon=True).start()
+    return await answer
+
+
+async def print_connection_changes(network: Network, *, before: Callable[[], object] = lambda: None) -> None:
+    """Print to stderr when the router is unreachable, and when it is back, until cancelled; call `before` that."""
+    async for _ in network.changes():
+        before()
+        words = "connected to the router again" if network.connected else "lost the router; waiting for it"
+        click.echo(f"aira: {words}", err=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedTerms:
+    """What a validator announces, the fee that the demand offers, and when the cost can be returned without it."""
+
+    announced: AnnouncedValidator
+    fee: int
+    refund_delay: int | None
+    """Blocks from the contract's creation; None if the contracts offer no refund."""
+    block_time: float | None
+    """Seconds."""
+
+    @classmethod
+    async def of(
+        cls,
+        chain: Chain,
+        directory: ValidatorDirectory,
+        validator: str,
+        *,
+        lighthouse: str,
+        generation: int,
+        fee: int | None,
+    ) -> JudgedTerms:
+        """Those of a demand at `lighthouse` that names `validator` (addresses); without a `fee` (wn) what it announces.
+
+        Raises `UnsafeValidator` and its like, `ChainError`.
+        """
+        from mesh.agent.orders import MEASURED_BLOCKS
+        from mesh.agent.validators import check_named, refund_delay
+
+        await check_named(chain, validator, lighthouse=lighthouse, generation=generation)
+        announced, block_time = await directory.find(validator), None
+        with suppress(AiraError):  # then it is not known
+            block_time = await chain.node.heads.block_time(MEASURED_BLOCKS)
+        return cls(
+            announced=announced,
+            fee=announced.fee if fee is None else fee,
+            refund_delay=await refund_delay(chain),
+            block_time=block_time,
+        )
+
+    @property
+    def doubts(self) -> dict[str, str]:
+        """Why perhaps nobody will judge, by code."""
+        announced, doubts = self.announced, {}
+        if announced.is_silent:
+            doubts["silent"] = "nobody answers as this validator on the mesh, so perhaps nobody will judge"
+        elif not announced.has_quorum:
+            missing = (
+                f"only {len(announced.announcements)} of the {announced.quorum} jurors that must judge alike answer"
+            )
+            doubts["few-jurors"] = missing
+        if self.fee < announced.fee:
+            offered = f"the fee is {XRT.show(self.fee)}, but the validator wants {XRT.show(announced.fee)}"
+            doubts["low-fee"] = f"{offered}, so it may refuse the work"
+        return doubts
+
+    @property
+    def reasons(self) -> str:
+        """The doubts, for people."""
+        return "; ".join(self.doubts.values())
+
+    def lines(self) -> Iterator[str]:
+        """What it means, for people."""
+        found = self.announced
+        title = f"{printable(found.title)}, " if found.title else ""
+        yield f"validator {title}{found.address}"
+        if not found.is_silent:
+            online = f"{len(found.announcements)} of its {found.jurors} jurors are on the mesh"
+            judges = "it is on the mesh" if found.jurors == 1 else f"{online}, {found.quorum} must judge alike"
+            yield f"  {judges}; nobody is paid for the work before it has judged"
+            for policy in found.policies:
+                yield f"  judges by {policy.name}: {printable(policy.description)}"
+            if not found.is_unanimous:
+                yield "  its jurors judge by different policies"
+        low = " (what it wants is not known)" if found.is_silent else ""
+        yield f"  fee {XRT.show(self.fee)}{low}, on top of the cost, also if the work does not count"
+        yield f"  if it is silent: {self.refund}"
+
+    @property
+    def refund(self) -> str:
+        """What can be returned, and when, if nobody judges."""
+        if self.refund_delay is None:
+            return "the contracts offer no refund, so the cost stays in the contract"
+        about = f" (about {_rough(self.refund_delay * self.block_time)})" if self.block_time else ""
+        return (
+            f"cost and fee can be refunded {plural(self.refund_delay, 'block')}{about} after the contract was created"
+        )
+
+    def json(self) -> dict[str, Any]:
+        """The same for JSON; fees in wn."""
+        found = self.announced
+        return {
+            "validator": found.address,
+            "title": found.title,
+            "jurors": found.jurors,
+            "quorum": found.quorum,
+            "online": [one.juror for one in found.announcements],
+            "policies": [{"name": policy.name, "description": policy.description} for policy in found.policies],
+            "unanimous": found.is_unanimous,
+            "announcedFee": None if found.is_silent else str(found.fee),
+            "fee": str(self.fee),
+            "refundDelay": self.refund_delay,
+            "blockTime": self.block_time,
+            "doubts": self.doubts,
+        }
+
+
+def _rough(seconds: float) -> str:
+    """A time for people, in minutes, hours or days."""
+    for unit, length in (("day", 86_400), ("hour", 3600)):
+        if seconds >= 2 * length:
+            return plural(round(seconds / length), unit)
+    return plural(max(round(seconds / 60), 1), "minute")
+
+
+async def agreed_fee(
+    agent: Agent, cid: str, fee: int | None, *, confirmed: bool, as_json: bool, validator: str, **fields: Any
+) -> int:
+    """The validator's fee for a demand of the objective `cid`, in wn, once its maker knows what the validator means.
+
+    `fee` is what the maker offers, None for what is announced. Doubts whether somebody will judge must be `confirmed`,
+    or are asked about in a terminal. Raises `UnsafeValidator` and its like, and `RemoteError`.
+    """
+    if not validator:
+        return 0
+    runtime = agent.runtime
+    terms = await runtime.trader.writer.terms(model=agent.model, objective=cid, token="", validator=validator, **fields)
+    if terms["validator"] == ZERO_ADDRESS:
+        return 0
+    judged = await JudgedTerms.of(
+        agent.parts.chain,
+        runtime.validators,
+        terms["validator"],
+        lighthouse=terms["lighthouse"],
+        generation=agent.settings.generation,
+        fee=fee,
+    )
+    if as_json:
+        print_json({"kind": "validator"} | judged.json())
+    else:
+        for line in judged.lines():
+            print_line(line)
+    if judged.doubts:
+        can_ask = sys.stdin.isatty() and not as_json
+        if confirmed or can_ask:
+            click.echo(f"aira: {judged.reasons}", err=True)
+        ask = partial(click.confirm, "post the demand all the same?", err=True)
+        if not (confirmed or (can_ask and await answer_of(ask))):
+            hint = "`--yes` posts the demand all the same"
+            raise RemoteError(f"not posted: {judged.reasons}", hint=hint, code="validator-doubtful")
+    return judged.fee
 
 
 @click.command("demand")
-@click.option("--model", required=True, help="CID or ENS name of the model: the behaviour that you order")
+@click.option("--model", required=True, help="model, the behaviour that you order: its file, CID or ENS name")
 @click.option("--objective", required=True, help="objective to play: a file or a CID")
 @click.option(
     "--cost",
@@ -60,24 +442,34 @@ SILENCE: Final = 5.0
 )
 @click.option(
     "--existing",
-    type=click.Choice(["wait", "withdraw", "new"]),
+    type=click.Choice(list(CHOICES)),
     help="what to do if an equal demand is open: wait for it, withdraw it first, or post another [ask]",
 )
 @click.option("--yes", "confirmed", is_flag=True, help="post the demand even if perhaps nobody judges the work")
-@click.option("--out", type=click.Path(path_type=Path), help="file to copy the recording to")
+@click.option("--out", type=PATH, help="file to copy the recording to")
 @click.option(
     "--withdraw-on-exit", is_flag=True, help="withdraw the demand if the command is interrupted before the contract"
 )
 @with_json
 @with_settings(
-    *options_of(NetworkSettings),
+    NetworkSettings,
     "lighthouse_contract",
     "erc20_token",
-    "keyfile",
-    "keyfile_password_file",
-    *options_of(ChainSettings),
+    AccountSettings,
+    ChainSettings,
 )
-async def command(settings: Settings, **order: Any) -> None:
+async def demand(
+    settings: Settings,
+    *,
+    objective: str,
+    validator_fee: str | None,
+    out: Path | None,
+    as_json: bool,
+    confirmed: bool = False,
+    existing: str | None = None,
+    withdraw_on_exit: bool = False,
+    **terms: Any,
+) -> None:
     """Publish a demand and wait for the contract, the work and the payment. The objective is checked first, as `aira
     objective check` does. What happens is printed as it happens: offers, robots that decline and why, the contract, the
     playback, the result. The recording is kept in the account's store, so that `aira verify` and `aira objective show`
@@ -95,40 +487,30 @@ async def command(settings: Settings, **order: Any) -> None:
     an object for each thing that happens, with its `kind`, and one when the contract has ended; that has an `error` if
     the exit code is 1.
     """
-    await demand(settings, **order)
+    from mesh.agent.agent import Agent
 
-
-async def demand(
-    settings: Settings,
-    *,
-    objective: str,
-    validator_fee: str | None,
-    out: Path | None,
-    as_json: bool,
-    confirmed: bool = False,
-    existing: str | None = None,
-    withdraw_on_exit: bool = False,
-    **terms: Any,
-) -> None:
-    from mesh.agent import Agent
-
-    require_model(terms["model"])
+    model = await asyncio.to_thread(model_named, terms.pop("model"))
     settings.keyfile_and_password()
-    source = await asyncio.to_thread(_source, objective)
+    source = await asyncio.to_thread(file_or_cid, objective)
     fee = None if validator_fee is None else XRT.parse(validator_fee)
     if fee and not terms["validator"]:
-        raise InvalidOptions("--validator-fee needs --validator", hint="give --validator, or omit the fee")
+        raise InputError(
+            "--validator-fee needs --validator", hint="give --validator, or omit the fee", code="invalid-options"
+        )
     if out is not None:
         await asyncio.to_thread(require_writable, out)
     checked = await asyncio.to_thread(_check_objective, settings, source) if isinstance(source, Path) else None
     # A server with the same settings may run beside this and serve metrics at the same port.
-    async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
+    async with Agent(model.name, settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
         unit = await agent.parts.chain.tokens.unit(agent.settings.erc20_token)
         with closing(JobPrinter(unit, as_json=as_json)) as printer:
             changes = print_connection_changes(agent.parts.network, before=printer.close)
             tasks.start(changes, "network losses")
             tasks.start(wait_for_broken_pipe(), "readers of stdout")
+            tasks.start(_say_how_far_it_read(agent), "catching up")
             printer.line(f"demand by {agent.address} for {agent.model}")
+            if model.file is not None:  # for robots and pages that read its description
+                await agent.add(model.file)
             cid = source if isinstance(source, str) else await agent.add(source)
             terms["cost"] = unit.parse(terms["cost"])
             fee = await agreed_fee(agent, cid, fee, confirmed=confirmed, as_json=as_json, **terms)
@@ -144,12 +526,11 @@ async def demand(
 
 def _check_objective(settings: Settings, path: Path) -> Objective:
     """Check a file as robots do. Raises `ObjectiveUnfit`."""
+    from mesh.agent.objectives import ObjectiveUnfit
     from mesh.recording import Limits, preflight
-    from mesh.work.objectives import ObjectiveUnfit
 
-    limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
     with progress(f"checking {path.name}") as tell:
-        outcome = preflight(path, limits, progress=tell)
+        outcome = preflight(path, Limits.of(settings), progress=tell)
     if outcome.objective is None or not outcome.ok:
         raise ObjectiveUnfit(str(path), outcome.reason, printable(outcome.detail))
     return outcome.objective
@@ -179,7 +560,8 @@ async def _post(agent: Agent, cid: str, checked: Objective | None, printer: JobP
 
 async def _contract(agent: Agent, order: Order | Contract, printer: JobPrinter, *, withdraw_on_exit: bool) -> Contract:
     """Wait until an order is a contract. When that is interrupted, say what becomes of the order, or withdraw it."""
-    from mesh.agent import Contract, Order, Progress
+    from mesh.agent.contracts import Contract, Progress
+    from mesh.agent.trade import Order
 
     if isinstance(order, Contract):
         printer(Progress(kind="contract", agent=order.liability.promisor, detail=order.address))
@@ -196,7 +578,10 @@ async def _contract(agent: Agent, order: Order | Contract, printer: JobPrinter, 
             click.echo(await _stays(agent, order), err=True)
         raise
     except OrderExpired:
-        click.echo(printer.summary(), err=True)
+        if printer.is_silent:
+            click.echo(f"no robot offered or declined; {await _who_is_here(agent)}", err=True)
+        else:
+            click.echo(printer.summary(), err=True)
         raise
 
 
@@ -204,19 +589,47 @@ async def _say_who_is_present(agent: Agent, printer: JobPrinter) -> None:
     """If no robot offers or declines for a while, say who is there to do so."""
     await asyncio.sleep(SILENCE)
     if printer.is_silent:
-        present = {role: await agent.channel.present(role) for role in ("agent", "provider")}
-        agents = [key for key in present["agent"] if key.agent != agent.address.lower()]
-        who = f"{plural(len(agents), 'other agent')} and {plural(len(present['provider']), 'provider')} are present"
-        click.echo(f"no robot has offered or declined yet; {who} on {agent.channel.lighthouse}", err=True)
+        click.echo(f"no robot has offered or declined yet; {await _who_is_here(agent)}", err=True)
+
+
+async def _say_how_far_it_read(agent: Agent) -> None:
+    """While the agent reads the blocks since its last run, say so: it learns of the contract when it has read that."""
+    while True:
+        await asyncio.sleep(SILENCE)
+        read = agent.parts.chain_head.head
+        with suppress(AiraError):
+            if (head := await agent.parts.chain.block_number()) - read > BEHIND:
+                text = f"reading the chain: block {read:,} of {head:,}; the contract is seen when that is done"
+                click.echo(text, err=True)
+                continue
+        return
+
+
+async def _who_is_here(agent: Agent) -> str:
+    """How many robots of the demanded model are present, by what they say of themselves, and how many others."""
+    from mesh.watching import PROVIDER, present, statuses
+
+    peers, model = await present(agent.channel, "agent", PROVIDER), await agent.parts.chain.names.model(agent.model)
+    others = [peer for peer in peers if peer.role == "agent" and peer.address != agent.address]
+    stated = await statuses(agent.network.session, agent.channel, others)
+    models = [getattr(status, "model", None) for status in stated.values()]
+    robots = sum(one in (model, agent.model) for one in models)
+    providers = plural(sum(peer.role == PROVIDER for peer in peers), "provider")
+    where = agent.channel.lighthouse
+    if robots:
+        return f"{plural(robots, 'robot')} of this model and {providers} are present on {where}"
+    silent = f", {models.count(None)} of which do not say what they are" if None in models else ""
+    return f"no robot of this model is here: {plural(len(others), 'other agent')}{silent}, and {providers} on {where}"
 
 
 async def _stays(agent: Agent, order: Order) -> str:
     """Until when an order stays open, and how to withdraw it."""
     until = f"the demand stays valid until block {order.deadline:,}"
     try:
-        blocks = order.deadline - await agent.parts.chain.block_number()
-        seconds = blocks * (await agent.parts.chain.node.heads.block_time(blocks) or 0)
-    except AiraError:
+        async with asyncio.timeout(STOP_TIMEOUT):
+            blocks = order.deadline - await agent.parts.chain.block_number()
+            seconds = blocks * (await agent.parts.chain.node.heads.block_time(blocks) or 0)
+    except (AiraError, TimeoutError):
         seconds = 0
     about = f", for about {plural(round(seconds / 60) or 1, 'minute')}" if seconds > 0 else ""
     return f"{until}{about}; withdraw it with `aira order withdraw {order.hash[:16]}`"
@@ -233,14 +646,23 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
         raise
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
     if contract.liability.validator != ZERO_ADDRESS:
-        facts["reports"] = [json.loads(one.encode()) for one in outcome.reports]
+        facts["reports"] = [decode_json(one.encode()) for one in outcome.reports]
     printer.close()
     printer.line(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
     failure: AiraError | None = None
     if not outcome.success:
         why = f"{printable(outcome.reason)} ({outcome.code})" if outcome.reason else "nothing says why"
-        hint = _failure_hint(contract, outcome.result)
-        failure = JobNotDone(f"the job was not done: {why}; the cost was returned", hint=hint)
+        owed, money = 0, "the cost was returned"
+        hint = f"it ended without a result; see `aira liability show {contract.address}`"
+        if outcome.result:
+            hint = f"the recording shows more: `aira objective show {outcome.result}`"
+        with suppress(AiraError):  # then the node does not say
+            liabilities = agent.parts.chain.liabilities
+            owed = await liabilities.owed_after(await liabilities.get(contract.address))
+        if owed:
+            money = f"the token refused to return the cost, `aira liability claim {contract.address}` takes it"
+            facts["owed"] = str(owed)
+        failure = RemoteError(f"the job was not done: {why}; {money}", hint=hint, code="job-not-done")
         facts |= {"error": str(failure), "reason": outcome.reason, "code": outcome.code}
     try:
         facts["recording"] = None if not outcome.result else str(await _keep_recording(contract, out))
@@ -259,28 +681,17 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
         raise failure
 
 
-def _source(objective: str) -> str | Path:
-    """The file with that name if there is one, else the CID. Raises `NotAFileOrCid`, `FileUnreadable`."""
-    source = file_or_cid(objective)
-    return require_readable(source) if isinstance(source, Path) else source
-
-
-def _failure_hint(contract: Contract, result: str) -> str:
-    """Where to find the reason of a failure."""
-    if result:
-        return f"the recording shows more: `aira objective show {result}`"
-    return f"it ended without a result; see `aira liability show {contract.address}`"
-
-
 async def _keep_recording(contract: Contract, out: Path | None) -> Path:
-    """Where the recording is: in the account's store, or its copy. Raises `ContentError`, `OutputFailed`."""
+    """Where the recording is: in the account's store, or its copy. Raises `ContentError`, `AiraError`."""
     recording = await contract.recording()
     if out is None:
         return recording
     try:
         await asyncio.to_thread(shutil.copyfile, recording, out)
     except OSError as error:
-        raise OutputFailed(
-            f"can't write the recording to {out}: {error.strerror}", hint=f"the store has it: {recording}"
+        raise AiraError(
+            f"can't write the recording to {out}: {error.strerror}",
+            hint=f"the store has it: {recording}",
+            code="output-failed",
         ) from None
     return out

@@ -6,21 +6,17 @@ from pathlib import Path
 
 import click
 
-from mesh.cli.options import PORT
-from mesh.page import PAGE_PORT
-from mesh.running import INTERRUPTED, run_to_end
+from mesh.cli.options import FOLDER, PATH, PORT
+from mesh.dev.page import PAGE_PORT
+from mesh.role.running import INTERRUPTED, run_to_end
 
 
 @click.command("demo")
-@click.option("--objective", type=click.Path(path_type=Path), help="MCAP file or ROS 1 bag to play [three blinks]")
+@click.option("--objective", type=PATH, help="MCAP file or ROS 1 bag to play [three blinks]")
 @click.option(
     "--generation", type=click.Choice(["3", "5"]), default="3", help="generation of the messages and contracts [3]"
 )
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="folder in which to keep the objective and the recording",
-)
+@click.option("--out", type=FOLDER, help="folder in which to keep the objective and the recording")
 @click.option("--web", is_flag=True, help="serve the page of the market, and leave it open on the finished job")
 @click.option("--web-port", type=PORT, help=f"port of the page [{PAGE_PORT}, or a free one if it is taken]")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object per line; the last one is a summary")
@@ -34,12 +30,11 @@ def command(
     With --web the market stays open: the page shows the job, and orders more of the robot. Ctrl-C ends everything."""
     from tempfile import TemporaryDirectory
 
-    from mesh.extras import needs_extra
+    from mesh.base.extras import needs_extra
 
     with needs_extra("demo", "the demo"):
-        from mesh.demo.demo import Demo
-        from mesh.page import free_page_port, page_server
-    from mesh.demo.narration import JsonNarrator, TextNarrator
+        from mesh.dev.demo import Demo, JsonNarrator, TextNarrator
+        from mesh.dev.page import free_page_port, page_server
 
     port = None
     if web:

@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
+import os
+from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
-from mesh.background import Background
+from mesh.base.background import Background
 from mesh.cli.chain_client import own_address
-from mesh.cli.errors import FileExists, FileUnreadable, FileUnwritable, FolderMissing, NotAFileOrCid, NotAModel
 from mesh.cli.output import printable, progress, short_address
 from mesh.content import Exchange, Store
-from mesh.settings import NetworkSettings, options_of
+from mesh.errors import ConfigurationError, InputError
+from mesh.settings import NetworkSettings
 from schemas import InvalidCid, cid_of_file, parse_cid
 from schemas.address import is_ens_name
+from schemas.decoding import without_mark
+from schemas.model import MAX_MODEL_SIZE, is_description, parse_description, read_description
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterator
 
     from mesh.network import Network
     from mesh.settings import Settings
+    from schemas.model import ModelDescription
 
 STORE_SETTINGS: Final = ("data_dir", "keyfile")
 """The settings that locate the store."""
-FETCH_SETTINGS: Final = (*options_of(NetworkSettings), "fetch_timeout", *STORE_SETTINGS)
+FETCH_SETTINGS: Final = (NetworkSettings, "fetch_timeout", *STORE_SETTINGS)
 """The settings to find a file in the store or fetch it from the mesh."""
 NOTICE: Final = 0.5
 """Seconds after which a command says what it waits for."""
@@ -38,69 +42,114 @@ LARGEST_FILE: Final = 8 << 30
 
 
 def require_readable(path: Path) -> Path:
-    """Return the path if it is a file that can be read. Raises `FileUnreadable`."""
+    """Return the path if it is a file that can be read. Raises `InputError`."""
     try:
         if path.is_dir():
-            raise FileUnreadable(f"can't read {path}: it is a directory")
+            raise InputError(f"can't read {path}: it is a directory", code="file-unreadable")
         with path.open("rb"):
             return path
     except OSError as error:
-        raise FileUnreadable(f"can't read {path}: {error.strerror}") from None
+        raise InputError(f"can't read {path}: {error.strerror}", code="file-unreadable") from None
+
+
+def read_message(path: Path) -> bytes:
+    """The JSON in a file. Raises `InputError`, `InvalidData`."""
+    return without_mark(require_readable(path).read_bytes())
 
 
 def require_new_file(path: Path) -> Path:
     """Return the path if a new file can be created there: no file is overwritten. Raises `InputError`."""
     if path.exists():
-        raise FileExists(f"{path} already exists", hint="choose another name, or move the file")
+        raise InputError(f"{path} already exists", hint="choose another name, or move the file", code="file-exists")
     if not path.parent.is_dir():
-        raise FolderMissing(f"the directory {path.parent} does not exist", hint="create it first")
+        raise InputError(f"the directory {path.parent} does not exist", hint="create it first", code="folder-missing")
     return path
 
 
 def require_writable(path: Path) -> None:
-    """Check that a file can be written there. Leaves no file behind. Raises `FileUnwritable`."""
-    try:
+    """Check that a file can be written there. Leaves no file behind. Raises `ConfigurationError`."""
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         existed = path.exists()
-        with path.open("ab"):
-            pass
+        path.open("ab").close()
         if not existed:
             path.unlink()
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the `OSError` of a file that the system refuses to write into a `ConfigurationError`."""
+    try:
+        yield
     except OSError as error:
-        raise write_error(path, error) from None
+        raise ConfigurationError(f"can't write {path}: {error.strerror}", code="file-unwritable") from None
 
 
-def write_error(path: Path, error: OSError) -> FileUnwritable:
-    """The error for a file that the system refuses to write."""
-    return FileUnwritable(f"can't write {path}: {error.strerror}")
+def names_in(text: str) -> frozenset[str]:
+    """Names that are separated by commas, such as topics."""
+    return frozenset(name.strip() for name in text.split(",") if name.strip())
 
 
 def file_or_cid(text: str) -> Path | str:
-    """The path of the file with that name if there is one, else the CID. Raises `NotAFileOrCid`."""
+    """The path of the file or folder with that name if there is one, else the CID. Raises `InputError`."""
     path = Path(text)
     if path.exists():
-        return path
+        return path if path.is_dir() else require_readable(path)
     try:
         parse_cid(text)
     except InvalidCid:
-        raise NotAFileOrCid(
-            f"{text!r} is neither a file nor a CID", hint="give an existing file, or a CID of 46 characters (Qm…)"
+        raise InputError(
+            f"{text!r} is neither a file nor a CID",
+            hint="give an existing file, or a CID of 46 characters (Qm…)",
+            code="not-a-file-or-cid",
         ) from None
     return text
 
 
-def require_model(text: str) -> str:
-    """Return the text if it may be a model. Raises `NotAModel`."""
-    if is_ens_name(text):
-        return text
+class NamedModel(NamedTuple):
+    """What `--model` names: a model by its CID or its ENS name, and the file, if that was given and others read it."""
+
+    name: str
+    file: Path | None = None
+
+    def cid(self) -> str:
+        """The CID, for commands without a chain. Raises `InvalidCid`."""
+        parse_cid(self.name)
+        return self.name
+
+
+def model_named(text: str) -> NamedModel:
+    """The model with that file if there is one, else that CID or ENS name. Reads the file.
+
+    Raises `InputError`, and `InvalidDescription` for a file NAME.json that is no description.
+    """
+    path = Path(text)
+    if os.path.isfile(text):  # any text may be given; Path.is_file raises for some
+        description_of(require_readable(path))
+        is_read = path.stat().st_size <= MAX_MODEL_SIZE
+        return NamedModel(cid_of_file(path), path if is_read else None)
     try:
-        parse_cid(text)
+        if not is_ens_name(text):
+            parse_cid(text)
     except InvalidCid:
-        hint = "`aira cid FILE` prints the CID of a model's file"
-        if Path(text).is_file():
-            hint = f"`aira cid {text}` prints its CID: {cid_of_file(Path(text))}"
-        raise NotAModel(f"{printable(text[:60])!r} is neither the CID nor the ENS name of a model", hint=hint) from None
-    return text
+        said = f"{printable(text[:60])!r} is neither a file, nor the CID or the ENS name of a model"
+        raise InputError(
+            said, hint="give the model's file, or its CID of 46 characters (Qm…)", code="not-a-model"
+        ) from None
+    return NamedModel(text)
+
+
+def description_of(path: Path) -> ModelDescription | None:
+    """The description in a model's file, which NAME.json has to be. Raises `InvalidDescription`."""
+    with path.open("rb") as file:
+        data = file.read(MAX_MODEL_SIZE + 1)
+    return read_description(data) if path.suffix == ".json" or is_description(data) else None
+
+
+def required_description(path: Path) -> ModelDescription:
+    """The description of a model in a file, which has to be one. Raises `InputError`, `InvalidDescription`."""
+    with require_readable(path).open("rb") as file:
+        return parse_description(file.read(MAX_MODEL_SIZE + 1))
 
 
 def open_store(settings: Settings) -> Store:
@@ -129,8 +178,8 @@ async def fetch(settings: Settings, store: Store, cid: str, *, size_limit: int |
     If that takes more than a moment, says on stderr what it waits for, which peers it asks, and when it gives up.
     `size_limit` is in bytes. Raises `InvalidCid`, `NetworkUnavailable`, `ContentUnavailable` and other `ContentError`s.
     """
-    from mesh.composition import endpoints_of
     from mesh.network import Network
+    from mesh.role.composition import endpoints_of
 
     parse_cid(cid)
     held = await asyncio.to_thread(store.checked, cid)
@@ -152,22 +201,25 @@ async def fetch(settings: Settings, store: Store, cid: str, *, size_limit: int |
         connecting.cancel()
 
 
+async def file_of(settings: Settings, store: Store, named: str) -> Path:
+    """The file with that name if there is one, else that with the CID, as `fetch`. Raises `InputError`."""
+    found = file_or_cid(named)
+    return require_readable(found) if isinstance(found, Path) else await fetch(settings, store, found)
+
+
 async def _say_who_is_asked(settings: Settings, network: Network, cid: str) -> None:
-    """Say whom a file is asked of, and when that ends, unless it arrives at once."""
-    await asyncio.sleep(NOTICE)
-    patience = f"gives up after {settings.fetch_timeout:g} s without an answer"
-    click.echo(f"aira: {cid} is not in the store; asking {await _peers(settings, network)}; {patience}", err=True)
-
-
-async def _peers(settings: Settings, network: Network) -> str:
-    """Who is asked for a file: the agents and bridges that are present on the settings' lighthouse, and all others."""
+    """Say whom a file is asked of, and when that ends, unless it arrives at once: the agents and bridges that are
+    present on the settings' lighthouse, and all others."""
     from mesh.network import Channel
     from mesh.watching import present
 
+    await asyncio.sleep(NOTICE)
     name, timeout = settings.lighthouse_contract, settings.answer_timeout
     async with Channel(network.session, name, answer_timeout=timeout) as channel:
         peers = await present(channel, "agent", "bridge")
     named = ", ".join(f"{peer.role} {short_address(peer.address)}" for peer in peers[:PEERS_NAMED])
     more = f" and {len(peers) - PEERS_NAMED} more" if len(peers) > PEERS_NAMED else ""
-    who = f"{named}{more}" if peers else f"all peers (none is present on {settings.lighthouse_contract})"
-    return f"{who} through {', '.join(settings.connect)}"
+    who = f"{named}{more}" if peers else f"all peers (none is present on {name})"
+    patience = f"gives up after {settings.fetch_timeout:g} s without an answer"
+    asked = f"asking {who} through {', '.join(settings.connect)}"
+    click.echo(f"aira: {cid} is not in the store; {asked}; {patience}", err=True)

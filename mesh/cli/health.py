@@ -8,27 +8,21 @@ from urllib.parse import urlsplit
 
 import click
 
-from mesh.cli.errors import HealthUnavailable, InvalidServerAddress
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.options import with_json, with_settings, with_timeout
 from mesh.cli.output import print_facts, print_json, printable
-from mesh.errors import AiraError
-from mesh.running import fail
+from mesh.errors import ConfigurationError, RemoteError
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
-    from mesh.telemetry.health import Health
+    from mesh.telemetry.metrics import Health
 
 LOOPBACK_OF: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 """The address at which to reach a server that listens on all interfaces."""
-LARGEST_ANSWER: Final = 65_536
-"""The most bytes of an answer that are read."""
 
 
 @click.command("health")
 @click.option("--url", help="address of the server, http://HOST:PORT [the settings' metrics_listen]")
-@click.option(
-    "--timeout", type=click.FloatRange(min=0, min_open=True), default=8.0, show_default=True, help="seconds to wait"
-)
+@with_timeout(8.0)
 @with_json
 @with_settings("metrics_listen")
 def command(settings: Settings, url: str | None, timeout: float, as_json: bool) -> None:
@@ -37,11 +31,7 @@ def command(settings: Settings, url: str | None, timeout: float, as_json: bool) 
     The exit code is 0 if all parts are alive, and 1 if one is not or the server does not answer, as container health
     checks expect.
     """
-    try:
-        host, port = _server_address(url, settings)
-        health = _fetch_health(host, port, timeout=timeout)
-    except AiraError as error:
-        fail(error)
+    health = _fetch_health(*_server_address(url, settings), timeout=timeout)
     if as_json:
         print_json(health)
     else:
@@ -51,52 +41,52 @@ def command(settings: Settings, url: str | None, timeout: float, as_json: bool) 
 
 def _server_address(url: str | None, settings: Settings) -> tuple[str, int]:
     """Host and port of the server. Raises `ConfigurationError`."""
-    from mesh.telemetry.health import listen_address
+    from mesh.telemetry.metrics import listen_address
 
     if url is not None:
-        return _parse_url(url)
+        try:
+            parts = urlsplit(url)
+            if parts.scheme == "http" and parts.hostname and parts.port:
+                return parts.hostname, parts.port
+        except ValueError:
+            pass
+        raise ConfigurationError(
+            f"{url!r} is not a server address", hint="give --url http://HOST:PORT", code="invalid-server-address"
+        )
     if not settings.metrics_listen:
-        raise InvalidServerAddress(
+        raise ConfigurationError(
             "the address of the server is missing",
             hint="give --url http://HOST:PORT, or the same metrics_listen as the server",
+            code="invalid-server-address",
         )
     host, port = listen_address(settings.metrics_listen)
     return LOOPBACK_OF.get(host, host), port
 
 
-def _parse_url(url: str) -> tuple[str, int]:
-    try:
-        parts = urlsplit(url)
-        found = parts.hostname, parts.port
-    except ValueError:
-        parts, found = None, (None, None)
-    if parts is None or parts.scheme != "http" or not found[0] or not found[1]:
-        raise InvalidServerAddress(f"{url!r} is not a server address", hint="give --url http://HOST:PORT")
-    return found[0], found[1]
-
-
 def _fetch_health(host: str, port: int, *, timeout: float) -> Health:
-    """The server's answer. Raises `HealthUnavailable`."""
+    """The server's answer. Raises `RemoteError`."""
     from http.client import HTTPConnection, HTTPException
 
-    import msgspec
-
-    from mesh.telemetry.health import Health
+    from mesh.telemetry.metrics import Health
+    from schemas.decoding import InvalidData
 
     connection = HTTPConnection(host, port, timeout=timeout)
     where = f"{host}:{port}"
     try:
         connection.request("GET", "/health")
-        return Health.decode(connection.getresponse().read(LARGEST_ANSWER))
+        return Health.decode(connection.getresponse().read(65_536))
     except (OSError, HTTPException, UnicodeError) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise HealthUnavailable(
+        raise RemoteError(
             f"no server answers at {where}: {why}",
             hint="check that the server runs with --metrics-listen HOST:PORT",
+            code="health-unavailable",
         ) from None
-    except msgspec.MsgspecError:
-        raise HealthUnavailable(
-            f"the answer of the server at {where} is not a health report", hint="give the right --url"
+    except InvalidData:
+        raise RemoteError(
+            f"the answer of the server at {where} is not a health report",
+            hint="give the right --url",
+            code="health-unavailable",
         ) from None
     finally:
         connection.close()

@@ -7,20 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.errors import IdentityMissing, InvalidOptions
 from mesh.cli.options import FILE, FOLDER, with_json, with_settings
-from mesh.cli.output import print_facts, print_json, printable
-from mesh.errors import AiraError
-from mesh.identity.roster import ROLES
-from mesh.running import fail, report
-from mesh.settings import NetworkSettings, options_of
+from mesh.cli.output import print_result, printable
+from mesh.errors import AiraError, ConfigurationError, InputError
+from mesh.ops.identity.roster import ROLES
+from mesh.role.running import report
+from mesh.settings import NetworkSettings
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.identity.certificates import CertificateFacts
-    from mesh.identity.folders import SiteFolder
-    from mesh.identity.roster import Member
+    from mesh.ops.identity.certificates import CertificateFacts, SiteFolder
+    from mesh.ops.identity.roster import Member
     from mesh.settings import Settings
 
 DAYS = click.FloatRange(0, 36_500, min_open=True)
@@ -41,14 +39,13 @@ def command() -> None:
 @click.argument("folder", type=FOLDER)
 @click.option("--name", default="AIRA mesh site", show_default=True, help="the site's name")
 @click.option("--days", type=DAYS, default=3650, show_default=True, help="validity of its certificate, in days")
-def site(folder: Path, name: str, days: float) -> None:
+@with_json
+def site(folder: Path, name: str, days: float, as_json: bool) -> None:
     """Create the certificate and the key of a site in FOLDER. Anyone with the key can admit members."""
-    try:
-        authority = _site(folder)
-        authority.make(name=_text(name), days=days)
-    except AiraError as error:
-        fail(error)
-    print_facts({"certificate": authority.certificate, "key": authority.key})
+    authority = _site(folder)
+    authority.make(name=_text(name), days=days)
+    facts = {"certificate": str(authority.certificate), "key": str(authority.key)}
+    print_result(facts, facts, as_json=as_json)
 
 
 @command.command("new", short_help="create a member's certificate and key")
@@ -71,13 +68,10 @@ def new(folder: Path, site: Path, days: float, roster: Path | None, as_json: boo
 
     With --roster, add the entry to that file instead. Keys are never shown, and files never overwritten.
     """
-    try:
-        facts, member = _create_member(folder, _site(site), days, roster, **about)
-    except AiraError as error:
-        fail(error)
+    facts, member = _create_member(folder, _site(site), days, roster, **about)
     _print(facts, as_json)
     if roster is None and not as_json:
-        from mesh.identity import entry_of
+        from mesh.ops.identity import entry_of
 
         click.echo(f"\n# for the roster:\n{entry_of(member)}", nl=False)
 
@@ -88,11 +82,8 @@ def new(folder: Path, site: Path, days: float, roster: Path | None, as_json: boo
 @with_json
 def show(folder: Path, roster: Path | None, as_json: bool) -> None:
     """Print the name, address, roles, validity and fingerprint of the identity in FOLDER."""
-    try:
-        facts = _member(folder).facts()
-        standing = _roster_state(facts, roster) if roster is not None else None
-    except AiraError as error:
-        fail(error)
+    facts = _member(folder).facts()
+    standing = _roster_state(facts, roster) if roster is not None else None
     _print(facts, as_json, standing)
 
 
@@ -128,36 +119,35 @@ def renew(
         else:
             click.echo(f"{printable(facts.holder.name)} is valid for {facts.left.days} more days")
     if failed is not None:
-        fail(failed)
+        raise failed
 
 
 @command.command("check", short_help="check that the router admits this identity")
 @click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
 @click.option("--device", default="", help="for an edge agent: name of that device")
-@with_settings(*options_of(NetworkSettings))
-async def check(settings: Settings, agent: str, device: str) -> None:
+@with_json
+@with_settings(NetworkSettings)
+async def check(settings: Settings, agent: str, device: str, as_json: bool) -> None:
     """Connect with the settings' certificate, and check that the router accepts this identity's messages.
 
     A router drops denied messages without an error. The exit code is 1 if it does not admit this identity, or denies
     all its operations.
     """
-    address = _own_address(settings)
+    if not settings.tls_certificate:
+        hint = "give --tls-ca, --tls-certificate and --tls-key"
+        raise ConfigurationError("no certificate is set", hint=hint, code="identity-missing")
     if bool(agent) != bool(device):
-        raise InvalidOptions("--agent and --device must be given together")
-    from mesh.identity.routers import check_admission
+        raise InputError("--agent and --device must be given together", code="invalid-options")
     from mesh.network.endpoints import Endpoints
+    from mesh.ops.identity.certificates import holder_address
+    from mesh.ops.identity.routers import check_admission
+
+    address = holder_address(settings.tls_certificate)
 
     await check_admission(Endpoints.from_settings(settings), address, agent=agent, device=device)
-    click.echo(f"{', '.join(settings.connect)} admits {address} and forwards its messages")
-
-
-def _own_address(settings: Settings) -> str:
-    """The address in the settings' certificate."""
-    if not settings.tls_certificate:
-        raise IdentityMissing("no certificate is set", hint="give --tls-ca, --tls-certificate and --tls-key")
-    from mesh.identity.certificates import holder_address
-
-    return holder_address(settings.tls_certificate)
+    result = {"admitted": True, "address": address, "routers": list(settings.connect)}
+    shown = f"{', '.join(settings.connect)} admits {address} and forwards its messages"
+    print_result(result, shown, as_json=as_json)
 
 
 def _create_member(
@@ -165,13 +155,14 @@ def _create_member(
 ) -> tuple[CertificateFacts, Member]:
     from msgspec.structs import replace
 
-    from mesh.identity.certificates import Holder
-    from mesh.identity.folders import with_member, write_roster
-    from mesh.identity.roster import Member, entry_of, roster_from
+    from mesh.ops.identity.certificates import Holder, with_member, write_roster
+    from mesh.ops.identity.roster import Member, entry_of, roster_from
 
     if "router" in about["roles"] and not about["hosts"]:
-        raise InvalidOptions(
-            "a router needs --host", hint="clients verify the host name or IP address in its certificate"
+        raise InputError(
+            "a router needs --host",
+            hint="clients verify the host name or IP address in its certificate",
+            code="invalid-options",
         )
     name, agent, device = (_text(about[field]) for field in ("name", "agent", "device"))
     roles = tuple(dict.fromkeys(about["roles"]))
@@ -188,7 +179,7 @@ def _create_member(
 
 
 def _renew(folder: Path, site: SiteFolder, days: float, roster: Path | None) -> CertificateFacts:
-    from mesh.identity.folders import with_fingerprint, write_roster
+    from mesh.ops.identity.certificates import with_fingerprint, write_roster
 
     member = _member(folder)
     before: CertificateFacts = member.facts()
@@ -208,18 +199,20 @@ def _address(about: dict[str, Any]) -> str:
         from mesh.cli.chain_client import address_in_keyfile
 
         if about["address"] is not None:
-            raise InvalidOptions("--address and --keyfile can't be used together", hint="give one of them")
+            raise InputError(
+                "--address and --keyfile can't be used together", hint="give one of them", code="invalid-options"
+            )
         return address_in_keyfile(about["keyfile"])
     if about["address"] is not None:
         return str(about["address"])
     if set(about["roles"]) == {"router"}:
         return "0x" + secrets.token_hex(20)  # a router has no account, but its name must be unique
-    raise InvalidOptions("the address is missing", hint="give the account's --address or --keyfile")
+    raise InputError("the address is missing", hint="give the account's --address or --keyfile", code="invalid-options")
 
 
 def _roster_state(facts: CertificateFacts, path: Path) -> str:
     """The state of the certificate's holder in the roster."""
-    from mesh.identity import read_roster
+    from mesh.ops.identity import read_roster
 
     member = read_roster(path).find(facts.holder.address)
     if member is None:
@@ -232,50 +225,44 @@ def _roster_state(facts: CertificateFacts, path: Path) -> str:
 
 
 def _print(facts: CertificateFacts, as_json: bool, standing: str | None = None) -> None:
-    left = facts.left
-    expired = left.total_seconds() <= 0
-    if as_json:
-        print_json(
-            {
-                "name": facts.holder.name,
-                "address": facts.holder.address,
-                "roles": facts.holder.roles,
-                "hosts": facts.holder.hosts,
-                "validFrom": facts.since.isoformat(),
-                "validUntil": facts.until.isoformat(),
-                "expired": expired,
-                "fingerprint": facts.fingerprint,
-                "roster": standing,
-            }
-        )
-        return
-    print_facts(
-        {
-            "name": printable(facts.holder.name),
-            "address": facts.holder.address,
-            "roles": printable(", ".join(facts.holder.roles)),
-            "hosts": printable(", ".join(facts.holder.hosts)) or None,
-            "valid from": facts.since.isoformat(" "),
-            "valid until": f"{facts.until.isoformat(' ')} ({'expired' if expired else f'{left.days} days left'})",
-            "fingerprint": facts.fingerprint,
-            "roster": standing,
-        }
-    )
+    holder, expired = facts.holder, facts.left.total_seconds() <= 0
+    result = {
+        "name": holder.name,
+        "address": holder.address,
+        "roles": holder.roles,
+        "hosts": holder.hosts,
+        "validFrom": facts.since.isoformat(),
+        "validUntil": facts.until.isoformat(),
+        "expired": expired,
+        "fingerprint": facts.fingerprint,
+        "roster": standing,
+    }
+    shown = {
+        "name": printable(holder.name),
+        "address": holder.address,
+        "roles": printable(", ".join(holder.roles)),
+        "hosts": printable(", ".join(holder.hosts)) or None,
+        "valid from": facts.since.isoformat(" "),
+        "valid until": f"{facts.until.isoformat(' ')} ({'expired' if expired else f'{facts.left.days} days left'})",
+        "fingerprint": facts.fingerprint,
+        "roster": standing,
+    }
+    print_result(result, shown, as_json=as_json)
 
 
 def _text(text: str) -> str:
     if not text.isprintable() or len(text) > 64:
-        raise InvalidOptions("a name is at most 64 printable characters")
+        raise InputError("a name is at most 64 printable characters", code="invalid-options")
     return text
 
 
 def _site(folder: Path) -> SiteFolder:
-    from mesh.identity.folders import SiteFolder
+    from mesh.ops.identity.certificates import SiteFolder
 
     return SiteFolder(folder)
 
 
 def _member(folder: Path) -> Any:
-    from mesh.identity.folders import MemberFolder
+    from mesh.ops.identity.certificates import MemberFolder
 
     return MemberFolder(folder)

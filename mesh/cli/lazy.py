@@ -6,6 +6,7 @@ Installed packages add commands by entry points of the group `aira.commands`: th
 
 from __future__ import annotations
 
+import os
 import sys
 from functools import cached_property
 from importlib import import_module
@@ -13,32 +14,21 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import click
 
-from mesh.errors import AiraError, ConfigurationError
-from mesh.extras import PackageMissing
-from mesh.running import INTERRUPTED, fail
-from mesh.suggestions import nearest
+from mesh.base.extras import PackageMissing
+from mesh.base.suggestions import nearest
+from mesh.errors import AiraError, ConfigurationError, InputError
+from mesh.role.running import INTERRUPTED, fail
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from mesh.plugins import EntryPoint
+    from mesh.base.plugins import EntryPoint
 
 ENTRY_POINTS: Final = "aira.commands"
 HELP_WIDTH: Final = 100
 """Most characters of the short help of an installed command."""
-
-
-class BrokenCommand(ConfigurationError, code="command-broken"):
-    """A command that an installed package registers can't be imported."""
-
-    def __init__(self, name: str, entry: EntryPoint, error: Exception) -> None:
-        package = entry.package
-        super().__init__(
-            f"can't load the command {name!r} of {package}: {type(error).__name__}: {error}",
-            hint=f"reinstall or uninstall {package}; other commands still work",
-        )
-        self.name = name
-        self.package = package
+LONGEST_NAME: Final = 200
+"""Characters of a file's name in an error."""
 
 
 class LazyGroup(click.Group):
@@ -65,7 +55,7 @@ class LazyGroup(click.Group):
         """The installed commands of this group. Reading them takes a few ms, so this happens only when needed."""
         if self._prefix is None:
             return {}
-        from mesh.plugins import entry_points
+        from mesh.base.plugins import entry_points
 
         found = {
             name.removeprefix(self._prefix): entry
@@ -107,6 +97,13 @@ class LazyGroup(click.Group):
             _fail_usage(error)
         except AiraError as error:
             fail(error)
+        except OSError as error:
+            if error.filename is None:
+                raise
+
+            name = os.fsdecode(error.filename)
+            shown = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
+            fail(InputError(f"can't use {shown}: {error.strerror}", code="file-unusable"))
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
@@ -124,7 +121,7 @@ class LazyGroup(click.Group):
                 formatter.write_dl(rows)
 
     def _command(self, name: str) -> click.Command | None:
-        """The command of that name. Raises `BrokenCommand`, `PackageMissing`."""
+        """The command of that name. Raises `ConfigurationError`, such as `PackageMissing`."""
         if name in self.commands:
             return self.commands[name]
         if name in self._lazy:
@@ -141,7 +138,11 @@ class LazyGroup(click.Group):
         except PackageMissing:
             raise
         except Exception as error:  # whatever the import of another package raises
-            raise BrokenCommand(name, entry, error) from error
+            raise ConfigurationError(
+                f"can't load the command {name!r} of {entry.package}: {type(error).__name__}: {error}",
+                hint=f"reinstall or uninstall {entry.package}; other commands still work",
+                code="command-broken",
+            ) from error
         return loaded
 
     def _help_of(self, name: str) -> str:
@@ -149,7 +150,7 @@ class LazyGroup(click.Group):
             return self._lazy[name][1]
         try:
             command = self._command(name)
-        except (BrokenCommand, PackageMissing) as error:
+        except ConfigurationError as error:
             return str(error)
         assert command is not None
         return command.get_short_help_str(HELP_WIDTH)
@@ -159,9 +160,8 @@ def _fail_usage(error: click.UsageError) -> NoReturn:
     """Exit with 2 after one line that says what is wrong, and where to read on."""
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         raise error  # it shows the help
-    from mesh.cli.errors import InvalidUsage
 
     message = " ".join(error.format_message().split()).removesuffix(".")
     path = error.ctx.command_path if error.ctx else "aira"
     message = message[:1].lower() + message[1:] if message[1:2].islower() else message
-    fail(InvalidUsage(message, hint=f"`{path} --help` shows what it takes"))
+    fail(InputError(message, hint=f"`{path} --help` shows what it takes", code="invalid-usage"))

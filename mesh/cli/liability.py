@@ -1,38 +1,63 @@
-"""`aira liability`: lists and shows liabilities."""
+"""`aira liability`: lists, shows, follows, cancels and claims what liabilities hold."""
 
 from __future__ import annotations
 
 import asyncio
-import json
+import logging
+from contextlib import aclosing
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from mesh.amounts import XRT, Unit
-from mesh.cli.chain_client import account_of, open_chain, own_address, units_of
+from mesh.base.background import Background
+from mesh.base.outage_log import OutageLog
+from mesh.chain.errors import Reverted
+from mesh.chain.liabilities import cost_receiver
+from mesh.cli.chain_client import account_of, notice_when_slow, open_chain, open_signing_chain, own_address, units_of
 from mesh.cli.files import FETCH_SETTINGS, fetch, opened_store
 from mesh.cli.lazy import LazyGroup
-from mesh.cli.options import ADDRESS, with_chain_settings, with_json, with_settings
-from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, printable, short_address
-from mesh.cli.verdicts import CONNECT_TIMEOUT, reports_json, reports_on, verdict_facts
-from mesh.errors import AiraError
-from mesh.settings import ChainSettings, options_of
+from mesh.cli.options import (
+    ADDRESS,
+    with_chain_settings,
+    with_first_block,
+    with_json,
+    with_settings,
+    with_signing_settings,
+)
+from mesh.cli.output import (
+    plural,
+    print_facts,
+    print_json,
+    print_line,
+    print_result,
+    print_table,
+    printable,
+    short_address,
+)
+from mesh.cli.verify import CONNECT_TIMEOUT, print_verdicts, reports_json, reports_on, verdict_facts
+from mesh.errors import AiraError, ChainError, InputError, InvalidMessage
+from mesh.settings import ChainSettings, NetworkSettings
 from schemas.address import ZERO_ADDRESS
+from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from mesh.chain import Chain, RefundState
+    from mesh.agent.jobs import Reason
+    from mesh.chain import BlockEvents, Chain, RefundState, Settled
+    from mesh.chain.transactions import Receipt
     from mesh.settings import Settings
-    from mesh.work.notes import Reason
     from schemas.records import Liability
     from schemas.verdicts import ValidatorReport
 
 
+log = logging.getLogger(__name__)
+
 FETCH_TIMEOUT: Final = 10.0
 """Seconds without a block of that recording after which it is given up."""
-HEAD = ("LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR")
 
 
 command = LazyGroup(
@@ -40,10 +65,6 @@ command = LazyGroup(
     help="""Liabilities: the contracts that hold the cost of a job until it is finalized.
 
     The promisee orders the work and pays; the promisor does it.""",
-    lazy={
-        "cancel": ("mesh.cli.liability_cancel:cancel", "cancel one by agreement, or refund it after the delay"),
-        "watch": ("mesh.cli.liability_watch:watch", "follow one until it ends, or all of them"),
-    },
 )
 
 
@@ -57,13 +78,7 @@ command = LazyGroup(
     show_default=True,
     help="list only open liabilities, or only finalized ones",
 )
-@click.option(
-    "--from-block",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="list only liabilities created at this block or later",
-)
+@with_first_block("list only liabilities created at this block or later")
 @with_json
 @with_chain_settings()
 async def list_liabilities(
@@ -76,9 +91,8 @@ async def list_liabilities(
     """
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
-        whose = (
-            None if all_accounts or (account is None and own is None) else await account_of(chain, settings, account)
-        )
+        is_any = all_accounts or (account is None and own is None)
+        whose = None if is_any else await account_of(chain, settings, account)
         found = await _liabilities_of(chain, whose, from_block)
         if state != "any":
             found = [liability for liability in found if liability.is_finalized == (state == "finalized")]
@@ -89,17 +103,11 @@ async def list_liabilities(
     if not found:
         print_line(f"no {'' if state == 'any' else state + ' '}liabilities" + (f" of {whose}" if whose else ""))
         return
-    rows = [
-        (
-            liability.address,
-            state_of(liability),
-            units[liability.token].show(liability.cost),
-            short_address(liability.promisee, own=own),
-            short_address(liability.promisor, own=own),
-        )
-        for liability in found
-    ]
-    print_table(HEAD, rows, numbers=("COST",))
+    rows = []
+    for one in found:
+        parties = short_address(one.promisee, own=own), short_address(one.promisor, own=own)
+        rows.append((one.address, state_of(one), units[one.token].show(one.cost), *parties))
+    print_table(("LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR"), rows, numbers=("COST",))
 
 
 async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> Sequence[Liability]:
@@ -114,9 +122,11 @@ async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> S
 @command.command("show", short_help="show the parties, terms, cost and state of one")
 @click.argument("address", type=ADDRESS)
 @with_json
-@with_settings(*dict.fromkeys((*FETCH_SETTINGS, "lighthouse_contract", *options_of(ChainSettings))))
+@with_settings(*FETCH_SETTINGS, "lighthouse_contract", ChainSettings)
 async def show(settings: Settings, address: str, as_json: bool) -> None:
     """Show the liability at ADDRESS: its parties, terms, cost and state, and from which block it can be refunded.
+
+    If the token refused to pay the cost at the end, show what is owed now, and to whom.
 
     Of a job that failed, show also why, as its recording says; that is fetched if the store does not have it. If it
     names a validator, show how its jurors have judged, as those say that are on the mesh.
@@ -131,27 +141,30 @@ async def print_liability(
 ) -> None:
     """Print all facts about a liability; of a failed job also why it failed, and how its validator judged."""
     refund = await refund_state(chain, liability)
+    owed = await chain.liabilities.owed_after(liability)
     reports = await reports_on(settings, chain, liability)
     failure = await _failure(settings, liability.result, reports or ()) if state_of(liability) == "failed" else None
     if as_json:
         facts = liability_json(liability) | {"refundableFrom": None if refund is None else refund.refundable_from}
+        facts |= {"owed": str(owed)} if owed else {}
         facts |= {} if liability.validator == ZERO_ADDRESS else {"reports": reports_json(reports)}
         print_json(facts if failure is None else facts | {"reason": failure.text, "code": failure.code})
         return
     units = await units_of(chain, [liability])
     words = None if refund is None else refund_words(refund)
     described = describe_liability(liability, units[liability.token], own=own, refundable=words)
+    if owed:
+        described["owed"] = owed_words(liability, units[liability.token], owed)
     if failure is not None:
-        described["reason"] = (
-            f"{printable(failure.text)} ({failure.code})" if failure.text else "the recording has none"
-        )
+        text = f"{printable(failure.text)} ({failure.code})"
+        described["reason"] = text if failure.text else "the recording has none"
     print_facts(described | verdict_facts(reports or ()))
 
 
 async def _failure(settings: Settings, result: str, reports: Sequence[ValidatorReport]) -> Reason:
     """Why a job failed, as its validator or its recording says."""
-    from mesh.agent.judged_contract import refusal
-    from mesh.work.notes import Reason, read_reason
+    from mesh.agent.contracts import refusal
+    from mesh.agent.jobs import Reason, read_reason
 
     if (refused := refusal(reports)) is not None:
         return Reason(*refused)
@@ -186,6 +199,12 @@ def refund_words(refund: RefundState) -> str:
     return f"possible from block {refund.refundable_from:,}, in {plural(blocks, 'block')}"
 
 
+def owed_words(liability: Liability, unit: Unit, owed: int) -> str:
+    """What is owed to whom because the token refused to pay it, and how to take it, for people."""
+    command = f"aira liability claim {liability.address}"
+    return f"{unit.show(owed)} to {cost_receiver(liability)}, whom the token refused to pay: `{command}`"
+
+
 OUTCOMES: Final[Mapping[str, str]] = {
     "open": "open: the contract holds the cost",
     "paid": "paid: the job was done, and the promisor was paid",
@@ -206,7 +225,7 @@ def state_of(liability: Liability) -> str:
 
 def liability_json(liability: Liability) -> dict[str, Any]:
     """A liability for JSON: its record as it is on the wire, and its state."""
-    record: dict[str, Any] = json.loads(liability.encode())
+    record: dict[str, Any] = decode_json(liability.encode())
     return record | {"state": state_of(liability)}
 
 
@@ -230,3 +249,267 @@ def describe_liability(
         "validator": f"{liability.validator}  for {fee}" if is_judged else "none",
         "refund": refundable,
     }
+
+
+@command.command("cancel", short_help="cancel one by agreement, or refund it after the delay")
+@click.argument("address", type=ADDRESS)
+@click.option("--signature", "signatures", multiple=True, help="a party's signature, as its own command printed it")
+@click.option("--refund", is_flag=True, help="refund the promisee after the refund delay, without signatures")
+@with_json
+@with_signing_settings()
+async def cancel(settings: Settings, address: str, signatures: tuple[str, ...], refund: bool, as_json: bool) -> None:
+    """Cancel the liability at ADDRESS: the promisee gets the cost back, and the promisor is not paid.
+
+    Both parties must agree. The first party runs this command without --signature: it prints a signature and sends
+    nothing. The other party runs it with that --signature, which ends the liability. Anyone else can end it with both
+    signatures.
+
+    If the promisor has disappeared, --refund returns the cost once the refund delay has passed. Anyone may do this;
+    `aira liability show` prints the block from which it is possible.
+    """
+    if refund and signatures:
+        raise click.UsageError("--refund and --signature can't be used together")
+    async with open_signing_chain(settings) as chain:
+        liability = await chain.liabilities.get(address)
+        if liability.is_finalized:
+            ended = f"{liability.address} has already ended: {OUTCOMES[state_of(liability)]}"
+            raise ChainError(ended, code="liability-ended")
+        if refund:
+            await _print_end(chain, await _refunded(chain, liability), liability, as_json)
+        elif (settled := await _cancelled(chain, liability, signatures, as_json)) is not None:
+            await _print_end(chain, settled, liability, as_json)
+
+
+async def _refunded(chain: Chain, liability: Liability) -> Settled:
+    state = await chain.liabilities.refund_state(liability.address)
+    if not state.is_refundable:
+        raise ChainError(
+            f"{liability.address} can't be refunded yet: {refund_words(state)}",
+            hint="until then both parties can cancel it: `aira liability cancel` without --refund",
+            code="not-refundable",
+        )
+    with notice_when_slow():
+        return await chain.liabilities.refund(liability.address)
+
+
+async def _cancelled(chain: Chain, liability: Liability, signatures: Sequence[str], as_json: bool) -> Settled | None:
+    """The end, mined; None if the other party has to sign first, which is printed. Raises `ChainError`."""
+    signed = _signed(chain, liability, signatures)
+    missing = [party for party in ("promisee", "promisor") if party not in signed]
+    if not missing:
+        parties = {f"{party}_signature": signature for party, signature in signed.items()}
+        with notice_when_slow():
+            return await chain.liabilities.cancel(liability.address, **parties)
+    if not signed:
+        raise ChainError(
+            f"the account is neither promisee nor promisor of {liability.address}",
+            hint="give the signatures of both parties, or the keyfile of one of them",
+            code="not-a-party",
+        )
+    if signatures:
+        raise ChainError(
+            f"the signature of the {missing[0]} is missing",
+            hint="the other party prints it with `aira liability cancel`",
+            code="signature-missing",
+        )
+    _print_signature(chain, liability, signed, as_json)
+    return None
+
+
+def _signed(chain: Chain, liability: Liability, signatures: Sequence[str]) -> dict[str, str]:
+    """Party → signature (0x…): the given signatures, and that of the own account if it is a party."""
+    from schemas import cancellation_hash, recover
+
+    assert chain.account is not None
+    digest = cancellation_hash(liability.address)
+    own = "0x" + chain.account.signer.sign_hash(digest).hex()
+    parties = {"promisee": liability.promisee, "promisor": liability.promisor}
+    signed = {party: own for party, address in parties.items() if address == chain.account.address}
+    for signature in signatures:
+        try:
+            signer = recover(digest, signature)
+        except InvalidMessage as error:
+            raise InputError(
+                f"invalid signature: {error.detail}",
+                hint="a signature is 0x and 130 hexadecimal digits",
+                code="invalid-signature",
+            ) from None
+        found = {party: signature for party, address in parties.items() if address == signer}
+        if not found:
+            raise InputError(
+                f"the signature is by {signer}, or for another liability",
+                hint=f"the signer must be {liability.promisee} or {liability.promisor}",
+                code="invalid-signature",
+            )
+        signed |= found
+    return signed
+
+
+def _print_signature(chain: Chain, liability: Liability, signed: dict[str, str], as_json: bool) -> None:
+    assert chain.account is not None
+    party, signature = next(iter(signed.items()))
+    other = "promisor" if party == "promisee" else "promisee"
+    whose = getattr(liability, other)
+    if as_json:
+        facts = {"liability": liability.address, "signer": chain.account.address, "party": party}
+        print_json(facts | {"signature": signature, "needed": whose})
+        return
+    print_line(f"as the {party}, you agree to cancel {liability.address} with this signature:\n\n{signature}\n")
+    print_line(f"Nothing was sent. The {other}, {whose}, can end it with:\n")
+    print_line(f"aira liability cancel {liability.address} --signature {signature}")
+
+
+async def _print_end(chain: Chain, settled: Settled, before: Liability, as_json: bool) -> None:
+    liability = await chain.liabilities.get(before.address)
+    owed = await chain.liabilities.owed_after(liability)
+    unit = (await units_of(chain, [liability]))[liability.token]
+    paid = {"paid back": f"{unit.show(liability.cost)}  to {liability.promisee}"}
+    facts = {"liability": liability.address, "state": OUTCOMES[state_of(liability)]}
+    facts |= {"owed": owed_words(liability, unit, owed)} if owed else paid
+    result = liability_json(liability) | {"tx": settled.tx, "gasUsed": settled.gas_used}
+    result |= {"owed": str(owed)} if owed else {}
+    print_result(result, facts | {"transaction": settled.tx}, as_json=as_json)
+
+
+@command.command("claim", short_help="take what the token refused to pay at the end of one")
+@click.argument("address", type=ADDRESS)
+@click.option("--to", type=ADDRESS, help="another account that receives it; only for the account that is owed it")
+@with_json
+@with_signing_settings()
+async def claim(settings: Settings, *, address: str, to: str | None, as_json: bool) -> None:
+    """Pay what is owed after the liability at ADDRESS, because its token refused to pay it when the liability ended.
+
+    `aira liability show` says whether something is owed. Anyone can claim it for the account that it is owed to. All
+    that this account is owed in the token is paid, of other liabilities, too.
+
+    If the token still refuses the account, its owner can have it paid to another one with --to.
+    """
+    async with open_signing_chain(settings) as chain:
+        liability = await chain.liabilities.get(address)
+        account, owed = cost_receiver(liability), await chain.liabilities.owed_after(liability)
+        if not owed:
+            why = "was paid" if liability.is_finalized else "has not ended"
+            raise ChainError(f"nothing is owed: {liability.address} {why}", code="nothing-owed")
+        receipt = await _claimed(chain, liability, account, to)
+        receiver = account if to is None else await chain.names.address(to)
+        unit = (await units_of(chain, [liability]))[liability.token]
+        result: dict[str, Any] = {
+            "liability": liability.address,
+            "token": liability.token,
+            "account": account,
+            "to": receiver,
+        }
+        result |= {"claimed": str(owed), "tx": receipt.tx, "gasUsed": receipt.gas_used}
+        facts = {"claimed": f"{unit.show(owed)}  to {receiver}", "transaction": receipt.tx}
+        print_result(result, facts, as_json=as_json)
+
+
+async def _claimed(chain: Chain, liability: Liability, account: str, to: str | None) -> Receipt:
+    """The claim, mined. Raises `ChainError`."""
+    assert chain.account is not None
+    if to is not None and chain.account.address != account:
+        raise ChainError(
+            f"only {account} can have what it is owed paid to another account",
+            hint="without --to anyone can claim it for that account",
+            code="not-a-party",
+        )
+    try:
+        with notice_when_slow():
+            return await chain.liabilities.claim(liability.token, account, to=to)
+    except Reverted as error:
+        raise ChainError(
+            f"the token {liability.token} still refuses to pay {account if to is None else to}"
+            + (f": {error.reason}" if error.reason else ""),
+            hint="the account that is owed it can have it paid to another one with --to",
+            code="claim-refused",
+        ) from error
+
+
+@command.command("watch", short_help="follow one until it ends, or all of them")
+@click.argument("address", required=False, type=ADDRESS)
+@click.option(
+    "--from-block", type=click.IntRange(min=0), help="without ADDRESS: the first block to read [the next one]"
+)
+@with_json
+@with_chain_settings(NetworkSettings, "lighthouse_contract", "confirmations", "poll_interval")
+async def watch(settings: Settings, address: str | None, from_block: int | None, as_json: bool) -> None:
+    """Wait until the liability at ADDRESS has ended, then show it. If the node is unreachable, wait for it. If it names
+    a validator, print how its jurors judge when they do.
+
+    Without ADDRESS, print each liability when it is created and when it ends, until Ctrl-C; with --json one object per
+    line.
+    """
+    if address is None:
+        await _watch_all(settings, from_block, as_json)
+        return
+    own = await asyncio.to_thread(own_address, settings)
+    async with open_chain(settings) as chain:
+        liability = await chain.liabilities.get(address)
+        async with Background() as tasks:
+            if not liability.is_finalized and not as_json:
+                print_line(f"{liability.address} is open; waiting until it ends (Ctrl-C stops waiting)")
+                tasks.start(print_verdicts(settings, chain, liability), "verdicts")
+            ended = await chain.liabilities.watch(address)
+        await print_liability(chain, ended, settings, own=own, as_json=as_json)
+
+
+async def _watch_all(settings: Settings, from_block: int | None, as_json: bool) -> None:
+    own = await asyncio.to_thread(own_address, settings)
+    async with open_chain(settings) as chain:
+        cursor = await chain.block_number() + 1 if from_block is None else from_block
+        if not as_json:
+            click.echo(f"watching from block {cursor:,}; Ctrl-C stops it", err=True)
+        outages = _PrintedOutages()
+        async with aclosing(chain.follow(cursor, outages=outages)) as blocks:
+            async for block in blocks:
+                events = await chain.retrying(partial(_liability_events, chain, block, own), outages=outages)
+                for facts, line in events:
+                    if as_json:
+                        print_json(facts)
+                    else:
+                        print_line(line)
+
+
+class _PrintedOutages(OutageLog):
+    """Prints to stderr that the node is unreachable, once per outage."""
+
+    def __init__(self) -> None:
+        super().__init__(log, "chain")
+        self._has_failed = False
+
+    def failed(self, error: AiraError, consequence: str) -> None:
+        """Print `error`, unless the outage is already known."""
+        if not self._has_failed:
+            click.echo(f"aira: {error}; waiting for it", err=True)
+        self._has_failed = True
+
+    def recovered(self, message: str) -> None:
+        """The next failure is another outage."""
+        self._has_failed = False
+
+
+async def _liability_events(chain: Chain, block: BlockEvents, own: str | None) -> list[tuple[dict[str, Any], str]]:
+    """The creations and ends of liabilities in a block or a reorganisation, in order: each for JSON and for people."""
+    from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation
+
+    found: list[tuple[dict[str, Any], str]] = []
+    for event in block.reverted_events if isinstance(block, Reorganisation) else ():
+        if isinstance(event, NewLiability | Finalized):
+            word, what = ("made", "creation") if isinstance(event, NewLiability) else ("ended", "end")
+            facts: dict[str, Any] = {"event": "taken-back", "what": word, "liability": event.liability, "tx": event.tx}
+            found.append((facts, f"a reorganisation reverted the {what} of {event.liability}"))
+    for event in block.events:
+        if not isinstance(event, NewLiability | Finalized):
+            continue
+        try:
+            liability = await chain.liabilities.get(event.liability)
+        except NoContracts:  # reverted meanwhile: the reorganisation comes next
+            continue
+        is_new, number = isinstance(event, NewLiability), block.block_number
+        facts = {"event": "made" if is_new else "ended", "blockNumber": number, "tx": event.tx}
+        word = "created" if is_new else state_of(liability)
+        parties = f"{short_address(liability.promisor, own=own)} for {short_address(liability.promisee, own=own)}"
+        cost = (await units_of(chain, [liability]))[liability.token].show(liability.cost)
+        line = f"block {number:,}  {liability.address}  {word:<10}  {parties}, {cost}"
+        found.append((facts | {"liability": liability_json(liability)}, line))
+    return found

@@ -7,25 +7,22 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.errors import NoAnswer
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.options import with_json, with_settings, with_timeout
 from mesh.cli.output import plural, print_line, printable, wait_for_broken_pipe
-from mesh.settings import NetworkSettings, options_of
+from mesh.settings import NetworkSettings
 from schemas import parse_address
-from schemas.agent_keys import DeviceTopicKey, RpcKey
-from schemas.logs import LEVELS
+from schemas.keys import DeviceTopicKey, RpcKey
+from schemas.status import LEVELS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.settings import Settings
-    from mesh.watching.logs import LogReader, LogUpdate
-    from schemas.logs import LogEvent
+    from mesh.watching.presence import LogReader, LogUpdate
+    from schemas.status import LogEvent
 
 POLL_INTERVAL: Final = 0.5
 """Seconds between two requests for new events."""
-DEVICE_LOG: Final = "/log"
-"""The topic on which an edge agent serves its device's log."""
 
 
 @click.command("logs")
@@ -44,11 +41,9 @@ DEVICE_LOG: Final = "/log"
     "--level", type=click.Choice(LEVELS[:-1]), default="debug", show_default=True, help="lowest level to show"
 )
 @click.option("--liability", default="", metavar="ADDRESS", help="show only events of this liability")
-@click.option(
-    "--timeout", type=click.FloatRange(min=0, min_open=True), default=3.0, show_default=True, help="seconds to wait"
-)
+@with_timeout()
 @with_json
-@with_settings(*options_of(NetworkSettings))
+@with_settings(NetworkSettings)
 async def command(
     settings: Settings,
     address: str,
@@ -65,37 +60,22 @@ async def command(
     Each keeps its last 2,000 events of its log_level or above. --json prints one object per line, in the format that
     log_format = "json" selects.
     """
-    from mesh.telemetry.events import human_line, json_line
+    from mesh.base.background import Background
+    from mesh.network import Network, no_answer
+    from mesh.role.composition import endpoints_of
+    from mesh.telemetry.logs import human_line, json_line
+    from mesh.watching.presence import LogReader
 
-    agent = parse_address(address)
-    key = str(RpcKey(agent, "logs") if device is None else DeviceTopicKey(agent, device, DEVICE_LOG))
-    wanted = {"lines": lines, "level": level, "liability": liability and parse_address(liability)}
-    await _show(settings, key, wanted, line=json_line if as_json else human_line, timeout=timeout, follow=follow)
-
-
-async def _show(
-    settings: Settings,
-    key: str,
-    wanted: dict[str, Any],
-    *,
-    line: Callable[[LogEvent], str],
-    timeout: float,
-    follow: bool,
-) -> None:
-    from mesh.background import Background
-    from mesh.composition import endpoints_of
-    from mesh.network import Network
-    from mesh.watching.logs import LogReader
-
+    agent, line = parse_address(address), json_line if as_json else human_line
+    wanted: dict[str, Any] = {"lines": lines, "level": level, "liability": liability and parse_address(liability)}
+    # An edge agent serves its device's log on the topic `/log`.
+    key = str(RpcKey(agent, "logs") if device is None else DeviceTopicKey(agent, device, "/log"))
     async with Network(endpoints_of(settings)) as network, Background() as tasks:
         tasks.start(wait_for_broken_pipe(), "readers of stdout")
         reader = LogReader(network.session, key, **wanted)
         update = await reader.poll(timeout=timeout)
         if not update.answered:
-            raise NoAnswer(
-                f"no answer at {key}",
-                hint="check with `aira peers` that it runs on this router; on a site, only operators may read logs",
-            )
+            raise no_answer(agent, "logs", device=device or "")
         _print_update(update, line)
         while update.more:
             update = await reader.poll(timeout=timeout)
@@ -107,7 +87,7 @@ async def _show(
 async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout: float) -> None:
     """Show new events. Prints to stderr when it stops answering, and when it answers again."""
     from mesh.network import ServiceFailed
-    from mesh.watching.logs import LogUpdate
+    from mesh.watching.presence import LogUpdate
 
     reported = ""
     while True:

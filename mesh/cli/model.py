@@ -2,36 +2,65 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+import re
+from typing import TYPE_CHECKING, Final
 
 import click
 
-from mesh.cli.errors import FileExists
-from mesh.cli.files import FETCH_SETTINGS, write_error
-from mesh.cli.model_source import description_from
-from mesh.cli.objective_show import local_file
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.files import FETCH_SETTINGS, description_of, require_readable, required_description, writing
+from mesh.cli.objective import local_file
+from mesh.cli.options import PATH, with_json, with_settings
 from mesh.cli.output import (
     format_duration,
     format_size,
+    interruptible,
     plural,
     print_facts,
     print_json,
     print_line,
+    print_result,
     print_table,
     printable,
-    run_sync,
 )
+from mesh.cli.program import only, run_program
+from mesh.errors import InputError
 from mesh.recording import Limits, preflight
-from mesh.work.models import description_in
+from mesh.role.models import description_in
 from schemas import cid_of_file
-from schemas.model import MAX_MODEL_SIZE, ModelDescription, description_schema, read_description
-from schemas.value_schema import ValueSchema
+from schemas.decoding import without_mark
+from schemas.model import MAX_MODEL_SIZE, ModelDescription, ValueSchema, description_schema
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.settings import Settings
     from schemas.model import ModelLimits, ModelTopic
+
+
+_HINT: Final = "write `MODEL = agent.model_description(…)` in it"
+
+
+def description_from(source: Path) -> ModelDescription:
+    """The description in a JSON file, or of a Python program's agent.
+
+    Of a program it is the `ModelDescription` that it has, or what the handlers of its agent say, with the title and the
+    text from its docstring. Raises `InputError`, `InvalidDescription`.
+    """
+    if source.suffix != ".py":
+        return required_description(source)
+    from mesh.agent.agent import Agent
+
+    path = require_readable(source)
+    names = run_program(path, Agent)
+    described = only(names, ModelDescription, path, hint=_HINT)
+    if described is not None:
+        return described
+    agent = only(names, Agent, path, hint=_HINT)
+    if agent is None:
+        raise InputError(f"{path} has no agent and no description", hint=_HINT, code="program-unusable")
+    text = (names.get("__doc__") or path.stem).strip()
+    title = re.split(r"[.:;](?=\s|$)|\n", text, maxsplit=1)[0].strip()[:80]
+    return agent.model_description(title, description=" ".join(text.split()) if text != title else "")
 
 
 @click.group("model")
@@ -44,10 +73,11 @@ def command() -> None:
 
 
 @command.command("new", short_help="write the description of a model")
-@click.argument("source", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="file to write [model.json beside SOURCE]")
+@click.argument("source", type=PATH)
+@click.option("--out", type=PATH, help="file to write [model.json beside SOURCE]")
 @click.option("--replace", is_flag=True, help="replace the file if it exists; the model then has another CID")
 @with_json
+@interruptible
 def new(source: Path, out: Path | None, replace: bool, as_json: bool) -> None:
     """Write a description in canonical form, and print its CID.
 
@@ -55,21 +85,15 @@ def new(source: Path, out: Path | None, replace: bool, as_json: bool) -> None:
     (NAME.py). The program is run, but its agent is not: the types of its handlers' messages say what the model takes.
     """
 
-    def work() -> None:
-        path = out or source.with_name("model.json")
-        description = description_from(source)
-        if path.exists() and not replace and not path.samefile(source):
-            raise FileExists(f"{path} already exists", hint="give --replace, or another name with --out")
-        try:
-            path.write_bytes(description.encode())
-        except OSError as error:
-            raise write_error(path, error) from None
-        if as_json:
-            print_json({"cid": description.cid, "file": str(path)})
-        else:
-            print_line(f"{description.cid}  {path}")
-
-    run_sync(work)
+    path = out or source.with_name("model.json")
+    description = description_from(source)
+    if path.exists() and not replace and not path.samefile(source):
+        raise InputError(
+            f"{path} already exists", hint="give --replace, or another name with --out", code="file-exists"
+        )
+    with writing(path):
+        path.write_bytes(description.encode())
+    print_result({"cid": description.cid, "file": str(path)}, f"{description.cid}  {path}", as_json=as_json)
 
 
 @command.command("check", short_help="check a description, or an objective against it")
@@ -77,6 +101,7 @@ def new(source: Path, out: Path | None, replace: bool, as_json: bool) -> None:
 @click.argument("objective", required=False)
 @with_json
 @with_settings(*FETCH_SETTINGS, "objective_size_limit", "objective_expanded_limit")
+@interruptible
 def check(settings: Settings, model: str, objective: str | None, as_json: bool) -> None:
     """Check MODEL, a file or a CID; with OBJECTIVE, a file or a CID, check whether a robot of that model accepts it.
 
@@ -85,27 +110,16 @@ def check(settings: Settings, model: str, objective: str | None, as_json: bool) 
     """
     path = local_file(settings, model)
     recording = None if objective is None else local_file(settings, objective)
-
-    def work() -> bool:
-        description = description_in(path)
-        if description is None and path.suffix == ".json":  # it was meant as one
-            with path.open("rb") as file:
-                description = read_description(file.read(MAX_MODEL_SIZE + 1))
-        facts = {"cid": cid_of_file(path), "described": description is not None, "ok": True, "reason": "", "detail": ""}
-        if recording is not None:
-            limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
-            outcome = preflight(recording, limits, model=description)
-            facts |= {"ok": outcome.ok, "reason": outcome.reason, "detail": outcome.detail}
-        if as_json:
-            print_json(facts)
-        elif facts["ok"]:
-            valid = "valid: a description" if description else "valid: a model without a description"
-            print_line(f"{facts['cid']}  {valid if recording is None else 'the objective fits'}")
-        else:
-            print_line(f"{facts['cid']}  {facts['reason']}: {printable(str(facts['detail']))}")
-        return bool(facts["ok"])
-
-    if not run_sync(work):
+    description = description_of(path)
+    facts = {"cid": cid_of_file(path), "described": description is not None, "ok": True, "reason": "", "detail": ""}
+    if recording is not None:
+        outcome = preflight(recording, Limits.of(settings), model=description)
+        facts |= {"ok": outcome.ok, "reason": outcome.reason, "detail": outcome.detail}
+    shown = "valid: a description" if description else "valid: a model without a description"
+    if recording is not None:
+        shown = "the objective fits" if facts["ok"] else f"{facts['reason']}: {printable(str(facts['detail']))}"
+    print_result(facts, f"{facts['cid']}  {shown}", as_json=as_json)
+    if not facts["ok"]:
         raise SystemExit(1)
 
 
@@ -113,22 +127,19 @@ def check(settings: Settings, model: str, objective: str | None, as_json: bool) 
 @click.argument("model")
 @with_json
 @with_settings(*FETCH_SETTINGS)
+@interruptible
 def show(settings: Settings, model: str, as_json: bool) -> None:
     """Show MODEL, a file or a CID: its description, or its text if it has none."""
     path = local_file(settings, model)
-
-    def work() -> None:
-        description = description_in(path)
-        if as_json:
-            print_json({"cid": cid_of_file(path), "description": description})
-        elif description is None:
-            with path.open("rb") as file:
-                text = file.read(MAX_MODEL_SIZE).decode(errors="replace")
-            print_line("\n".join(printable(line.expandtabs()) for line in text.splitlines()))
-        else:
-            _print_description(description)
-
-    run_sync(work)
+    description = description_in(path)
+    if as_json:
+        print_json({"cid": cid_of_file(path), "description": description})
+    elif description is None:
+        with path.open("rb") as file:
+            text = without_mark(file.read(MAX_MODEL_SIZE)).decode(errors="replace")
+        print_line("\n".join(printable(line.expandtabs()) for line in text.splitlines()))
+    else:
+        _print_description(description)
 
 
 @command.command("schema", short_help="print the JSON Schema of descriptions")

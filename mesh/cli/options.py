@@ -1,4 +1,4 @@
-"""Options that commands share: a flag for each setting that a command uses, `--json`, and a few others."""
+"""Options of commands: those of the settings, addresses, amounts, CIDs and ports."""
 
 from __future__ import annotations
 
@@ -9,32 +9,36 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.errors import AiraError
-from mesh.running import fail, run_to_end
-from mesh.settings import MEANING, Settings, load
+from mesh.amounts import AMOUNT, XRT, InvalidAmount
+from mesh.role.running import run_to_end
+from mesh.settings import DEFAULTS, MEANING, AccountSettings, load, options_of
 from schemas.address import parse_address_or_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+
+class AmountText(click.ParamType[str]):
+    """An amount. Its syntax is checked here; its value depends on the token. Raises `InvalidAmount`."""
+
+    name = "amount"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the text."""
+        text = str(value)
+        if AMOUNT.fullmatch(text.strip()) is None:
+            flag = f"{param.opts[0]}: " if isinstance(param, click.Option) else ""
+            raise InvalidAmount(f"{flag}{text[:40]!r} is not an amount", hint=XRT.hint())
+        return text
+
+
+PATH: Final = click.Path(path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
 FOLDER: Final = click.Path(file_okay=False, path_type=Path)
 PORT: Final = click.IntRange(0, 65_535)
 BLOCK_TIME: Final = click.FloatRange(0.01, 86_400)
 """Seconds."""
 
-LISTS: Final = frozenset(
-    {
-        "connect",
-        "link",
-        "listen",
-        "ipfs_public_providers",
-        "ipfs_swarm_connect",
-        "ros2_connect",
-        "validator_policies",
-    }
-)
-"""The settings with several values, whose flags may be repeated."""
 CHAIN_SETTINGS: Final = (
     "web3_http_provider",
     "ens_contract",
@@ -44,7 +48,6 @@ CHAIN_SETTINGS: Final = (
     "contracts",
 )
 """The settings that name a chain, and the contracts on it."""
-ACCOUNT_SETTINGS: Final = ("keyfile", "keyfile_password_file")
 TRANSACTION_SETTINGS: Final = ("data_dir", "max_fee_gwei", "confirmations", "poll_interval")
 """The settings for sending transactions."""
 
@@ -64,22 +67,22 @@ class AddressText(click.ParamType[str]):
 ADDRESS: Final = AddressText()
 
 
-def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Give a command `--config` and a flag for each named setting; it is called with `settings`.
+def with_settings(*named: str | type) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Give a command `--config` and a flag for each named setting, or each of a group; it is called with `settings`.
 
     Flags override `AIRA_*` variables, which override the settings file. A command that is a coroutine function is run
     to its end, as `run_to_end` does.
     """
+    names = tuple(
+        dict.fromkeys(name for each in named for name in ((each,) if isinstance(each, str) else options_of(each)))
+    )
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
         def command(config: Path | None, **options: Any) -> Any:
-            flags = {name: _given(options.pop(name)) for name in names}
-            try:
-                settings = load(path=config, flags=flags)
-            except AiraError as error:
-                fail(error)
-            work = partial(function, settings=settings, **options)
+            # An empty text is a value; an empty list is not, because click also passes one when the flag is absent.
+            flags = {name: None if (value := options.pop(name)) == () else value for name in names}
+            work = partial(function, settings=load(path=config, flags=flags), **options)
             return run_to_end(work) if iscoroutinefunction(function) else work()
 
         decorated: Callable[..., Any] = command
@@ -90,19 +93,30 @@ def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., A
     return decorate
 
 
-def with_chain_settings(*more: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def with_chain_settings(*more: str | type) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Give a command that only reads a chain its settings, the keyfile (for the address in it), and `more`."""
     return with_settings(*more, "keyfile", *CHAIN_SETTINGS)
 
 
-def with_signing_settings(*more: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def with_signing_settings(*more: str | type) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Give a command that sends transactions the settings of chain and account, and `more`."""
-    return with_settings(*more, *ACCOUNT_SETTINGS, *CHAIN_SETTINGS, *TRANSACTION_SETTINGS)
+    return with_settings(*more, AccountSettings, *CHAIN_SETTINGS, *TRANSACTION_SETTINGS)
 
 
 def with_json(function: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the flag `--json`; it is called with `as_json`."""
     return click.option("--json", "as_json", is_flag=True, help="print JSON only to stdout")(function)
+
+
+def with_timeout(seconds: float | None = 3.0, *, meaning: str = "seconds to wait") -> Callable[..., Any]:
+    """Give a command `--timeout`."""
+    kind = click.FloatRange(min=0, min_open=True)
+    return click.option("--timeout", type=kind, default=seconds, show_default=seconds is not None, help=meaning)
+
+
+def with_first_block(meaning: str) -> Callable[..., Any]:
+    """Give a command `--from-block`."""
+    return click.option("--from-block", type=click.IntRange(min=0), default=0, show_default=True, help=meaning)
 
 
 def with_lighthouse_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -120,17 +134,13 @@ def with_lighthouse_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return stake(timeout(command))
 
 
-def _given(value: str | tuple[str, ...] | None) -> str | tuple[str, ...] | None:
-    """A flag's value, None if it was not given. An empty text is a value; an empty list is not, because click also
-    passes one when the flag is absent."""
-    return None if value == () else value
-
-
 def _flag(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    default = getattr(Settings(), name)
+    default = getattr(DEFAULTS, name)
     shown = ", ".join(default) if isinstance(default, tuple) else str(default)
     metavar = name.split("_")[-1].upper()
     if isinstance(default, bool):
         shown, metavar = shown.lower(), "true|false"
     text = MEANING[name] + (f" [{shown}]" if shown else "")
-    return click.option(f"--{name.replace('_', '-')}", name, multiple=name in LISTS, metavar=metavar, help=text)
+    return click.option(
+        f"--{name.replace('_', '-')}", name, multiple=isinstance(default, tuple), metavar=metavar, help=text
+    )

@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections import defaultdict
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mesh.cli.chain_client import notice_when_slow, open_chain, required_address, units_of
-from mesh.cli.errors import InvalidOptions, UnknownOrder
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, print_table
-from mesh.settings import ChainSettings, NetworkSettings, options_of
+from mesh.errors import InputError
+from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
 from schemas import parse_address
+from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
-    from mesh.agent import Order
     from mesh.agent.components import AgentComponents
+    from mesh.agent.ledger import StoredOrder
+    from mesh.agent.trade import Order
     from mesh.chain import Chain
     from mesh.settings import Settings
-    from mesh.work import StoredOrder
     from schemas import Demand, Offer
     from schemas.signing import Rejection
-
-ANSWERS: Final = 256
-HEAD: Final = ("ORDER", "KIND", "STATE", "COST", "VALID UNTIL")
 
 
 @click.group("order")
@@ -38,17 +35,13 @@ def command() -> None:
 
 @command.command("list", short_help="list the open and withdrawn orders")
 @with_json
-@with_settings("keyfile", *options_of(ChainSettings))
+@with_settings("keyfile", ChainSettings)
 async def list_orders(settings: Settings, as_json: bool) -> None:
     """List the orders that may still become contracts: open ones, and withdrawn ones until their deadline.
 
     A `matched` one became a contract while no agent of the account ran; `aira liability list` shows it.
     """
-    await _list(settings, as_json)
-
-
-async def _list(settings: Settings, as_json: bool) -> None:
-    from schemas import decode
+    from schemas import decode, encode
 
     address = await asyncio.to_thread(required_address, settings)
     async with open_chain(settings) as chain:
@@ -60,7 +53,11 @@ async def _list(settings: Settings, as_json: bool) -> None:
                 found.append((stored, message, await _state(chain, stored, message, address)))
         units = await units_of(chain, [message for _, message, _ in found])
     if as_json:
-        print_json([_json(stored, message, state, head) for stored, message, state in found])
+        listed = []
+        for stored, message, state in found:
+            facts = {"hash": stored.identity, "kind": message.kind, "state": state, "posted": stored.posted}
+            listed.append(facts | {"blocksLeft": message.deadline - head} | decode_json(encode(message)))
+        print_json(listed)
     elif not found:
         print_line(f"no open orders of {address}")
     else:
@@ -68,14 +65,14 @@ async def _list(settings: Settings, as_json: bool) -> None:
         for stored, message, state in found:
             until = f"block {message.deadline:,}, in {plural(message.deadline - head, 'block')}"
             rows.append((stored.identity, message.kind, state, units[message.token].show(message.cost), until))
-        print_table(HEAD, rows, numbers=("COST",))
+        print_table(("ORDER", "KIND", "STATE", "COST", "VALID UNTIL"), rows, numbers=("COST",))
 
 
 async def _stored_orders(settings: Settings, chain: Chain, address: str) -> Sequence[StoredOrder]:
     """The orders in the account's ledger for this chain; none if it has no ledger."""
     from mesh.agent.components import LEDGER
-    from mesh.composition import state_folder
-    from mesh.work import Ledger
+    from mesh.agent.ledger import Ledger
+    from mesh.role.composition import state_folder
 
     path = await state_folder(settings, chain, address) / LEDGER
     if not await asyncio.to_thread(path.exists):
@@ -91,22 +88,12 @@ async def _state(chain: Chain, stored: StoredOrder, message: Demand | Offer, add
     return "matched" if is_used else "open"
 
 
-def _json(stored: StoredOrder, message: Demand | Offer, state: str, head: int) -> dict[str, Any]:
-    from schemas import encode
-
-    fields: dict[str, Any] = json.loads(encode(message))
-    facts = {"hash": stored.identity, "kind": message.kind, "state": state, "posted": stored.posted}
-    return facts | {"blocksLeft": message.deadline - head} | fields
-
-
 @command.command("withdraw", short_help="withdraw open orders")
 @click.argument("hashes", nargs=-1, metavar="[HASH]...")
 @click.option("--all", "everything", is_flag=True, help="withdraw all open orders of the account")
 @click.option("--on-chain", is_flag=True, help="also by a transaction, after which no provider can use the order")
 @with_json
-@with_settings(
-    *options_of(NetworkSettings), "lighthouse_contract", "keyfile", "keyfile_password_file", *options_of(ChainSettings)
-)
+@with_settings(NetworkSettings, "lighthouse_contract", AccountSettings, ChainSettings)
 async def withdraw(
     settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool
 ) -> None:
@@ -118,18 +105,12 @@ async def withdraw(
     """
     if bool(hashes) == everything:
         raise click.UsageError("give the hashes of orders, or --all")
-    await _withdraw(settings, hashes, everything, on_chain, as_json)
-
-
-async def _withdraw(
-    settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool
-) -> None:
     from mesh.agent.components import working
+    from mesh.agent.contracts import ContractReports
     from mesh.agent.orders import OrderState
-    from mesh.agent.reports import ContractReports
     from mesh.agent.trade import Trader
-    from mesh.composition import load_account
-    from mesh.flood import Drops
+    from mesh.base.flood import Drops
+    from mesh.role.composition import load_account
 
     account = await asyncio.to_thread(load_account, settings)
     async with working(settings, account, None, drops=Drops()) as parts:
@@ -159,8 +140,8 @@ def withdrawal_lines(facts: Sequence[dict[str, Any]]) -> Iterator[str]:
 async def withdraw_orders(parts: AgentComponents, orders: Sequence[Order], *, on_chain: bool) -> list[dict[str, Any]]:
     """Withdraw orders, and wait a moment for providers to confirm it; returns what is printed of each."""
     from mesh.agent.orders import OrderState
-    from mesh.agent.statements import received_rejections
-    from mesh.market.refusals import Refusal
+    from mesh.agent.trade import received_rejections
+    from schemas.signing import Refusal
 
     honoured = defaultdict[str, set[str]](set)
 
@@ -170,30 +151,31 @@ async def withdraw_orders(parts: AgentComponents, orders: Sequence[Order], *, on
 
     async with received_rejections(parts, {order.hash for order in orders}, hear):
         withdrawn = [await order.withdraw() for order in orders]
-        providers = await _providers(parts)
-        return [
-            {
-                "hash": order.hash,
-                "kind": order.kind,
-                "deadline": order.deadline,
-                "providers": providers,
-                "confirmedBy": await _confirmations(
-                    parts, order, providers, honoured[order.hash] if before.state is OrderState.OPEN else None
-                ),
-                "honouredBy": sorted(honoured[order.hash]),
-                "tx": await _withdraw_on_chain(parts, order) if on_chain else None,
-            }
-            for before, order in zip(orders, withdrawn, strict=True)
-        ]
+        providers, facts = await _providers(parts), []
+        for before, order in zip(orders, withdrawn, strict=True):
+            told = honoured[order.hash] if before.state is OrderState.OPEN else None
+            confirmed, tx = await _confirmations(parts, order, providers, told), None
+            about = {"hash": order.hash, "kind": order.kind, "deadline": order.deadline, "providers": providers}
+            about |= {"confirmedBy": confirmed, "honouredBy": sorted(honoured[order.hash])}
+            if on_chain:
+                with notice_when_slow():
+                    tx = (await parts.chain.liabilities.withdraw(order.message)).tx
+                await parts.ledger.use_up(order.hash, tx)
+            facts.append(about | {"tx": tx})
+        return facts
 
 
 def _named(orders: Sequence[Order], digits: str) -> Order:
-    """The order whose hash begins with these digits. Raises `UnknownOrder` and `InvalidOptions`."""
+    """The order whose hash begins with these digits. Raises `InputError`."""
     found = [order for order in orders if order.hash.startswith(digits.lower().removeprefix("0x"))]
     if not found:
-        raise UnknownOrder(f"no open order has the hash {digits[:70]}", hint="`aira order list` lists them")
+        raise InputError(
+            f"no open order has the hash {digits[:70]}", hint="`aira order list` lists them", code="unknown-order"
+        )
     if len(found) > 1:
-        raise InvalidOptions(f"{len(found)} orders have hashes that begin with {digits}", hint="give more digits")
+        raise InputError(
+            f"{len(found)} orders have hashes that begin with {digits}", hint="give more digits", code="invalid-options"
+        )
     return found[0]
 
 
@@ -225,11 +207,11 @@ def _answers(parts: AgentComponents, order: Order) -> int:
     """How many providers answer with the withdrawal of an order now."""
     import zenoh
 
-    from schemas.selectors import withdrawal_selector
+    from schemas.keys import withdrawal_selector
 
     replies = parts.network.session.get(
         withdrawal_selector(parts.channel.lighthouse, order.hash),
-        zenoh.handlers.FifoChannel(ANSWERS),
+        zenoh.handlers.FifoChannel(256),
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=parts.channel.answer_timeout / 2,
@@ -248,13 +230,6 @@ def _withdraws(sample: Any, parts: AgentComponents, order: Order) -> bool:
         return False
     is_own = withdrawal.signer == parts.signer.address
     return isinstance(withdrawal.message, Withdrawal) and withdrawal.message.order == order.hash and is_own
-
-
-async def _withdraw_on_chain(parts: AgentComponents, order: Order) -> str:
-    with notice_when_slow():
-        tx = (await parts.chain.liabilities.withdraw(order.message)).tx
-    await parts.ledger.use_up(order.hash, tx)
-    return tx
 
 
 def _what_it_means(fact: dict[str, Any]) -> str:

@@ -9,20 +9,21 @@ import signal
 import sys
 import time
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from functools import wraps
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
 import click
 import msgspec
 
-from mesh.cli.errors import OutputFailed
 from mesh.errors import AiraError
-from mesh.running import INTERRUPTED, STOPPING, fail
+from mesh.role.running import INTERRUPTED, STOPPING, fail
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from logging import Logger
 
 T = TypeVar("T")
+P = ParamSpec("P")
 
 COLUMN_GAP: Final = "  "
 LARGEST_NUMBER: Final = 2**53
@@ -35,23 +36,26 @@ PIPE_INTERVAL: Final = 0.5
 """Seconds between two checks whether stdout is still read."""
 
 
-def run_sync(work: Callable[[], T]) -> T:
-    """Call `work`, which needs no event loop. Prints an `AiraError` and exits like `run_to_end`.
+def interruptible(function: Callable[P, T]) -> Callable[P, T]:
+    """Let Ctrl-C and SIGTERM raise `KeyboardInterrupt` in a command without an event loop.
 
-    Ctrl-C and SIGTERM raise `KeyboardInterrupt` in it, so that it removes unfinished files and restores the cursor.
+    So it removes unfinished files and restores the cursor before it exits with 130.
     """
-    before = {number: signal.signal(number, signal.default_int_handler) for number in STOPPING}
-    try:
-        return work()
-    except AiraError as error:
-        fail(error)
-    except KeyboardInterrupt:
-        if sys.stderr.isatty():  # a bar that is interrupted while it begins or ends leaves the cursor hidden
-            click.echo(SHOW_CURSOR, file=sys.stderr, nl=False)
-        sys.exit(INTERRUPTED)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+
+    @wraps(function)
+    def run(*arguments: P.args, **options: P.kwargs) -> T:
+        before = {number: signal.signal(number, signal.default_int_handler) for number in STOPPING}
+        try:
+            return function(*arguments, **options)
+        except KeyboardInterrupt:
+            if sys.stderr.isatty():  # a bar that is interrupted while it begins or ends leaves the cursor hidden
+                click.echo(SHOW_CURSOR, file=sys.stderr, nl=False)
+            sys.exit(INTERRUPTED)
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    return run
 
 
 def print_line(text: str = "") -> None:
@@ -63,15 +67,22 @@ def print_line(text: str = "") -> None:
     except OSError as error:
         with open(os.devnull, "w") as nowhere:  # flushing the rest of the buffer at exit would fail again
             os.dup2(nowhere.fileno(), sys.stdout.fileno())
-        fail(OutputFailed(f"can't write to stdout: {error.strerror}"))
+        fail(AiraError(f"can't write to stdout: {error.strerror}", code="output-failed"))
 
 
 def print_json(value: Any) -> None:
     """Print one JSON value on a line. Structs have the field names that they have on the wire.
 
-    Numbers that JSON can't hold exactly are printed as text, also NaN and infinity.
+    Numbers that JSON can't hold exactly are printed as text, also NaN and infinity; characters that stdout can't take
+    are escaped, so that nothing is lost.
     """
-    print_line(msgspec.json.encode(_exact(msgspec.to_builtins(value))).decode())
+    plain = _exact(msgspec.to_builtins(value))
+    try:
+        text = msgspec.json.encode(plain).decode()
+        text.encode(getattr(sys.stdout, "encoding", None) or "utf-8")
+    except UnicodeEncodeError:
+        text = json.dumps(plain, separators=(",", ":"))
+    print_line(text)
 
 
 def json_text(value: Any) -> str:
@@ -86,6 +97,16 @@ def print_facts(facts: Mapping[str, object]) -> None:
     width = max(map(len, known), default=0)
     for name, fact in known.items():
         print_line(f"{name:<{width}}{COLUMN_GAP}{fact}".rstrip())
+
+
+def print_result(result: Mapping[str, object], shown: Mapping[str, object] | str, *, as_json: bool) -> None:
+    """Print what a command has done: `result` as JSON, or what is `shown` to people, facts or a line."""
+    if as_json:
+        print_json(result)
+    elif isinstance(shown, str):
+        print_line(shown)
+    else:
+        print_facts(shown)
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[object]], *, numbers: Sequence[str] = ()) -> None:
@@ -128,10 +149,9 @@ def format_size(size: int) -> str:
 
 def format_duration(nanoseconds: int) -> str:
     """A duration for people: `1.5 s`, or `1:02:03` from two minutes on."""
-    seconds = nanoseconds / 1e9
-    if seconds < 120:
-        return f"{seconds:.3f}".rstrip("0").rstrip(".") + " s"
-    minutes, rest = divmod(int(seconds), 60)
+    if nanoseconds < 120 * 10**9:
+        return f"{nanoseconds / 1e9:.3f}".rstrip("0").rstrip(".") + " s"
+    minutes, rest = divmod(nanoseconds // 10**9, 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}"
 
@@ -144,7 +164,7 @@ def announce(log: Logger, event: str, text: str, **fields: object) -> None:
     """
     import logging
 
-    from mesh.log_context import log_event
+    from mesh.base.log_context import log_event
     from mesh.telemetry.logs import process_log
 
     own = process_log()

@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from traceback import extract_tb
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from mesh.cli.errors import ProgramUnusable
-from mesh.errors import AiraError
+from mesh.errors import AiraError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,7 +20,7 @@ K = TypeVar("K")
 def run_program(path: Path, kind: type[Any]) -> dict[str, Any]:
     """The names that a Python program has, which is run without starting its agent (`kind`).
 
-    Raises `ProgramUnusable`, and any `AiraError` of the program.
+    Raises `InputError`, and any `AiraError` of the program.
     """
     with _importing_from(path.parent), _not_running(kind, path) as started:
         try:
@@ -34,14 +33,18 @@ def run_program(path: Path, kind: type[Any]) -> dict[str, Any]:
             lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
             where = f"{path}:{lines[-1]}" if lines else str(path)
             why = " ".join(str(error).split())
-            raise ProgramUnusable(f"can't run {where}: {type(error).__name__}: {why}") from error
+            raise InputError(f"can't run {where}: {type(error).__name__}: {why}", code="program-unusable") from error
 
 
 def only(names: dict[str, Any], kind: type[K], path: Path, *, hint: str) -> K | None:
-    """The one object of that kind that a program has, None if there is none. Raises `ProgramUnusable` for several."""
+    """The one object of that kind that a program has, None if there is none. Raises `InputError` for several."""
     found = {name: value for name, value in names.items() if isinstance(value, kind)}
     if len(set(map(id, found.values()))) > 1:
-        raise ProgramUnusable(f"{path} has several objects {kind.__name__}: {', '.join(sorted(found))}", hint=hint)
+        raise InputError(
+            f"{path} has several objects {kind.__name__}: {', '.join(sorted(found))}",
+            hint=hint,
+            code="program-unusable",
+        )
     return next(iter(found.values()), None)
 
 
@@ -66,8 +69,10 @@ def _not_running(kind: type[Any], path: Path) -> Iterator[list[Any]]:
 
     async def refuse(agent: Any) -> NoReturn:
         started.append(agent)
-        raise ProgramUnusable(
-            f"{path} starts its {kind.__name__.lower()}", hint='do that below `if __name__ == "__main__":`'
+        raise InputError(
+            f"{path} starts its {kind.__name__.lower()}",
+            hint='do that below `if __name__ == "__main__":`',
+            code="program-unusable",
         )
 
     kind.run, kind.__aenter__ = lambda agent: None, refuse

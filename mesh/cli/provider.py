@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Final
 import click
 from msgspec.structs import asdict
 
-from mesh.background import Background
+from mesh.base.background import Background
+from mesh.base.log_context import LogSource, log_event
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
-from mesh.log_context import LogSource, log_event
-from mesh.running import run_until_stopped
-from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
-from mesh.starting import open_when_ready, serve_on_each_chain, wait_for_files
+from mesh.role.running import open_when_ready, run_until_stopped, serve_on_each_chain, wait_for_files
+from mesh.settings import AccountSettings, ChainSettings, NetworkSettings, TelemetrySettings
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 
@@ -37,16 +36,17 @@ REPORT_INTERVAL: Final = 600.0
 
 @click.command("provider")
 @with_settings(
-    *options_of(NetworkSettings),
+    NetworkSettings,
     "lighthouse_contract",
-    "keyfile",
-    "keyfile_password_file",
-    *options_of(ChainSettings),
+    AccountSettings,
+    ChainSettings,
     "open_orders_limit",
     "unmined_limit",
+    "free_contracts",
+    "customers",
     "deadline_limit",
     "blocked_signers",
-    *options_of(TelemetrySettings),
+    TelemetrySettings,
 )
 def command(settings: Settings) -> None:
     """Match the demands and offers of a lighthouse, create liabilities and finalize them. Ctrl-C stops it.
@@ -58,7 +58,7 @@ def command(settings: Settings) -> None:
 
 
 async def serve(settings: Settings) -> None:
-    from mesh.composition import load_account
+    from mesh.role.composition import load_account
 
     lighthouse = settings.lighthouse_contract
     async with AsyncExitStack() as stack:
@@ -80,9 +80,9 @@ async def _open_provider(
     settings: Settings, account: Account, telemetry: Telemetry
 ) -> AsyncIterator[tuple[Network, Provider]]:
     """The provider with its chain and network, and its metrics. Raises `AiraError` for what is not ready yet."""
-    from mesh.composition import chain_of, endpoints_of, provider_of
-    from mesh.market.provider import ProviderProcess, check_account
+    from mesh.market.provider import ProviderProcess, check_account, provider_of
     from mesh.network import Network
+    from mesh.role.composition import chain_of, endpoints_of
 
     async with chain_of(settings, account) as chain:
         await check_account(chain, settings.lighthouse_contract)

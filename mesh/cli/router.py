@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.background import Background
-from mesh.cli.errors import FileUnwritable, RosterMissing
-from mesh.cli.options import with_json, with_settings
+from mesh.base.background import Background
+from mesh.base.flood import Drops
+from mesh.base.log_context import log_event
+from mesh.base.outage_log import OutageLog
+from mesh.cli.options import FILE, with_json, with_settings
 from mesh.cli.output import announce, plural, print_json, print_table, printable
-from mesh.errors import AiraError
-from mesh.flood import Drops
-from mesh.log_context import log_event
-from mesh.outage_log import OutageLog
-from mesh.running import fail, run_until_stopped
-from mesh.settings import TelemetrySettings, options_of
+from mesh.errors import AiraError, ConfigurationError
+from mesh.role.running import run_until_stopped
+from mesh.settings import TelemetrySettings
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from contextlib import AbstractContextManager
 
-    from mesh.identity import Roster
     from mesh.network import Endpoints, Network
+    from mesh.ops.identity import Roster
     from mesh.settings import Settings
     from mesh.telemetry.metrics import MetricFamily
 
@@ -48,7 +48,7 @@ ROSTER_INTERVAL: Final = 1.0
 
 
 @click.group("router", invoke_without_command=True)
-@with_settings(*SITE_SETTINGS, *options_of(TelemetrySettings))
+@with_settings(*SITE_SETTINGS, TelemetrySettings)
 @click.pass_context
 def command(context: click.Context, settings: Settings) -> None:
     """Run a Zenoh router, through which agents, providers and people exchange messages. Ctrl-C stops it.
@@ -64,7 +64,7 @@ def command(context: click.Context, settings: Settings) -> None:
 
 @command.command("acl", short_help="show the rights of each member")
 @click.option("--check", is_flag=True, help="print a readable table instead of Zenoh's rules")
-@click.option("--roster", type=click.Path(dir_okay=False, path_type=Path), help="roster [the settings']")
+@click.option("--roster", type=FILE, help="roster [the settings']")
 @with_json
 @click.pass_obj
 def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> None:
@@ -72,12 +72,12 @@ def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> 
 
     The router denies everything else.
     """
-    from mesh.identity import access_control
+    from mesh.ops.identity import access_control, read_roster
 
-    try:
-        found = _roster(settings, roster)
-    except AiraError as error:
-        fail(error)
+    if roster is None and not settings.roster:
+        hint = "give --roster; `aira identity new --roster FILE` creates one"
+        raise ConfigurationError("no roster is set", hint=hint, code="roster-missing")
+    found = read_roster(roster or Path(settings.roster).expanduser())
     if not check:
         print_json(access_control(found))
     elif as_json:
@@ -93,7 +93,7 @@ def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> 
 
 
 @command.command("config", short_help="write an equivalent configuration for zenohd")
-@click.option("--out", required=True, type=click.Path(dir_okay=False, path_type=Path), help="file to write (JSON5)")
+@click.option("--out", required=True, type=FILE, help="file to write (JSON5)")
 @click.pass_obj
 def config(settings: Settings, out: Path) -> None:
     """Write a configuration file with which `zenohd` behaves like `aira router` with the same options.
@@ -101,52 +101,49 @@ def config(settings: Settings, out: Path) -> None:
     Give those options before `config`. zenohd reads the file only when it starts: after a change of the roster, write
     it again and restart zenohd.
     """
-    from mesh.identity.routers import router_endpoints, zenohd_configuration
+    from mesh.cli.files import writing
+    from mesh.ops.identity.routers import router_endpoints, zenohd_configuration
 
-    try:
-        text = zenohd_configuration(router_endpoints(settings))
-        try:
-            out.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise FileUnwritable(f"can't write {out}: {error.strerror}") from None
-    except AiraError as error:
-        fail(error)
+    text = zenohd_configuration(router_endpoints(settings))
+    with writing(out):
+        out.write_text(text, encoding="utf-8")
     click.echo(f"zenohd --config {out}")
 
 
 async def serve(settings: Settings) -> None:
-    from mesh.identity.routers import router_endpoints
     from mesh.network import Network
-    from mesh.network.connections import blocked_sessions_at, guard, report_traffic
-    from mesh.network.endpoints import allow_sessions
-    from mesh.starting import wait_for_files
+    from mesh.network.endpoints import allow_sessions, with_free_ports
+    from mesh.network.session import BlockedSessions, guard, report_traffic
+    from mesh.ops.identity.routers import router_endpoints
+    from mesh.role.running import wait_for_files
 
     allow_sessions(settings.max_sessions)
-    drops, blocked = Drops(), blocked_sessions_at(settings.blocked_sessions)
+    drops = Drops()
+    blocked = BlockedSessions(settings.blocked_sessions) if settings.blocked_sessions else None
     async with Telemetry(settings.metrics_listen) as telemetry:
         await wait_for_files(settings)
+        settings = replace(settings, listen=with_free_ports(settings.listen))
         endpoints = router_endpoints(settings)
         while True:
             certificate = _own_certificate(endpoints)
             async with Network(endpoints) as network:
                 # Served first: a reader of the announcement may ask for the health at once.
                 with _serve_metrics(telemetry, network, drops):
-                    announce(
-                        log,
-                        "router-started",
-                        f"router {network.id} listens at {', '.join(settings.listen)}",
-                        zenoh=network.id,
-                    )
-                    announce(log, "access-loaded", _describe_access(endpoints))
+                    words = f"router {network.id} listens at {', '.join(settings.listen)}"
+                    announce(log, "router-started", words, zenoh=network.id)
+                    words = "no roster: every client on this machine may do everything; other machines can't connect"
+                    if endpoints.access is not None:
+                        members = plural(len(endpoints.access["subjects"]), "member")
+                        words = f"roster: {members} admitted by certificate"
+                    announce(log, "access-loaded", words)
                     async with Background() as tasks:
                         if blocked is not None:
                             tasks.start(guard(network.session, blocked, drops), "blocked sessions")
                         tasks.start(report_traffic(network.session), "traffic")
                         tasks.start(drops.run(), "drops")
                         endpoints = await _wait_for_change(settings, endpoints, certificate)
-            log.info(
-                "the roster or the certificate changed: restarting the router", extra=log_event("router-restarted")
-            )
+            words = "the roster or the certificate changed: restarting the router"
+            log.info(words, extra=log_event("router-restarted"))
 
 
 def _serve_metrics(telemetry: Telemetry, network: Network, drops: Drops) -> AbstractContextManager[None]:
@@ -161,7 +158,7 @@ def _serve_metrics(telemetry: Telemetry, network: Network, drops: Drops) -> Abst
 
 async def _wait_for_change(settings: Settings, endpoints: Endpoints, certificate: bytes) -> Endpoints:
     """Wait until the roster or the certificate changes; the new endpoints. Invalid changes are logged and ignored."""
-    from mesh.identity.routers import router_endpoints
+    from mesh.ops.identity.routers import router_endpoints
 
     outages = OutageLog(log, "roster")
     while True:
@@ -186,34 +183,12 @@ def _own_certificate(endpoints: Endpoints) -> bytes:
         return b""
 
 
-def _describe_access(endpoints: Endpoints) -> str:
-    if endpoints.access is None:
-        return "no roster: every client on this machine may do everything; other machines can't connect"
-    return f"roster: {plural(len(endpoints.access['subjects']), 'member')} admitted by certificate"
-
-
-def _roster(settings: Settings, path: Path | None) -> Roster:
-    from mesh.identity import read_roster
-
-    if path is None and not settings.roster:
-        raise RosterMissing("no roster is set", hint="give --roster; `aira identity new --roster FILE` creates one")
-    return read_roster(path or Path(settings.roster).expanduser())
-
-
 def _access(roster: Roster) -> list[dict[str, Any]]:
     """The rights of each member; revoked members have none."""
-    from mesh.identity import access_of
+    from mesh.ops.identity import access_of
 
     found: dict[str, dict[str, list[str]]] = {member.address: {} for member in roster.member}
     for member, right, keys in access_of(roster):
         found[member.address][right.value] = list(keys)
-    return [
-        {
-            "name": member.name,
-            "address": member.address,
-            "roles": list(member.roles),
-            "revoked": member.revoked,
-            "may": found[member.address],
-        }
-        for member in roster.member
-    ]
+    named = ("name", "address", "roles", "revoked")
+    return [{name: getattr(one, name) for name in named} | {"may": found[one.address]} for one in roster.member]

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 import msgspec
 
 from mesh.amounts import ETH
-from mesh.cli.errors import InvalidArgument, UnknownJob, UnknownService
-from mesh.cli.options import with_json, with_settings
+from mesh.base.suggestions import nearest
+from mesh.cli.options import with_json, with_settings, with_timeout
 from mesh.cli.output import print_facts, print_json, print_line, print_table, printable
 from mesh.cli.status import describe_status
-from mesh.settings import NetworkSettings, options_of
-from mesh.suggestions import nearest
+from mesh.errors import InputError
+from mesh.settings import NetworkSettings
 from schemas import InvalidRecord, Record, parse_address
-from schemas.logs import LogsRead
+from schemas.decoding import InvalidData, decode_json
 from schemas.records import UInt256
 from schemas.rpc import GUARDED, SERVICES, Balance, Done, LiabilityRead
-from schemas.status import Status
+from schemas.status import LogsRead, Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,6 +27,14 @@ if TYPE_CHECKING:
 
 
 ETH_BALANCES: Final = frozenset({"eth/eth_balance", "eth/account_eth_balance"})
+BOOLEANS: Final = {"true": True, "yes": True, "false": False, "no": False}
+TYPES: Final[Mapping[Any, str]] = {
+    UInt256: "a whole number, in the smallest unit",
+    bool: "true or false",
+    int: "a whole number",
+    str: "text",
+}
+"""How error messages name the values of each type."""
 
 
 @click.command("rpc")
@@ -35,13 +42,9 @@ ETH_BALANCES: Final = frozenset({"eth/eth_balance", "eth/account_eth_balance"})
 @click.argument("service", required=False)
 @click.argument("arguments", nargs=-1, metavar="[NAME=VALUE … | JSON]")
 @click.option("--list", "as_list", is_flag=True, help="list the services with their arguments and answers")
-@click.option(
-    "--timeout",
-    type=click.FloatRange(min=0, min_open=True),
-    help="seconds to wait for the answer [10; 240 for services that send a transaction]",
-)
+@with_timeout(None, meaning="seconds to wait for the answer [10; 240 for services that send a transaction]")
 @with_json
-@with_settings(*options_of(NetworkSettings))
+@with_settings(NetworkSettings)
 async def command(
     settings: Settings,
     address: str | None,
@@ -62,22 +65,40 @@ async def command(
     """
     if as_list:
         _list_services(as_json=as_json)
-    elif address is None or service is None:
+        return
+    if address is None or service is None:
         raise click.UsageError("ADDRESS and SERVICE are required; --list shows the services")
+    from mesh.network import Network, ServiceFailed, call
+    from mesh.role.composition import endpoints_of
+    from mesh.telemetry.logs import human_line
+
+    address, request = parse_address(address), request_of(service, arguments)
+    async with Network(endpoints_of(settings)) as network:
+        reply = await call(network.session, address, service, request, timeout=timeout)
+    if as_json:
+        print_json(decode_json(reply.encode()))
+    if isinstance(reply, Done) and not reply.success:
+        raise ServiceFailed(f"{service}: {printable(reply.msg) or 'the service failed'}", service=service)
+    if isinstance(reply, LiabilityRead) and not reply.read:
+        asked = getattr(request, "address", "it")
+        raise InputError(f"the agent at {address} has no job for {asked}", code="unknown-job")
+    if as_json:
+        return
+    if isinstance(reply, LogsRead):
+        for event in reply.entries:
+            print_line(human_line(event))
+    elif service in ETH_BALANCES and isinstance(reply, Balance):
+        print_facts({"balance": ETH.show(reply.balance)})  # only the agent knows the unit of its token
     else:
-        await call_service(settings, (address, service, arguments), timeout=timeout, as_json=as_json)
+        print_facts(_describe(reply) or {service: "done"})
 
 
 def _list_services(*, as_json: bool) -> None:
     if as_json:
-        services = {
-            name: {
-                "arguments": argument_names(kinds.request),
-                "answer": argument_names(kinds.reply),
-                "guarded": name in GUARDED,
-            }
-            for name, kinds in SERVICES.items()
-        }
+        services = {}
+        for name, kinds in SERVICES.items():
+            takes, answers = argument_names(kinds.request), argument_names(kinds.reply)
+            services[name] = {"arguments": takes, "answer": answers, "guarded": name in GUARDED}
         print_json(services)
         return
     rows = [
@@ -90,37 +111,6 @@ def _list_services(*, as_json: bool) -> None:
 def _names(kind: type[Record], most: int) -> str:
     names = argument_names(kind)
     return " ".join(names if len(names) <= most else [*names[:most], "…"]) or "none"
-
-
-async def call_service(
-    settings: Settings, called: tuple[str, str, tuple[str, ...]], *, timeout: float | None, as_json: bool
-) -> None:
-    from mesh.composition import endpoints_of
-    from mesh.network import Network, ServiceFailed, call
-    from mesh.telemetry.events import human_line
-
-    address, service, arguments = parse_address(called[0]), called[1], called[2]
-    request = request_of(service, arguments)
-    async with Network(endpoints_of(settings)) as network:
-        reply = await call(network.session, address, service, request, timeout=timeout)
-    if as_json:
-        print_json(msgspec.json.decode(reply.encode()))
-    if isinstance(reply, Done) and not reply.success:
-        raise ServiceFailed(service, printable(reply.msg) or "the service failed")
-    if isinstance(reply, LiabilityRead) and not reply.read:
-        raise UnknownJob(f"the agent at {address} has no job for {getattr(request, 'address', 'it')}")
-    if isinstance(reply, LogsRead) and not as_json:
-        for event in reply.entries:
-            print_line(human_line(event))
-    elif not as_json:
-        print_facts(_balance_of(service, reply) or _describe(reply) or {service: "done"})
-
-
-def _balance_of(service: str, reply: Record) -> dict[str, str]:
-    """A balance of ETH with its unit. Only the agent knows its token's unit, so other balances are plain numbers."""
-    if service in ETH_BALANCES and isinstance(reply, Balance):
-        return {"balance": ETH.show(reply.balance)}
-    return {}
 
 
 def _describe(reply: Record) -> dict[str, str]:
@@ -148,71 +138,71 @@ def _fact(value: object) -> str:
     return printable(str(value))
 
 
-BOOLEANS: Final = {"true": True, "yes": True, "false": False, "no": False}
-
-
-TYPES: Final[Mapping[Any, str]] = {
-    UInt256: "a whole number, in the smallest unit",
-    bool: "true or false",
-    int: "a whole number",
-    str: "text",
-}
-"""How error messages name the values of each type."""
-
-
 def argument_names(kind: type[Record]) -> list[str]:
     """The wire names of a record's fields; optional ones are in brackets."""
-    return [field.encode_name if field.required else f"[{field.encode_name}]" for field in _fields(kind)]
+    return [field.encode_name if field.required else f"[{field.encode_name}]" for field in msgspec.structs.fields(kind)]
 
 
 def request_of(service: str, arguments: Sequence[str]) -> Record:
-    """The request to a service with these arguments. Raises `UnknownService`, `InvalidArgument`."""
+    """The request to a service with these arguments. Raises `InputError`."""
     if service not in SERVICES:
         near = nearest(service, SERVICES)
         meant = f"did you mean {near}? " if near else ""
-        raise UnknownService(f"there is no service {service[:60]!r}", hint=f"{meant}--list shows all services")
+        raise InputError(
+            f"there is no service {service[:60]!r}", hint=f"{meant}--list shows all services", code="unknown-service"
+        )
     kind = SERVICES[service].request
     given = _given(arguments)
     _check_names(service, kind, given)
-    values = {field.encode_name: _value(service, field, given[field.encode_name]) for field in _named(kind, given)}
+    values = {
+        field.encode_name: _value(service, field, given[field.encode_name])
+        for field in msgspec.structs.fields(kind)
+        if field.encode_name in given
+    }
     try:
         return kind.decode(msgspec.json.encode(values))
     except InvalidRecord as error:
-        raise InvalidArgument(f"{service}: {error}") from None
+        raise InputError(f"{service}: {error}", code="invalid-argument") from None
 
 
 def _given(arguments: Sequence[str]) -> dict[str, Any]:
     """The arguments by name."""
     if len(arguments) == 1 and arguments[0].lstrip().startswith("{"):
         try:
-            found = json.loads(arguments[0])
-        except (ValueError, RecursionError) as error:
-            raise InvalidArgument(f"the arguments are not JSON: {error}") from None
-        assert isinstance(found, dict)
-        return found
+            return decode_json(arguments[0], dict[str, Any])
+        except InvalidData as error:
+            raise InputError(f"the arguments are not JSON: {error}", code="invalid-argument") from None
     given: dict[str, Any] = {}
     for argument in arguments:
         name, equals, value = argument.partition("=")
         if not equals or not name:
-            raise InvalidArgument(f"{argument[:60]!r} is not an argument", hint="write name=value, or one JSON object")
+            raise InputError(
+                f"{argument[:60]!r} is not an argument",
+                hint="write name=value, or one JSON object",
+                code="invalid-argument",
+            )
         if name in given:
-            raise InvalidArgument(f"the argument {name[:60]} is given twice")
+            raise InputError(f"the argument {name[:60]} is given twice", code="invalid-argument")
         given[name] = value
     return given
 
 
 def _check_names(service: str, kind: type[Record], given: Mapping[str, Any]) -> None:
-    known = [field.encode_name for field in _fields(kind)]
+    known = [field.encode_name for field in msgspec.structs.fields(kind)]
     takes = f"{service} takes {', '.join(argument_names(kind)) or 'no arguments'}"
     for name in given:
         if name not in known:
             near = nearest(name, known)
-            raise InvalidArgument(
-                f"{service} has no argument {name[:60]!r}", hint=f"did you mean {near}? {takes}" if near else takes
+            raise InputError(
+                f"{service} has no argument {name[:60]!r}",
+                hint=f"did you mean {near}? {takes}" if near else takes,
+                code="invalid-argument",
             )
-    missing = [field.encode_name for field in _fields(kind) if field.required and field.encode_name not in given]
+    missing = [
+        field.encode_name for field in msgspec.structs.fields(kind) if field.required and field.encode_name not in given
+    ]
     if missing:
-        raise InvalidArgument(f"{service} needs {', '.join(missing)}", hint=takes)
+        raise InputError(f"{service} needs {', '.join(missing)}", hint=takes, code="invalid-argument")
 
 
 def _value(service: str, field: msgspec.structs.FieldInfo, given: Any) -> Any:
@@ -229,12 +219,6 @@ def _value(service: str, field: msgspec.structs.FieldInfo, given: Any) -> Any:
             return given
     if kind not in TYPES or (type(given) is kind and kind is not UInt256):
         return given
-    raise InvalidArgument(f"{service}: {field.encode_name} is {str(given)[:60]!r}, but must be {TYPES[kind]}")
-
-
-def _fields(kind: type[Record]) -> tuple[msgspec.structs.FieldInfo, ...]:
-    return msgspec.structs.fields(kind)
-
-
-def _named(kind: type[Record], given: Mapping[str, Any]) -> list[msgspec.structs.FieldInfo]:
-    return [field for field in _fields(kind) if field.encode_name in given]
+    raise InputError(
+        f"{service}: {field.encode_name} is {str(given)[:60]!r}, but must be {TYPES[kind]}", code="invalid-argument"
+    )

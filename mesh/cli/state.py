@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import click
 
 from mesh.cli.options import FILE, with_json, with_settings
-from mesh.cli.output import format_size, plural, print_facts, print_json, print_table, printable
+from mesh.cli.output import format_size, plural, print_facts, print_json, print_result, print_table, printable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from mesh.ops.state import ArchiveContents, ContentScope, Inventory
     from mesh.settings import Settings
-    from mesh.state import ArchiveContents, Inventory
 
 
 @click.group("state")
@@ -33,7 +33,7 @@ async def show(settings: Settings, file: Path | None, as_json: bool) -> None:
     """Show the state of the agents of the data folder; they may be running. With FILE, verify the checksums of that
     backup and show its content.
     """
-    from mesh.state import examine_archive, take_inventory
+    from mesh.ops.state import examine_archive, take_inventory
 
     if file is None:
         inventory = await take_inventory(settings.state_directory)
@@ -54,29 +54,25 @@ async def show(settings: Settings, file: Path | None, as_json: bool) -> None:
 )
 @with_json
 @with_settings("data_dir")
-async def backup(settings: Settings, file: Path, content: str, as_json: bool) -> None:
+async def backup(settings: Settings, file: Path, content: ContentScope, as_json: bool) -> None:
     """Write the state of the agents of the data folder to FILE (tar.zst). An existing FILE is replaced at the end.
 
     The agents may be running: the backup contains what a crash at one moment would leave.
     """
     from dataclasses import asdict
 
-    from mesh.state import ContentScope, back_up
+    from mesh.ops.state import back_up
 
-    done = await back_up(settings.state_directory, file, content=ContentScope(content))
-    if as_json:
-        print_json({"file": str(file), **asdict(done)})
-        return
-    print_facts(
-        {
-            "backup": file,
-            "size": format_size(done.size),
-            "accounts": ", ".join(done.accounts) or None,
-            "open jobs": done.jobs,
-            "content": plural(done.files, "file"),
-            "missing": ", ".join(done.missing) or None,
-        }
-    )
+    done = await back_up(settings.state_directory, file, content=content)
+    facts = {
+        "backup": file,
+        "size": format_size(done.size),
+        "accounts": ", ".join(done.accounts) or None,
+        "open jobs": done.jobs,
+        "content": plural(done.files, "file"),
+        "missing": ", ".join(done.missing) or None,
+    }
+    print_result({"file": str(file), **asdict(done)}, facts, as_json=as_json)
 
 
 @command.command("restore", short_help="restore a backup")
@@ -96,43 +92,25 @@ async def restore(settings: Settings, file: Path, existing: str, as_json: bool) 
     Changes nothing unless FILE is valid as a whole. Make sure that the agent that was backed up never runs again: two
     agents with one account would do every job twice.
     """
-    from mesh.state import ExistingState
-    from mesh.state import restore as restore_backup
+    from mesh.ops.state import restore as restore_backup
 
     folder = settings.state_directory
-    done = await restore_backup(file, folder, existing=ExistingState(existing))
+    done = await restore_backup(file, folder, set_aside=existing == "set-aside")
     jobs = {job.liability.address: job.phase.value for job in done.jobs}
-    if as_json:
-        aside = None if done.aside is None else str(done.aside)
-        print_json({"folder": str(folder), "made": done.made, "parts": done.parts, "jobs": jobs, "aside": aside})
-        return
-    print_facts(
-        {
-            "restored to": folder,
-            "backup of": printable(done.made),
-            "old state": done.aside,
-            "open jobs": len(jobs),
-        }
-    )
-    print_facts(jobs)
+    result = {"folder": str(folder), "made": done.made, "parts": done.parts, "jobs": jobs}
+    facts = {"restored to": folder, "backup of": printable(done.made), "old state": done.aside, "open jobs": len(jobs)}
+    print_result(result | {"aside": done.aside and str(done.aside)}, facts, as_json=as_json)
+    if not as_json:
+        print_facts(jobs)
 
 
 def _print_inventory(found: Inventory) -> None:
     rows = []
     for account in found.accounts:
-        rows += [
-            (
-                account.address,
-                chain.chain,
-                "-" if chain.block is None else chain.block,
-                _counted(chain.jobs),
-                _counted(chain.verdicts),
-                chain.waiting,
-                chain.recordings,
-                ", ".join(chain.provides) or "-",
-            )
-            for chain in account.chains
-        ]
+        for one in account.chains:
+            counts = _counted(one.jobs), _counted(one.verdicts), one.waiting, one.recordings
+            block = "-" if one.block is None else one.block
+            rows.append((account.address, one.chain, block, *counts, ", ".join(one.provides) or "-"))
     if rows:
         print_table(("ACCOUNT", "CHAIN", "BLOCK", "JOBS", "VERDICTS", "TO SEND", "RECORDING", "PROVIDER OF"), rows)
     print_facts(

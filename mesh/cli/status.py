@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from mesh.amounts import ETH, XRT
-from mesh.cli.errors import NoAnswer
-from mesh.cli.options import with_json, with_settings
+from mesh.base.flood import Drops
+from mesh.cli.options import with_json, with_settings, with_timeout
 from mesh.cli.output import (
     format_duration,
     format_size,
@@ -20,51 +19,43 @@ from mesh.cli.output import (
     print_table,
     printable,
 )
-from mesh.flood import Drops
-from mesh.settings import NetworkSettings, options_of
-from mesh.telemetry.health import is_healthy
+from mesh.settings import NetworkSettings
+from mesh.telemetry.metrics import is_healthy
 from schemas import parse_address
+from schemas.decoding import decode_json
 from schemas.status import ALIVE, BridgeStatus, Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from mesh.settings import Settings
-    from mesh.watching import PresentPeer, RoleStatus
+    from mesh.watching import RoleStatus
     from schemas.status import ContentMetrics, DirectionStatus, MarketStatus, StoreUse, ValidationStatus, Work
 
 
 @click.command("status")
 @click.argument("address", required=False)
-@click.option(
-    "--timeout", type=click.FloatRange(min=0, min_open=True), default=3.0, show_default=True, help="seconds to wait"
-)
+@with_timeout()
 @with_json
-@with_settings(*options_of(NetworkSettings), "lighthouse_contract")
+@with_settings(NetworkSettings, "lighthouse_contract")
 async def status(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
     """Show the status of the agent, provider, validator or bridge with ADDRESS: the health of its parts, the last block
     read, and its jobs, its market or its cases.
 
     Without ADDRESS, show one line for each peer on the lighthouse's channel; with --json one object for all.
     """
-    if address is None:
-        await show_all(settings, timeout=timeout, as_json=as_json)
-    else:
-        await show_one(settings, address, timeout=timeout, as_json=as_json)
-
-
-async def show_one(settings: Settings, named: str, *, timeout: float, as_json: bool) -> None:
-    from mesh.agent.components import watching
+    from mesh.network import no_answer
+    from mesh.role.composition import watching
     from mesh.watching import status_of
 
-    address = parse_address(named)
+    if address is None:
+        await _show_all(settings, timeout=timeout, as_json=as_json)
+        return
+    address = parse_address(address)
     async with watching(settings) as (network, channel):
         found = await status_of(network.session, address, channel.lighthouse, timeout=timeout)
     if not found:
-        raise NoAnswer(
-            f"no answer from {address}",
-            hint="check with `aira peers` that it runs on this router; for a bridge give its --lighthouse-contract",
-        )
+        raise no_answer(address)
     if as_json:
         print_json([_status_json(status) for status in found])
         return
@@ -74,8 +65,8 @@ async def show_one(settings: Settings, named: str, *, timeout: float, as_json: b
         print_facts(describe_status(status))
 
 
-async def show_all(settings: Settings, *, timeout: float, as_json: bool) -> None:
-    from mesh.agent.components import watching
+async def _show_all(settings: Settings, *, timeout: float, as_json: bool) -> None:
+    from mesh.role.composition import watching
     from mesh.watching import BRIDGE, PROVIDER, present, statuses
 
     drops = Drops()
@@ -107,61 +98,44 @@ def _unlisted(drops: Drops) -> int:
 
 def _status_json(how: RoleStatus | None) -> dict[str, Any] | None:
     """A status as it is on the wire."""
-    return None if how is None else json.loads(how.encode())
+    return None if how is None else decode_json(how.encode())
 
 
 @click.command("peers")
 @with_json
-@with_settings(*options_of(NetworkSettings), "lighthouse_contract")
+@with_settings(NetworkSettings, "lighthouse_contract")
 async def peers(settings: Settings, as_json: bool) -> None:
     """List the peers on the lighthouse's channel by role and address, and count the nodes on the IPFS side.
 
     Watchers are not listed. `aira status` shows the status of each peer.
     """
-    await show_peers(settings, as_json=as_json)
-
-
-async def show_peers(settings: Settings, *, as_json: bool) -> None:
-    from mesh.agent.components import watching
+    from mesh.role.composition import watching
     from mesh.watching import BRIDGE, PROVIDER, present, statuses
-    from schemas.status import BridgeStatus
 
     drops = Drops()
     async with watching(settings, drops=drops) as (network, channel):
         bridges = await present(channel, BRIDGE)
         found = await statuses(network.session, channel, bridges)
         peers = sorted({*await present(channel, PROVIDER), *bridges, *await present(channel)})
-    states = {peer: status for peer, status in found.items() if isinstance(status, BridgeStatus)}
+    states = [status for status in found.values() if isinstance(status, BridgeStatus)]
+    # The count of the active bridge is used, or else of the one that sees most nodes.
+    best = max(states, key=lambda how: (how.carries, len(how.ipfs_peers)), default=None)
     if as_json:
-        print_json(_peers_json(channel.lighthouse, peers, states) | {"unlisted": _unlisted(drops)})
+        listed = [{"role": peer.role, "address": peer.address} for peer in peers]
+        nodes = None if best is None else list(best.ipfs_peers)
+        about = {"lighthouse": channel.lighthouse, "peers": listed, "ipfsPeers": nodes}
+        print_json(about | {"unlisted": _unlisted(drops)})
         return
     if peers:
         print_table(("role", "address"), [(peer.role, peer.address) for peer in peers])
-    print_line(f"{plural(len(peers), 'peer')} on {channel.lighthouse}; IPFS side: {_ipfs_side(bridges, states)}")
-    _unlisted(drops)
-
-
-def _peers_json(lighthouse: str, peers: list[PresentPeer], states: dict[PresentPeer, BridgeStatus]) -> dict[str, Any]:
-    best = _best(states)
-    return {
-        "lighthouse": lighthouse,
-        "peers": [{"role": peer.role, "address": peer.address} for peer in peers],
-        "ipfsPeers": None if best is None else list(best.ipfs_peers),
-    }
-
-
-def _ipfs_side(bridges: list[PresentPeer], states: dict[PresentPeer, BridgeStatus]) -> str:
-    """How many nodes of the legacy network are on the channel, according to a bridge."""
-    best = _best(states)
     if best is None:
-        return "unknown, no bridge answers" if bridges else "unknown, there is no bridge"
-    nodes = plural(len(best.ipfs_peers), "node")
-    return nodes if best.state in ("connected", "alone") else f"{nodes}; the bridge reports: {printable(best.state)}"
-
-
-def _best(states: dict[PresentPeer, BridgeStatus]) -> BridgeStatus | None:
-    """The bridge whose count is used: the active one, or else the one that sees most nodes."""
-    return max(states.values(), key=lambda how: (how.carries, len(how.ipfs_peers)), default=None)
+        nodes_there = "unknown, no bridge answers" if bridges else "unknown, there is no bridge"
+    else:
+        nodes_there = plural(len(best.ipfs_peers), "node")
+        if best.state not in ("connected", "alone"):
+            nodes_there += f"; the bridge reports: {printable(best.state)}"
+    print_line(f"{plural(len(peers), 'peer')} on {channel.lighthouse}; IPFS side: {nodes_there}")
+    _unlisted(drops)
 
 
 PHASES: Final = ("incoming", "ready", "running", "complete")
@@ -189,7 +163,7 @@ def summarize_status(how: RoleStatus | None) -> str:
         failures = [f"{part} {state}" for part, state in how.parts.items() if not is_healthy(state)]
         words = [*(failures or [ALIVE]), f"block {how.head:,}"]
         if how.work is not None:
-            words.append(plural(_open_jobs(how.work), "open job"))
+            words.append(plural(sum(how.work.jobs.get(phase, 0) for phase in PHASES), "open job"))
         if how.market is not None:
             words += [plural(how.market.open_orders, "open order"), plural(how.market.created, "contract")]
         if how.validation is not None:
@@ -208,11 +182,8 @@ def _describe_participant(how: Status) -> dict[str, str]:
     facts |= {} if how.work is None else _describe_work(how.work)
     facts |= {} if how.market is None else _describe_market(how.market)
     facts |= {} if how.validation is None else _describe_validation(how.validation)
-    return facts | {
-        "uptime": format_duration(int(how.uptime) * 10**9),
-        "version": how.version,
-        "Zenoh id": how.zenoh_id,
-    }
+    uptime = format_duration(int(how.uptime) * 10**9)
+    return facts | {"uptime": uptime, "version": how.version, "Zenoh id": how.zenoh_id}
 
 
 def _describe_work(work: Work) -> dict[str, str]:
@@ -247,6 +218,7 @@ def _describe_market(market: MarketStatus) -> dict[str, str]:
     return {
         "open orders": f"{market.open_orders:,}",
         "contracts": f"{market.created:,} created, {market.finalized:,} finalized",
+        "free contracts": f"{market.free_created:,}; {market.free_left:,} left now, of {market.free_a_day:,} a day",
         "rejected": _counts(market.rejected),
         "earned": f"{XRT.show(market.fees + market.minted)}, including {XRT.show(market.fees)} of fees",
         "spent": f"{ETH.show(market.spent)} for {market.gas_used:,} gas",
@@ -291,7 +263,3 @@ def _counts(counts: Mapping[str, int]) -> str:
     """The total, and the count of each kind."""
     kinds = ", ".join(f"{count:,} {kind}" for kind, count in sorted(counts.items()))
     return f"{sum(counts.values()):,}" + (f" ({kinds})" if kinds else "")
-
-
-def _open_jobs(work: Work) -> int:
-    return sum(work.jobs.get(phase, 0) for phase in PHASES)

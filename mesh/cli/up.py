@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import shlex
 from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -11,19 +12,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from mesh.cli.errors import AnvilMissing
+from mesh.base.extras import PackageMissing
 from mesh.cli.options import BLOCK_TIME, PORT, with_json, with_settings
 from mesh.cli.output import announce, print_json
-from mesh.extras import PackageMissing
-from mesh.page import PAGE_PORT, free_page_port, page_server
-from mesh.running import run_until_stopped
-from mesh.settings import Settings, TelemetrySettings, options_of
+from mesh.dev.page import PAGE_PORT, free_page_port, page_server
+from mesh.errors import ConfigurationError
+from mesh.role.running import run_until_stopped
+from mesh.settings import Settings, TelemetrySettings
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from mesh.devchain.development import DevelopmentChain
+    from mesh.dev.development import DevelopmentChain
 
 
 def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -42,17 +43,20 @@ def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def find_engine(*, engine: str, anvil: Path | None, state: Path | None) -> Path | None:
-    """The program anvil, or None for the embedded chain. Raises `AnvilMissing`."""
-    from mesh.devchain.anvil import find_anvil
+    """The program anvil, or None for the embedded chain. Raises `ConfigurationError`."""
+    from mesh.dev.anvil import find_anvil
 
     program = None if engine == "embedded" else find_anvil(anvil)
     if engine == "anvil" and program is None:
-        raise AnvilMissing("anvil is not on the PATH", hint="give --anvil FILE, or use --engine embedded")
+        raise ConfigurationError(
+            "anvil is not on the PATH", hint="give --anvil FILE, or use --engine embedded", code="anvil-missing"
+        )
     if state is not None and program is None:
-        raise AnvilMissing(
+        raise ConfigurationError(
             "--state needs anvil, and "
             + ("--engine embedded was given" if engine == "embedded" else "anvil is not on the PATH"),
             hint="give --anvil FILE, or omit --state",
+            code="anvil-missing",
         )
     return program
 
@@ -75,7 +79,8 @@ log = logging.getLogger(__name__)
 @click.option("--web-port", type=PORT, help=f"port of the page [{PAGE_PORT}, or a free one if it is taken]")
 @click.option("--local-account", is_flag=True, help="let the page order for the person's account, without a wallet")
 @with_engine
-@with_settings("listen", "data_dir", *options_of(TelemetrySettings))
+@with_json
+@with_settings("listen", "data_dir", "generation", "free_contracts", TelemetrySettings)
 def command(
     settings: Settings,
     port: int,
@@ -83,16 +88,21 @@ def command(
     has_page: bool,
     web_port: int | None,
     local_account: bool,
+    as_json: bool,
     **engine: Any,
 ) -> None:
     """Run a market for development: a Zenoh router, a chain with the contracts, a provider, and the page. Ctrl-C stops
     it. The chain is lost then, unless --state stores it.
 
-    Writes keyfiles of a funded robot and a funded person to the data folder, and prints how to use them.
+    Writes keyfiles of a funded robot and a funded person to the data folder, and prints the `export` lines with which
+    another shell uses the market as the person. The markets of both generations run; --generation says which one these
+    lines name.
     """
     served_page = MarketPage(web_port, local_account) if has_page else None
     run_until_stopped(
-        lambda: serve_market(settings, port, block_time, page=served_page, **engine), settings=settings, role="up"
+        lambda: serve_market(settings, port, block_time, page=served_page, as_json=as_json, **engine),
+        settings=settings,
+        role="up",
     )
 
 
@@ -102,27 +112,29 @@ class MarketPage(NamedTuple):
     port: int | None
     has_account: bool
 
-    async def open(self, stack: AsyncExitStack, settings: Settings, served: DevelopmentChain) -> str:
-        """Serve it until `stack` closes; its address. Raises `PackageMissing`, `PortUnavailable`."""
-        from mesh.agent import Agent
+    async def open(self, stack: AsyncExitStack, settings: Settings, served: DevelopmentChain) -> tuple[str, str]:
+        """Serve it until `stack` closes: its address, or empty and why there is none. Raises `PortUnavailable`."""
+        from mesh.agent.agent import Agent
 
-        serve, port = page_server(), free_page_port(self.port)
-        deployment = served.market.deployment
+        try:
+            serve = page_server()
+        except PackageMissing as error:
+            return "", f"none: {error}; {error.hint}"
         own = replace(
             settings,
             connect=settings.listen,
             data_dir=str(settings.state_directory / "page"),
-            lighthouse_contract=deployment.lighthouse_name,
-            ens_contract=deployment.ens,
+            ens_contract=served.market.deployment.ens,
             metrics_listen="",
             enable_executor=False,
         )
+        port = free_page_port(self.port)
         chain = await stack.enter_async_context(served.market.chain(served.url, "person"))
         agent = None
         if self.has_account:
             account = served.market.accounts["person"]
             agent = await stack.enter_async_context(Agent(settings=own, account=account, chain=chain))
-        return await stack.enter_async_context(serve(own, port=port, chain=chain, agent=agent))
+        return await stack.enter_async_context(serve(own, port=port, chain=chain, agent=agent)), ""
 
 
 async def serve_market(
@@ -131,17 +143,20 @@ async def serve_market(
     block_time: float,
     *,
     page: MarketPage | None = None,
+    as_json: bool = False,
     engine: str = "auto",
     anvil: Path | None = None,
     state: Path | None = None,
 ) -> None:
-    from mesh.composition import provider_files
-    from mesh.devchain.development import serve_chain
-    from mesh.identity.routers import check_loopback
-    from mesh.market.provider import Provider, ProviderProcess
+    from mesh.dev.development import serve_chain
+    from mesh.market.provider import Provider, ProviderOptions, ProviderProcess, provider_file
     from mesh.network import Endpoints, Network
+    from mesh.network.endpoints import with_free_ports
+    from mesh.ops.identity.routers import check_loopback
 
     check_loopback(settings.listen)
+    own = Settings(generation=settings.generation).lighthouse_contract
+    settings = replace(settings, listen=with_free_ports(settings.listen), lighthouse_contract=own)
     program = find_engine(engine=engine, anvil=anvil, state=state)
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
@@ -153,33 +168,46 @@ async def serve_market(
         markets = [Settings(generation=generation).lighthouse_contract for generation in (3, 5)]
         address, providers = served.market.accounts["provider"].address, []
         for name in markets:
-            files = await provider_files(settings, chain, address, name)
-            provider = Provider(network.session, chain, name, **files)
+            options = ProviderOptions(
+                free_contracts=settings.free_contracts, store=await provider_file(settings, chain, address, name)
+            )
+            provider = Provider(network.session, chain, name, options)
             providers.append(await stack.enter_async_context(provider))
         process = ProviderProcess(network, chain, providers)
         stack.enter_context(telemetry.showing(measure=process.measure, health=process.health))
-        where = await _page_line(stack, page, settings, served)
+        address_of_page, without_page = ("", "") if page is None else await page.open(stack, settings, served)
         tasks = await stack.enter_async_context(asyncio.TaskGroup())
         for name, provider in zip(markets, providers, strict=True):
             tasks.create_task(provider.run(), name=f"provider of {name}")
-        router = ", ".join(settings.listen)
-        words = f"router      {router}\n{served.describe()}\n{where}provider    {address}"
-        announce(log, "market-started", words, **served.facts(), provider=address)
+        variables = _variables(settings, served)
+        facts = served.facts() | {
+            "lighthouseName": settings.lighthouse_contract,
+            "router": list(settings.listen),
+            "page": address_of_page or None,
+            "provider": address,
+            "environment": variables,
+        }
+        if as_json:
+            print_json(facts)
+        else:
+            shown = f"\npage        {address_of_page or without_page}" if page is not None else ""
+            lines = "\n".join(f"export {name}={shlex.quote(value)}" for name, value in variables.items())
+            described = served.describe(settings.lighthouse_contract)
+            words = f"router      {', '.join(settings.listen)}\n{described}{shown}\nprovider    {address}\n\n{lines}"
+            announce(log, "market-started", words, **served.facts(), provider=address)
 
 
-async def _page_line(
-    stack: AsyncExitStack, page: MarketPage | None, settings: Settings, served: DevelopmentChain
-) -> str:
-    """Serve the page; the line that says where it is, or what it lacks."""
-    if page is None:
-        return ""
-    try:
-        return f"page        {await page.open(stack, settings, served)}\n"
-    except PackageMissing as error:
-        return f"page        none: {error}; {error.hint}\n"
-
-
-log = logging.getLogger(__name__)
+def _variables(settings: Settings, served: DevelopmentChain) -> dict[str, str]:
+    """The environment in which commands use this market, for the person's account."""
+    chosen = {} if settings.generation == Settings().generation else {"AIRA_GENERATION": str(settings.generation)}
+    return {
+        "AIRA_CONNECT": ",".join(settings.listen),
+        "AIRA_WEB3_HTTP_PROVIDER": served.url,
+        "AIRA_WEB3_WS_PROVIDER": served.ws_url,
+        **chosen,
+        "AIRA_KEYFILE": str((served.keys / "person.json").absolute()),
+        "AIRA_KEYFILE_PASSWORD_FILE": str((served.keys / "password").absolute()),
+    }
 
 
 @click.command("up")
@@ -188,7 +216,7 @@ log = logging.getLogger(__name__)
 @click.option("--block-time", type=BLOCK_TIME, help="also mine an empty block at this interval, in seconds")
 @with_engine
 @with_json
-@with_settings("data_dir", *options_of(TelemetrySettings))
+@with_settings("data_dir", TelemetrySettings)
 def chain_up(settings: Settings, host: str, port: int, block_time: float | None, as_json: bool, **engine: Any) -> None:
     """Serve a development chain with the contracts as JSON-RPC over HTTP and WebSocket. Ctrl-C stops it. The chain is
     lost then, unless --state stores it.
@@ -198,7 +226,7 @@ def chain_up(settings: Settings, host: str, port: int, block_time: float | None,
     """
 
     async def serve() -> None:
-        from mesh.devchain.development import serve_chain
+        from mesh.dev.development import serve_chain
 
         program = find_engine(**engine)
         async with (
@@ -219,7 +247,7 @@ def chain_up(settings: Settings, host: str, port: int, block_time: float | None,
 async def _show_health(url: str, telemetry: Telemetry) -> None:
     """Serve metrics and health of the chain at `url`, if the settings ask for it, until cancelled."""
     from mesh.chain import Node
-    from mesh.devchain.monitor import ChainMonitor
+    from mesh.dev.development import ChainMonitor
 
     if not telemetry.url:
         await asyncio.Event().wait()

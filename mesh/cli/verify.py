@@ -1,53 +1,120 @@
-"""`aira verify`: checks a recording as evidence of a job."""
+"""`aira verify`: checks a recording against its objective and its liability, and prints the verdict of each check."""
 
 from __future__ import annotations
 
 import asyncio
 import sys
+from contextlib import asynccontextmanager
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import click
-import msgspec
 
 from mesh.cli.chain_client import open_chain
-from mesh.cli.errors import InvalidOptions
-from mesh.cli.files import FETCH_SETTINGS, fetch, opened_store, require_readable
-from mesh.cli.options import ADDRESS, with_json, with_settings
-from mesh.cli.output import plural, print_facts, print_json, print_table, printable, progress
-from mesh.errors import AiraError
-from mesh.evidence import Claim, Verdict, check_end, verify
-from mesh.running import report, run_to_end
-from mesh.settings import ChainSettings, options_of
+from mesh.cli.files import FETCH_SETTINGS, fetch, opened_store, read_message, require_readable
+from mesh.cli.options import ADDRESS, PATH, with_json, with_settings
+from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, printable, progress, short_address
+from mesh.errors import AiraError, InputError
+from mesh.role.running import report, run_to_end
+from mesh.settings import ChainSettings
+from mesh.validator.verification import Claim, Verdict, check_end, verify
 from schemas import parse_address
+from schemas.address import ZERO_ADDRESS
+from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+    from pathlib import Path
 
+    from mesh.chain import Chain
+    from mesh.network import Network
     from mesh.settings import Settings
+    from schemas import Liability
+    from schemas.verdicts import ValidatorReport
 
-FILE: Final = click.Path(path_type=Path)
+
+CONNECT_TIMEOUT: Final = 3.0
+"""Seconds to connect to a router."""
+INTERVAL: Final = 5.0
+"""Seconds between two questions for new reports."""
+
+
+async def reports_on(settings: Settings, chain: Chain, liability: Liability) -> Sequence[ValidatorReport] | None:
+    """The verified reports of the jurors that answer; None if the mesh can't be asked, which is printed to stderr."""
+    if liability.validator == ZERO_ADDRESS:
+        return ()
+    try:
+        async with _network(settings) as network:
+            return await _ask(network, settings, chain, liability)
+    except AiraError as error:
+        click.echo(f"aira: the validator's reports are not known: {error}", err=True)
+        return None
+
+
+def verdict_facts(reports: Sequence[ValidatorReport]) -> dict[str, str | None]:
+    """Each juror's verdict, for people."""
+    from mesh.agent.contracts import verdict_words
+
+    return {f"juror {short_address(one.juror)}": printable(verdict_words(one)) for one in reports}
+
+
+def reports_json(reports: Sequence[ValidatorReport] | None) -> list[Any] | None:
+    """Reports for JSON: as they are on the wire."""
+    return None if reports is None else [decode_json(one.encode()) for one in reports]
+
+
+async def print_verdicts(settings: Settings, chain: Chain, liability: Liability) -> None:
+    """Print each juror's verdict on an open liability when it is there, until cancelled."""
+    from mesh.agent.contracts import verdict_words
+
+    if liability.validator == ZERO_ADDRESS:
+        return
+    said: set[str] = set()
+    try:
+        jury = await chain.validators.jury(liability.validator)
+        needed = plural(1 if jury is None else jury.quorum, "juror")
+        print_line(f"its validator {liability.validator} must judge the result: {needed} alike")
+        async with _network(settings) as network:
+            while True:
+                for one in await _ask(network, settings, chain, liability):
+                    if one.juror not in said:
+                        said.add(one.juror)
+                        print_line(f"juror {one.juror} judged: {printable(verdict_words(one))}")
+                await asyncio.sleep(INTERVAL)
+    except AiraError as error:
+        click.echo(f"aira: the validator's reports are not known: {error}", err=True)
+
+
+@asynccontextmanager
+async def _network(settings: Settings) -> AsyncIterator[Network]:
+    from mesh.network import Network
+    from mesh.role.composition import endpoints_of
+
+    quick = replace(settings, connect_timeout=min(settings.connect_timeout, CONNECT_TIMEOUT))
+    async with Network(endpoints_of(quick)) as network:
+        yield network
+
+
+async def _ask(network: Network, settings: Settings, chain: Chain, liability: Liability) -> Sequence[ValidatorReport]:
+    from mesh.agent.contracts import asked_reports
+
+    lighthouse, timeout = settings.lighthouse_contract.lower(), settings.answer_timeout
+    return await asked_reports(network.session, lighthouse, chain, liability, timeout=timeout)
+
+
 MARKS: Final = {True: "holds", False: "FAILS", None: "open"}
 
 
 @click.command("verify")
 @click.argument("liability", required=False, type=ADDRESS)
-@click.option("--objective", type=FILE, help="file of the objective [fetched by its CID]")
-@click.option("--result", type=FILE, help="file of the recording [fetched by its CID]")
-@click.option("--message", type=FILE, help="file with the Result message as it was sent (JSON)")
+@click.option("--objective", type=PATH, help="file of the objective [fetched by its CID]")
+@click.option("--result", type=PATH, help="file of the recording [fetched by its CID]")
+@click.option("--message", type=PATH, help="file with the Result message as it was sent (JSON)")
 @click.option("--offline", is_flag=True, help="don't read the contract; the checks that need it stay open")
 @with_json
-@with_settings(*dict.fromkeys((*FETCH_SETTINGS, *options_of(ChainSettings))))
-def command(
-    settings: Settings,
-    liability: str | None,
-    objective: Path | None,
-    result: Path | None,
-    message: Path | None,
-    offline: bool,
-    as_json: bool,
-) -> None:
+@with_settings(*FETCH_SETTINGS, ChainSettings)
+def command(settings: Settings, **options: Any) -> None:
     """Check the objective and the recording of LIABILITY (an address) against each other and against the contract: the
     CIDs of both files, the signature, and that the recording is complete, belongs to this job and plays the objective.
 
@@ -57,8 +124,7 @@ def command(
     recording fail it, unless the job is known to have ended without success. The exit code is 0 if no check fails, 1 if
     one fails, and 2 if the checks could not run.
     """
-    files = VerifiedFiles(objective=objective, result=result, message=message)
-    exit_by_outcome(partial(verify_job, settings, liability, files, offline=offline, as_json=as_json))
+    exit_by_outcome(partial(verify_job, settings, **options))
 
 
 def exit_by_outcome(check: Callable[[], Awaitable[bool]]) -> NoReturn:
@@ -77,28 +143,31 @@ def exit_by_outcome(check: Callable[[], Awaitable[bool]]) -> NoReturn:
     sys.exit(exit_code)
 
 
-class VerifiedFiles(msgspec.Struct, frozen=True, kw_only=True):
-    """The files that the options name."""
-
-    objective: Path | None
-    result: Path | None
-    message: Path | None
-
-
 async def verify_job(
-    settings: Settings, liability: str | None, files: VerifiedFiles, *, offline: bool, as_json: bool
+    settings: Settings,
+    *,
+    liability: str | None,
+    objective: Path | None,
+    result: Path | None,
+    message: Path | None,
+    offline: bool,
+    as_json: bool,
 ) -> bool:
-    if (liability is None or offline) and None in (files.objective, files.result):
-        raise InvalidOptions(
-            "without a contract to read, both files are required", hint="give --objective and --result"
+    if (liability is None or offline) and (objective is None or result is None):
+        raise InputError(
+            "without a contract to read, both files are required",
+            hint="give --objective and --result",
+            code="invalid-options",
         )
-    message = None if files.message is None else await asyncio.to_thread(require_readable(files.message).read_bytes)
+    said = None if message is None else await asyncio.to_thread(read_message, message)
     claim = await _claim(settings, liability, offline=offline)
-    verdict = await _verdict(settings, claim, files, message)
+    verdict = await _verdict(settings, claim, objective, result, said)
     if as_json:
         print_json({"holds": verdict.holds, "claim": claim, "findings": verdict.findings})
     else:
-        _print(claim, verdict)
+        named = ("liability", "promisor", "objective", "result")
+        print_facts({name: getattr(claim, name) or None for name in named})
+        print_findings([(finding.holds, finding.name, finding.detail) for finding in verdict.findings])
     return verdict.holds
 
 
@@ -111,37 +180,26 @@ async def _claim(settings: Settings, liability: str | None, *, offline: bool) ->
         return Claim.of_contract(await chain.liabilities.get(liability))
 
 
-async def _verdict(settings: Settings, claim: Claim, files: VerifiedFiles, message: bytes | None) -> Verdict:
-    if files.result is None and not claim.result:
+async def _verdict(
+    settings: Settings, claim: Claim, objective: Path | None, result: Path | None, message: bytes | None
+) -> Verdict:
+    if result is None and not claim.result:
         return Verdict((check_end(claim),))
     async with opened_store(settings) as store:
-        objective = (
-            require_readable(files.objective) if files.objective else await fetch(settings, store, claim.objective)
-        )
-        result = require_readable(files.result) if files.result else await fetch(settings, store, claim.result)
+        played = require_readable(objective) if objective else await fetch(settings, store, claim.objective)
+        recorded = require_readable(result) if result else await fetch(settings, store, claim.result)
         with progress("verifying") as tell:
             return await asyncio.to_thread(
                 verify,
                 claim,
-                objective=objective,
-                result=result,
+                objective=played,
+                result=recorded,
                 message=message,
-                objective_cid="" if files.objective else claim.objective,
-                result_cid="" if files.result else claim.result,
+                objective_cid="" if objective else claim.objective,
+                result_cid="" if result else claim.result,
+                bags=True,
                 progress=tell,
             )
-
-
-def _print(claim: Claim, verdict: Verdict) -> None:
-    print_facts(
-        {
-            "liability": claim.liability or None,
-            "promisor": claim.promisor or None,
-            "objective": claim.objective or None,
-            "result": claim.result or None,
-        }
-    )
-    print_findings([(finding.holds, finding.name, finding.detail) for finding in verdict.findings])
 
 
 def print_findings(findings: Sequence[tuple[bool | None, str, str]]) -> None:

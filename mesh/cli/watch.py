@@ -1,4 +1,4 @@
-"""`aira watch`: prints what happens on a market."""
+"""`aira watch`: prints what happens on a market, one line for each event."""
 
 from __future__ import annotations
 
@@ -8,21 +8,27 @@ from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.background import Background
-from mesh.cli.event_lines import EventFormatter, event_json
+from mesh.agent.contracts import verdict_words
+from mesh.amounts import XRT, Unit
+from mesh.base.background import Background
+from mesh.base.flood import Rate, RateLimiter
+from mesh.cli.demand import print_connection_changes
+from mesh.cli.files import model_named
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import plural, print_json, print_line, wait_for_broken_pipe
-from mesh.cli.waiting import print_connection_changes
-from mesh.flood import Rate, RateLimiter
+from mesh.cli.output import json_text, plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
 from mesh.network import Reading
-from mesh.running import run_until_stopped
-from mesh.settings import NetworkSettings, options_of
+from mesh.role.running import run_until_stopped
+from mesh.settings import NetworkSettings
 from mesh.telemetry.logs import configure_logging
-from schemas import InvalidAddress, parse_address, parse_cid
+from mesh.watching import JobEvent, PresenceChange
+from schemas import Demand, InvalidAddress, Result, Verified, parse_address
+from schemas.decoding import decode_json
+from schemas.signing import Decline, Rejection
+from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -32,8 +38,124 @@ if TYPE_CHECKING:
     from mesh.network import Channel, Network
     from mesh.recording import Recorder
     from mesh.settings import Settings
-    from mesh.watching import MarketCounters, MarketEvent, MarketWatch, PresenceChange
-    from schemas import PresenceKey
+    from mesh.watching import MarketCounters, MarketEvent, MarketWatch
+    from schemas import Offer, PresenceKey
+
+
+LONGEST_TEXT: Final = 200
+"""The most characters of a text from others that are shown."""
+HASH_DIGITS: Final = 8
+"""Digits of an order's hash in a line; JSON has all 64."""
+EVENT_WIDTH: Final = 9
+"""Columns of the event's name."""
+
+
+def event_json(seen: MarketEvent | PresenceChange, *, time: str) -> dict[str, Any]:
+    """An event at `time` (ISO 8601) for JSON. Amounts are text, in the smallest unit."""
+    match seen:
+        case Verified():
+            message = seen.message
+            about: dict[str, Any] = {"event": type(message).__name__.lower(), "hash": seen.hash.hex()}
+            about["signer"] = seen.signer
+            if isinstance(message, Result):
+                about |= {"liability": message.liability, "result": message.result, "success": message.success}
+            else:
+                about |= _order_facts(message)
+        case Rejection():
+            about = {"event": "rejected", "order": seen.order, "provider": seen.provider}
+            about |= {"reason": seen.reason, "detail": seen.detail}
+        case Decline():
+            about = {"event": "declined", "order": seen.order, "agent": seen.agent}
+            about |= {"code": seen.code, "detail": seen.detail}
+        case ValidatorReport():
+            about = {"event": "judged", **decode_json(seen.encode())}
+        case Reading():
+            about = {"event": "reading", "agent": seen.agent, "topic": seen.topic, "value": seen.value}
+            if seen.result:
+                about |= {"signer": seen.agent, "result": seen.result}
+        case PresenceChange((role, address), is_present):
+            about = {"event": "present" if is_present else "gone", "role": role, "agent": address}
+        case JobEvent(agent, event, liability):
+            about = {"event": event, "agent": agent, "liability": decode_json(liability.encode())}
+    return {"time": time} | about
+
+
+def _order_facts(order: Demand | Offer) -> dict[str, Any]:
+    fee = "validator" if isinstance(order, Demand) else "lighthouse"
+    return {
+        "model": order.model,
+        "objective": order.objective,
+        "token": order.token,
+        "cost": str(order.cost),
+        "lighthouse": order.lighthouse,
+        "validator": order.validator,
+        f"{fee}Fee": str(getattr(order, f"{fee}_fee")),
+        "deadline": order.deadline,
+        "generation": order.generation,
+    }
+
+
+class EventFormatter:
+    """Formats events as lines for people. `xrt` is the address of XRT, None if unknown."""
+
+    def __init__(self, xrt: str | None) -> None:
+        self._xrt = xrt
+
+    def line(self, seen: MarketEvent | PresenceChange) -> str:
+        """The line of an event, without the time."""
+        match seen:
+            case Verified():
+                message, kind = seen.message, type(seen.message).__name__.lower()
+                if isinstance(message, Result):
+                    signer = short_address(seen.signer)
+                    words = f"{message.result}  {_ended(message.success)}, for {message.liability}, signed by {signer}"
+                else:
+                    words = self._order(seen)
+            case Rejection():
+                why = printable(seen.detail[:LONGEST_TEXT] or seen.reason[:LONGEST_TEXT])
+                kind, words = "rejected", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.provider)}: {why}"
+            case Decline():
+                why = f"{printable(seen.detail[:LONGEST_TEXT])} ({seen.code})".lstrip()
+                kind, words = "declined", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.agent)}: {why}"
+            case ValidatorReport():
+                why = printable(verdict_words(seen)[:LONGEST_TEXT])
+                kind, words = "judged", f"{seen.liability} by juror {short_address(seen.juror)}: {why}"
+            case Reading():
+                text = seen.value if isinstance(seen.value, str) else json_text(seen.value)
+                shown = printable(text[:LONGEST_TEXT] + ("…" if len(text) > LONGEST_TEXT else ""))
+                kind, words = "reading", f"{printable(seen.topic)}  {shown}, from {short_address(seen.agent)}"
+            case PresenceChange((role, address), is_present):
+                kind, words = "present" if is_present else "gone", f"{printable(role)} {address}"
+            case JobEvent(_, kind, liability):
+                parties = f"{short_address(liability.promisor)} for {short_address(liability.promisee)}"
+                words = f"{liability.address}  {parties}, {self.cost(liability.cost, liability.token)}"
+                if liability.result:
+                    words += f", {_ended(liability.is_success)}: {liability.result}"
+        return f"{kind:<{EVENT_WIDTH}}  {words}"
+
+    def cost(self, amount: int, token: str) -> str:
+        """An amount of a token with its unit."""
+        return (XRT if token == self._xrt else Unit(f"units of {short_address(token)}", 0)).show(amount)
+
+    def _order(self, seen: Verified[Any]) -> str:
+        order: Demand | Offer = seen.message
+        if isinstance(order, Demand):
+            does, fee = "pays", ""
+        else:
+            does = "works for"
+            fee = f" and {XRT.show(order.lighthouse_fee)} to the provider" if order.lighthouse_fee else ""
+        terms = f"{self.cost(order.cost, order.token)}{fee}, model {_short_cid(order.model)}"
+        more = f"objective {_short_cid(order.objective)}, until block {order.deadline:,}"
+        return f"{seen.hash.hex()[:HASH_DIGITS]}  {seen.signer} {does} {terms}, {more}"
+
+
+def _short_cid(cid: str) -> str:
+    """A CID shortened to its ends, for lines with a full one beside it."""
+    return f"{cid[:6]}…{cid[-4:]}"
+
+
+def _ended(success: bool) -> str:
+    return "done" if success else "not done"
 
 
 PRESENCE_CHANGES: Final = Rate(per_second=4.0, burst=64)
@@ -41,14 +163,14 @@ PRESENCE_CHANGES: Final = Rate(per_second=4.0, burst=64)
 
 
 @click.command("watch")
-@click.option("--model", help="print only events of this model (CID)")
+@click.option("--model", help="print only events of this model: its file or CID")
 @click.option("--open", "with_open", is_flag=True, help="first print the orders that are open now")
 @click.option("--readings", is_flag=True, help="also print what agents publish outside of jobs, and their answers")
 @click.option(
     "--out", type=click.Path(dir_okay=False, path_type=Path), help="record the readings to this MCAP file (new)"
 )
 @with_json
-@with_settings(*options_of(NetworkSettings), "lighthouse_contract", "xrt_contract")
+@with_settings(NetworkSettings, "lighthouse_contract", "xrt_contract")
 def command(
     settings: Settings, model: str | None, with_open: bool, readings: bool, out: Path | None, as_json: bool
 ) -> None:
@@ -81,11 +203,11 @@ async def watch(
     readings: bool = False,
     out: Path | None = None,
 ) -> None:
-    from mesh.agent.components import watching
+    from mesh.role.composition import watching
     from mesh.watching import MarketWatch, ReadingFetcher
 
     if model is not None:
-        parse_cid(model)
+        model = (await asyncio.to_thread(model_named, model)).cid()
     async with AsyncExitStack() as stack:
         network, channel = await stack.enter_async_context(watching(settings))
         formatter = None if as_json else EventFormatter(await _xrt(settings, network.session, channel))

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.amounts import AmountText
 from mesh.cli.chain_client import (
     FACTORY,
     account_of,
@@ -16,8 +15,8 @@ from mesh.cli.chain_client import (
     open_signing_chain,
     spender_of,
 )
-from mesh.cli.options import ADDRESS, with_chain_settings, with_json, with_signing_settings
-from mesh.cli.output import print_facts, print_json, print_line
+from mesh.cli.options import ADDRESS, AmountText, with_chain_settings, with_json, with_signing_settings
+from mesh.cli.output import print_result
 
 if TYPE_CHECKING:
     from mesh.amounts import Unit
@@ -47,10 +46,8 @@ async def balance(settings: Settings, *, account: str | None, token: str | None,
         owner = await account_of(chain, settings, account)
         unit = await chain.tokens.unit(token)
         amount = await chain.tokens.balance(owner, token=token)
-        if as_json:
-            print_json({"account": owner, **await _token_json(chain, token, unit), "balance": str(amount)})
-        else:
-            print_line(unit.show(amount))
+        result = {"account": owner, **await _token_json(chain, token, unit), "balance": str(amount)}
+        print_result(result, unit.show(amount), as_json=as_json)
 
 
 @command.command("allowance", short_help="show how much a spender may transfer from an account")
@@ -67,11 +64,8 @@ async def allowance(settings: Settings, *, spender: str, owner: str | None, toke
         whose, by = await account_of(chain, settings, owner), await spender_of(chain, spender)
         unit = await chain.tokens.unit(token)
         amount = await chain.tokens.allowance(whose, by, token=token)
-        if as_json:
-            about = await _token_json(chain, token, unit)
-            print_json({"owner": whose, "spender": by, **about, "allowance": str(amount)})
-        else:
-            print_line(unit.show(amount))
+        result = {"owner": whose, "spender": by, **await _token_json(chain, token, unit), "allowance": str(amount)}
+        print_result(result, unit.show(amount), as_json=as_json)
 
 
 @command.command("approve", short_help="allow a spender to transfer up to an amount")
@@ -90,10 +84,9 @@ async def approve(settings: Settings, *, spender: str, amount: str, token: str |
         value, by = unit.parse(amount), await spender_of(chain, spender)
         with notice_when_slow():
             tx = await chain.tokens.approve(by, value, token=token)
-        if as_json:
-            print_json({"spender": by, **await _token_json(chain, token, unit), "allowance": str(value), "tx": tx})
-        else:
-            print_facts({"spender": by, "allowance": unit.show(value), "transaction": tx})
+        result = {"spender": by, **await _token_json(chain, token, unit), "allowance": str(value), "tx": tx}
+        facts = {"spender": by, "allowance": unit.show(value), "transaction": tx}
+        print_result(result, facts, as_json=as_json)
 
 
 @command.command("transfer", short_help="transfer an amount to another account")
@@ -111,11 +104,9 @@ async def transfer(settings: Settings, *, to: str, amount: str, token: str | Non
         with notice_when_slow():
             tx = await chain.tokens.transfer(recipient, value, token=token)
         left = await chain.tokens.balance(token=token)
-        if as_json:
-            about = await _token_json(chain, token, unit)
-            print_json({"to": recipient, **about, "amount": str(value), "balance": str(left), "tx": tx})
-        else:
-            print_facts({"sent": unit.show(value), "to": recipient, "left": unit.show(left), "transaction": tx})
+        about = {"to": recipient, **await _token_json(chain, token, unit)}
+        facts = {"sent": unit.show(value), "to": recipient, "left": unit.show(left), "transaction": tx}
+        print_result(about | {"amount": str(value), "balance": str(left), "tx": tx}, facts, as_json=as_json)
 
 
 async def _token_json(chain: Chain, token: str | None, unit: Unit) -> dict[str, Any]:

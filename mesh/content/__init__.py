@@ -1,17 +1,7 @@
 """Files by CID: kept in a directory, and exchanged block by block over Zenoh."""
 
-from mesh.content.assembly import Assembly
-from mesh.content.dag import BlockRef, is_block
-from mesh.content.download import DownloadTiming
-from mesh.content.errors import (
-    ContentCorrupt,
-    ContentPinned,
-    ContentTooLarge,
-    ContentUnavailable,
-    QuotaReached,
-    StoreDamaged,
-    StoreFull,
-)
-from mesh.content.exchange import Exchange, session_address
+from mesh.content._blocks import BlockRef, is_block
+from mesh.content._errors import ContentCorrupt, ContentTooLarge, ContentUnavailable, StoreFull
+from mesh.content._exchange import DownloadTiming, Exchange, session_address
 from mesh.content.files import Progress
-from mesh.content.store import Store
+from mesh.content.store import Assembly, Store

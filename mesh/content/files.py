@@ -9,8 +9,8 @@ import secrets
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, TypeAlias, cast
 
-from mesh.content.errors import StoreFull
-from mesh.private_files import open_private
+from mesh.base.private_files import open_private
+from mesh.content._errors import StoreFull
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -46,7 +46,8 @@ class TemporaryFile:
     def __init__(self, path: Path, descriptor: int) -> None:
         self.path = path
         self._descriptor = descriptor
-        self._delete_on_exit = True
+        self.is_kept = False
+        """Whether the file will still exist, under either name, after the `with` block."""
         self._unwritten = 0
 
     @classmethod
@@ -75,15 +76,10 @@ class TemporaryFile:
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        if self._delete_on_exit:
+        if not self.is_kept:
             with suppress(FileNotFoundError):
                 self.path.unlink()
         os.close(self._descriptor)
-
-    @property
-    def is_kept(self) -> bool:
-        """Whether the file will still exist, under either name, after the `with` block."""
-        return not self._delete_on_exit
 
     @property
     def size(self) -> int:
@@ -107,14 +103,6 @@ class TemporaryFile:
         """The bytes from `offset`; fewer than `length` at the end of the file."""
         return os.pread(self._descriptor, length, offset)
 
-    def keep(self) -> None:
-        """Leave the file where it is when the `with` block ends."""
-        self._delete_on_exit = False
-
-    def discard(self) -> None:
-        """Delete the file when the `with` block ends, even if it was kept."""
-        self._delete_on_exit = True
-
     def finish(self, size: int, *, mode: int = 0o400, sync: bool = True) -> None:
         """Cut the file to `size` bytes and `sync` it to the disk. Raises `StoreFull`."""
         with raising_store_full(self.path.parent):
@@ -126,25 +114,7 @@ class TemporaryFile:
     def rename(self, final: Path) -> None:
         """Give the file its final name, replacing any file of that name. Atomic; durable after `sync_directory`."""
         self.path.rename(final)
-        self._delete_on_exit = False
-
-
-@contextmanager
-def atomic_file(final: Path, *, private: bool = False) -> Iterator[BinaryIO]:
-    """A stream to a file that appears at `final`, complete and synced, if the `with` block ends without error.
-
-    Only this user can read it if it is `private`.
-    """
-    temporary = final.with_name(f"{final.name}.new")
-    try:
-        with open(temporary, "wb", opener=open_private if private else None) as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.rename(final)
-        sync_directory(final.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
+        self.is_kept = True
 
 
 @contextmanager
@@ -165,39 +135,6 @@ def directory_lock(directory: Path) -> Iterator[None]:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
-    finally:
-        os.close(descriptor)
-
-
-def is_locked(path: Path) -> bool:
-    """Whether this process or another has the file at `path` locked."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
-
-
-def sync_directory(directory: Path) -> None:
-    """Sync the names of the directory to the disk: a rename is durable only after this."""
-    _sync(directory, os.O_DIRECTORY)
-
-
-def sync_file(path: Path) -> None:
-    """Sync what was written to a file, by whomever."""
-    _sync(path, 0)
-
-
-def _sync(path: Path, flags: int) -> None:
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | flags)
-    try:
-        os.fsync(descriptor)
     finally:
         os.close(descriptor)
 

@@ -2,4 +2,3 @@
 `mesh.market.provider`)."""
 
 from mesh.market.book import Added, Match, OrderBook, order_id
-from mesh.market.refusals import Refusal

@@ -8,60 +8,190 @@ was killed starts with an empty book and catches up. It asks the others for open
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from mesh.blocklist import Blocklist
+from mesh.base.blocklist import Blocklist, blocklist_at
+from mesh.base.flood import Drops, FairQueue
+from mesh.base.fresh_file import CHECK_INTERVAL
+from mesh.base.lifecycle import Role
+from mesh.base.log_context import LogSource, source_context
+from mesh.base.outage_log import OutageLog
 from mesh.chain import InsufficientFunds
 from mesh.chain.transactions import TransactionSender
-from mesh.flood import Drops
-from mesh.fresh_file import CHECK_INTERVAL
-from mesh.log_context import LogSource, source_context
-from mesh.market.arrivals import OrderArrivals, ResultArrivals
-from mesh.market.book import LIMIT, Match, OrderBook
-from mesh.market.earnings import Earnings, EarningsLedger
-from mesh.market.liability_events import OPEN_LIABILITIES
-from mesh.market.sent_orders import SentOrders
-from mesh.market.services import OrderBookService, ProviderStatusService
-from mesh.market.settlement import Settlement
-from mesh.market.transaction_queue import LEAST_GAS, RETRY, UNDER_WAY, TransactionQueue
-from mesh.market.turns import NoStake
-from mesh.market.versions import OrderVersions
+from mesh.market._earnings import A_DAY, Earnings, EarningsLedger, FreeContracts
+from mesh.market._orders import Orders
+from mesh.market._services import OrderBookService, ProviderStatus
+from mesh.market._settlement import OPEN_LIABILITIES, Settlement, SettlementParts
+from mesh.market.book import LIMIT, Match
+from mesh.market.store import MarketStore
+from mesh.market.transactions import LEAST_GAS, RETRY, UNDER_WAY, NoStake, TransactionQueue
 from mesh.market.withdrawals import Withdrawals
 from mesh.network.channel import Channel
 from mesh.network.metrics import link_state, network_families
 from mesh.network.services import Services
-from mesh.role import Role
+from mesh.role.composition import state_folder
+from mesh.role.following import ChainHead
 from mesh.settings.groups import DEADLINE_LIMIT
 from mesh.telemetry.logs import LogService
 from schemas import Demand, Offer, Result, Withdrawal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
     from contextlib import AsyncExitStack
     from pathlib import Path
 
     import zenoh
 
-    from mesh.blocklist import BlockedSigners
+    from mesh.base.blocklist import BlockedSigners
+    from mesh.base.flood import KnownSenders
+    from mesh.base.retry import RetryPolicy
     from mesh.chain import Chain
-    from mesh.network import Network
-    from mesh.retry import RetryPolicy
+    from mesh.market.book import Order, OrderBook
+    from mesh.network import Network, Subscription
+    from mesh.settings import Settings
+    from mesh.settings.groups import StorageSettings
     from mesh.telemetry.metrics import MetricFamily
     from schemas import Verified
 
-__all__ = ["Earnings", "Provider", "ProviderProcess", "check_account"]
+    _Waiting: TypeAlias = FairQueue[tuple[Verified[Any], Subscription[Any]]]
+    """Messages that wait, with the subscriptions that they came from."""
+
+
+log = logging.getLogger(__name__)
+
+CHECKED: Final = 512
+"""Orders whose makers' funds are asked for at once."""
+WAITING: Final = 32_768
+"""Orders that wait for that."""
+LOOKED_UP: Final = 100
+"""Results whose contracts are looked up in one call."""
+RESULTS_OF_SIGNER: Final = 64
+"""Results of one signer that wait for that …"""
+RESULTS: Final = 4096
+"""… and results in all."""
+
+
+class Arrivals:
+    """Takes orders and results from subscriptions, and passes them to `settlement` (`run`); `known` signers go first.
+
+    What an order says that it pays (`worth`, a priority) counts only when its maker can pay it. While `queue` is full
+    of transactions that are worth as much, an order is held. Results of open contracts that are known go on at once.
+    The others wait until the chain was asked for their contracts, for many in one call: a stranger can sign any number.
+    """
+
+    def __init__(
+        self,
+        settlement: Settlement,
+        queue: TransactionQueue,
+        *,
+        worth: Callable[[Order], int],
+        known: KnownSenders,
+        drops: Drops,
+    ) -> None:
+        self._settlement = settlement
+        self._transactions = queue
+        self._worth = worth
+        self._known = known
+        self._drops = drops
+        self._orders: _Waiting = FairQueue(per_sender=WAITING, total=WAITING)
+        self._held: _Waiting = FairQueue(per_sender=WAITING, total=WAITING)
+        self._results: _Waiting = FairQueue(per_sender=RESULTS_OF_SIGNER, total=RESULTS)
+
+    async def take_orders(self, orders: Subscription[Any]) -> None:
+        """Take the open orders of other providers, then those that are published, until cancelled."""
+        await orders.recall()
+        async for order in orders:
+            self._put(self._orders, order, orders)
+
+    async def take_results(self, results: Subscription[Result]) -> None:
+        """Take the results that are published, until cancelled."""
+        async for result in results:
+            if (liability := self._settlement.events.open.get(result.message.liability)) is not None:
+                await self._settlement.results.settle(result, liability)
+            else:
+                self._put(self._results, result, results)
+
+    async def run(self) -> None:
+        """Pass on what was taken, until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._pass_arrived(), name="arrived orders")
+            tasks.create_task(self._pass_held(), name="held orders")
+            tasks.create_task(self._look_up_results(), name="results of unknown contracts")
+
+    def _put(self, waiting: _Waiting, message: Verified[Any], source: Subscription[Any]) -> None:
+        """Let a message wait; what is dropped for it is counted, and taken when it is sent again."""
+        is_known = message.signer in self._known
+        for dropped, subscription in waiting.put(message.signer, (message, source), priority=int(is_known)):
+            self._drops.count("queue-full", dropped.signer)
+            subscription.forget(dropped)
+
+    async def _pass_arrived(self) -> None:
+        while True:
+            batch = await self._orders.get_batch(CHECKED)
+            await asyncio.sleep(0)  # the transactions of the batch before enter the queue
+            settled = []
+            for order, orders in batch:
+                if self._transactions.has_room_for(self._worth(order.message)):
+                    settled.append(order)
+                else:
+                    self._put(self._held, order, orders)
+            await self._pass(settled)
+
+    async def _pass_held(self) -> None:
+        while True:
+            batch = await self._held.get_batch(CHECKED)
+            await self._transactions.has_room()
+            await self._pass([order for order, _ in batch])
+
+    async def _pass(self, orders: Sequence[Verified[Order]]) -> None:
+        for order, shortage in zip(orders, await self._settlement.shortages(orders), strict=True):
+            if shortage:
+                self._drops.count("unfunded", order.signer)
+                self._settlement.set_aside(order, shortage)
+            else:
+                self._settlement.add(order)
+
+    async def _look_up_results(self) -> None:
+        while True:
+            batch = [result for result, _ in await self._results.get_batch(LOOKED_UP)]
+            found = await self._settlement.events.liabilities([result.message.liability for result in batch])
+            for result in batch:
+                await self._settlement.results.settle(result, found.get(result.message.liability))
+
+
+__all__ = ["Earnings", "Provider", "ProviderOptions", "ProviderProcess", "check_account"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProviderOptions:
+    """What a provider does, and how much of it. `customers` are addresses; see `aira provider --help` for the others.
+
+    `store` is the file for what must outlive a crash; without it nothing is kept. `retry` is for transactions that
+    fail, `unmined_limit` the most of them that wait to be mined, `open_liabilities` the most records in memory.
+    """
+
+    limit: int = LIMIT
+    retry: RetryPolicy = RETRY
+    unmined_limit: int = UNDER_WAY
+    open_liabilities: int = OPEN_LIABILITIES
+    store: Path | None = None
+    deadline_limit: int = DEADLINE_LIMIT
+    free_contracts: int = A_DAY
+    customers: Collection[str] = ()
+    blocked: BlockedSigners = frozenset()
+
+
+DEFAULTS: Final = ProviderOptions()
 
 
 class Provider(Role):
     """A provider of one lighthouse: `async with Provider(session, chain, lighthouse) as provider`, then `run`.
 
-    `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
-    is called with each match before its liability is created, `retry` is the policy for transactions that fail,
-    `unmined_limit` the most of them that wait to be mined, and `open_liabilities` the most records of open liabilities
-    in memory. Withdrawals are kept in the file `withdrawals`, if given, and what may still be mined in `sent_orders`.
-    Orders leave the book after `deadline_limit` blocks. Messages of `blocked` signers are rejected, and their orders
-    leave the book; what is dropped is counted in `drops`. The caller closes session and chain. When `run` is cancelled,
-    a transaction that was sent may still be mined.
+    `lighthouse` is the ENS name; its chain account must have a stake there. `matched` is called with each match before
+    its liability is created. The caller closes session and chain. When `run` is cancelled, a transaction that was sent
+    may still be mined.
     """
 
     title = "provider"
@@ -71,17 +201,9 @@ class Provider(Role):
         session: zenoh.Session,
         chain: Chain,
         lighthouse: str,
+        options: ProviderOptions = DEFAULTS,
         *,
-        limit: int = LIMIT,
         matched: Callable[[Match], None] = lambda match: None,
-        retry: RetryPolicy = RETRY,
-        unmined_limit: int = UNDER_WAY,
-        open_liabilities: int = OPEN_LIABILITIES,
-        withdrawals: Path | None = None,
-        sent_orders: Path | None = None,
-        deadline_limit: int = DEADLINE_LIMIT,
-        blocked: BlockedSigners = frozenset(),
-        drops: Drops | None = None,
     ) -> None:
         if chain.account is None:
             raise ValueError("a provider needs a chain with an account")
@@ -89,36 +211,48 @@ class Provider(Role):
         self._session = session
         self._chain = chain
         self._lighthouse = lighthouse.lower()
-        self._limit = limit
+        self._options = options
         self._matched = matched
-        self._retry = retry
-        self._unmined_limit = unmined_limit
-        self._open_liabilities = open_liabilities
-        self._deadline_limit = deadline_limit
-        self._blocked = blocked
-        self.withdrawals = Withdrawals(withdrawals, deadline_limit=deadline_limit)
-        self._sent_orders = SentOrders(sent_orders)
+        self._store = MarketStore(options.store)
+        self.withdrawals = Withdrawals(self._store, deadline_limit=options.deadline_limit)
         self.ledger = EarningsLedger()
-        self.drops = Drops() if drops is None else drops
+        self.drops = Drops()
         """What it dropped because of floods."""
         self._source = LogSource("provider", self.address, self._lighthouse)
 
     async def _open(self, stack: AsyncExitStack) -> None:
-        address, head = await self._chain.names.address(self._lighthouse), await self._chain.block_number()
-        head = max(head - self._chain.node.timing.reorg_depth, 0)  # blocks that may be replaced are read again
-        self.book = OrderBook(address, limit=self._limit, deadline_limit=self._deadline_limit)
-        self.book.expire(head)
+        timing, options = self._chain.node.timing, self._options
+        address, latest = await self._chain.names.address(self._lighthouse), await self._chain.block_number()
+        head = self.head = ChainHead(max(latest - timing.reorg_depth, 0))  # blocks that may be replaced are read again
+        stack.enter_context(self._store)
         stack.enter_context(self.withdrawals)
-        self.withdrawals.expire(head)
-        await self.withdrawals.sync()  # those of the earlier process
-        versions = await self._restore(stack)
+        self.withdrawals.expire(head.head)
+        self.orders = Orders(
+            address,
+            depth=timing.reorg_depth,
+            withdrawn=self.withdrawals,
+            limit=options.limit,
+            deadline_limit=options.deadline_limit,
+        )
+        self.book.expire(head.head)
+        await self._restore(latest)
+        self.free = FreeContracts(
+            self.address,
+            self._chain.xrt,
+            a_day=options.free_contracts,
+            customers=options.customers,
+            always_minted=not await self._chain.has_mesh_contracts(),
+            store=self._store,
+        )
+        outages, lookups = OutageLog(log, "chain"), OutageLog(log, "node")
         self.queue = TransactionQueue(
             self._chain,
             address,
-            head=lambda: self.settlement.events.head,
+            head=lambda: head.head,
             earnings=self.ledger,
-            retry=self._retry,
-            under_way=self._unmined_limit,
+            lookups=lookups,
+            retry=options.retry,
+            under_way=options.unmined_limit,
         )
         self.channel = await stack.enter_async_context(
             Channel(
@@ -126,9 +260,9 @@ class Provider(Role):
                 self._lighthouse,
                 address=address,
                 resolver=self._chain.names.address,
-                validators=self._chain.validators,
-                head=lambda: self.settlement.events.head,
-                blocked=self._blocked,
+                validators=self._chain.validators.settled,
+                head=lambda: head.head,
+                blocked=options.blocked,
                 drops=self.drops,
             )
         )
@@ -136,87 +270,71 @@ class Provider(Role):
         self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
         self._withdrawn = await stack.enter_async_context(self.channel.subscribe(Withdrawal))
         self.results = await stack.enter_async_context(self.channel.subscribe(Result))
-        self._wire(head, versions)
+        parts = SettlementParts(
+            chain=self._chain,
+            head=head,
+            outages=outages,
+            lookups=lookups,
+            channel=self.channel,
+            orders=self.orders,
+            withdrawals=self.withdrawals,
+            store=self._store,
+            queue=self.queue,
+            earnings=self.ledger,
+            free=self.free,
+            drops=self.drops,
+            forget=self._forget,
+        )
+        self.settlement = Settlement(parts, matched=self._matched, open_limit=options.open_liabilities)
         await stack.enter_async_context(
             OrderBookService(self._session, self._lighthouse, self.book, self.withdrawals, drops=self.drops)
         )
+        subscriptions = (self._demands, self._offers, self._withdrawn, self.results)
+        self.status = ProviderStatus(self._session, parts, subscriptions=subscriptions)
         services = await stack.enter_async_context(Services(self._session, self.address, drops=self.drops))
         with source_context(self._source):
-            services.offer("status", self._status.status)
+            services.offer("status", self.status.status)
             services.offer("logs", LogService("provider", self.address).logs)
         self.channel.announce("provider", self.address)
 
-    async def _restore(self, stack: AsyncExitStack) -> OrderVersions:
-        """The versions of orders that an earlier process has left on disk."""
-        assert self._chain.account is not None
-        await stack.enter_async_context(self._sent_orders)
-        versions = OrderVersions(self._chain.node.timing.reorg_depth, self._sent_orders)
-        if self._sent_orders.left or self._sent_orders.contracts:
-            nonce = await TransactionSender(self._chain.node, self._chain.account).last_nonce()
-            versions.restore(nonce, await self._chain.block_number())
-        return versions
+    @property
+    def book(self) -> OrderBook:
+        """The open orders."""
+        return self.orders.book
 
-    def _wire(self, head: int, versions: OrderVersions) -> None:
-        """Connect book, queue, channel and chain, which has been read up to block `head`."""
-        self.settlement = Settlement(
-            self._chain,
-            self.channel,
-            book=self.book,
-            queue=self.queue,
-            earnings=self.ledger,
-            head=head,
-            matched=self._matched,
-            forget=self._forget,
-            withdrawals=self.withdrawals,
-            versions=versions,
-            drops=self.drops,
-            open_limit=self._open_liabilities,
-        )
-        self._status = ProviderStatusService(
-            self._session,
-            self._chain,
-            self.channel,
-            subscriptions=(self._demands, self._offers, self._withdrawn, self.results),
-            book=self.book,
-            queue=self.queue,
-            settlement=self.settlement,
-            earnings=self.ledger,
-            drops=self.drops,
-        )
+    async def _restore(self, head: int) -> None:
+        """Take over the orders that an earlier process has left on disk."""
+        assert self._chain.account is not None
+        sent, contracts = self._store.sent_orders(), self._store.sent_orders(contracts=True)
+        if sent or contracts:
+            nonce = await TransactionSender(self._chain.node, self._chain.account).last_nonce()
+            self.orders.versions.restore(sent, contracts=contracts, nonce=nonce, head=head)
 
     async def _work(self) -> None:
         with source_context(self._source):
             async with asyncio.TaskGroup() as tasks:
                 self.settlement.start(tasks)
                 tasks.create_task(self.drops.run(), name="provider drops")
-                if isinstance(self._blocked, Blocklist):
-                    tasks.create_task(self._follow_blocklist(self._blocked), name="provider blocklist")
+                if isinstance(self._options.blocked, Blocklist):
+                    tasks.create_task(self._follow_blocklist(self._options.blocked), name="provider blocklist")
                 # Before the orders that they concern; one that comes later still stops what was not sent.
                 await self._withdrawn.recall()
                 tasks.create_task(self._take_withdrawals(), name="provider withdrawals")
-                self._take_arrivals(tasks)
-
-    def _take_arrivals(self, tasks: asyncio.TaskGroup) -> None:
-        known, drops = self.book.known, self.drops
-        orders = OrderArrivals(self.settlement, self.queue, worth=self._chain.costs.worth, known=known, drops=drops)
-        tasks.create_task(orders.take(self._demands), name="provider demands")
-        tasks.create_task(orders.take(self._offers), name="provider offers")
-        tasks.create_task(orders.run(), name="provider orders")
-        results = ResultArrivals(self.settlement, known=known, drops=drops)
-        tasks.create_task(results.take(self.results), name="provider results")
-        tasks.create_task(results.run(), name="provider unknown results")
+                arrivals = Arrivals(
+                    self.settlement,
+                    self.queue,
+                    worth=self._chain.funds.worth,
+                    known=self.book.known,
+                    drops=self.drops,
+                )
+                tasks.create_task(arrivals.take_orders(self._demands), name="provider demands")
+                tasks.create_task(arrivals.take_orders(self._offers), name="provider offers")
+                tasks.create_task(arrivals.take_results(self.results), name="provider results")
+                tasks.create_task(arrivals.run(), name="provider arrivals")
 
     def earnings(self) -> Earnings:
         """What was done, earned and spent so far."""
         return self.ledger.earnings()
-
-    async def measure(self) -> Iterable[MetricFamily]:
-        """The provider's metrics, labelled with its lighthouse; without those of its chain and its session."""
-        return await self._status.measure()
-
-    def health(self) -> Mapping[str, str]:
-        """The state of each part, as `aira status` shows it."""
-        return self._status.health()
 
     def _forget(self, verified: Verified[Any], *, after: float = 0.0) -> None:
         """Let the next copy of a message through: it is not handled, or its effect was not confirmed."""
@@ -231,7 +349,7 @@ class Provider(Role):
 
     async def _take_withdrawals(self) -> None:
         async for withdrawal in self._withdrawn:
-            self.settlement.withdrawn.add(withdrawal)
+            self.settlement.withdraw(withdrawal)
 
 
 class ProviderProcess:
@@ -246,7 +364,7 @@ class ProviderProcess:
         """The metrics of session, chain and account, and those of each provider with its lighthouse."""
         families = [*network_families(self._network), *await self._chain.measure()]
         for provider in self._providers:
-            families += await provider.measure()
+            families += await provider.status.measure()
         return tuple(families)
 
     def health(self) -> Mapping[str, str]:
@@ -254,7 +372,7 @@ class ProviderProcess:
         parts = {"channel": link_state(self._network)}
         for provider in self._providers:
             of = f" of {provider.channel.lighthouse}" if len(self._providers) > 1 else ""
-            parts |= {f"{part}{of}": state for part, state in provider.health().items()}
+            parts |= {f"{part}{of}": state for part, state in provider.status.health().items()}
         return parts
 
 
@@ -272,3 +390,28 @@ async def check_account(chain: Chain, lighthouse: str) -> None:
     balance, price = await chain.tokens.eth_balance(), await chain.node.gas_price()
     if balance < LEAST_GAS * price:
         raise InsufficientFunds(address, balance=balance, needed=LEAST_GAS * price)
+
+
+async def provider_file(settings: StorageSettings, chain: Chain, address: str, lighthouse: str) -> Path:
+    """The file of an account's provider on a chain, for a lighthouse (ENS name)."""
+    return await state_folder(settings, chain, address) / f"provider-{lighthouse.lower()}.sqlite"
+
+
+async def provider_of(settings: Settings, session: zenoh.Session, chain: Chain) -> Provider:
+    """The provider that the settings name, not yet opened, with the account of an open chain.
+
+    Raises `ConfigurationError` for a node with which it could not follow the contracts that it makes.
+    """
+    assert chain.account is not None
+    await chain.node.check_calls(chain.account.address)
+    lighthouse = settings.lighthouse_contract
+    options = ProviderOptions(
+        limit=settings.open_orders_limit,
+        unmined_limit=settings.unmined_limit,
+        store=await provider_file(settings, chain, chain.account.address, lighthouse),
+        deadline_limit=settings.deadline_limit,
+        free_contracts=settings.free_contracts,
+        customers=[await chain.names.address(customer) for customer in settings.customers],
+        blocked=blocklist_at(settings.blocked_signers),
+    )
+    return Provider(session, chain, lighthouse, options)

@@ -10,44 +10,18 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
+from mesh.base.outage_log import OutageLog
+from mesh.base.retry import Backoff
 from mesh.errors import ClosedError, ConfigurationError, NetworkUnavailable, RemoteError
 from mesh.network.endpoints import ATTEMPT_TIMEOUT, RECONNECT
-from mesh.outage_log import OutageLog
-from mesh.retry import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from mesh.network.endpoints import Endpoints
-    from mesh.network.handshake import TlsRefusal
 
 log = logging.getLogger(__name__)
 
 CAUSE: Final = re.compile(r"\[\S+?: (?P<cause>.+?) at /")
 """The cause in Zenoh's error about a listener."""
-
-
-class ListenFailed(ConfigurationError, code="listen-failed"):
-    """A router can't listen on its endpoints: a port is taken, or this user may not have it."""
-
-    def __init__(self, listen: tuple[str, ...], why: str) -> None:
-        super().__init__(
-            f"can't listen at {', '.join(listen)}: {why}",
-            hint="is the port taken? choose another with --listen tcp/HOST:PORT",
-        )
-        self.listen = listen
-
-
-class NotAdmitted(RemoteError, code="not-admitted"):
-    """A router answers, but it and this identity do not accept each other. `reasons` has a word for each locator."""
-
-    def __init__(self, refusals: Mapping[str, TlsRefusal]) -> None:
-        said = "; ".join(f"{locator}: {refusal.text}" for locator, refusal in refusals.items())
-        super().__init__(
-            f"rejected by the Zenoh router at {said}",
-            hint="set --tls-ca, --tls-certificate and --tls-key to your site's; `aira identity show` prints them",
-        )
-        self.reasons = {locator: refusal.reason for locator, refusal in refusals.items()}
 
 
 class SessionOpening:
@@ -63,8 +37,8 @@ class SessionOpening:
     def run(self) -> zenoh.Session:
         """Return the open session. With an infinite timeout, the wait for a router is logged once.
 
-        Raises `NetworkUnavailable` when no router answers within the timeout, `NotAdmitted` when every router that
-        answers rejects this identity, `ListenFailed`, `ClosedError` when it was abandoned.
+        Raises `NetworkUnavailable` when no router answers within the timeout, `RemoteError` (`not-admitted`) when every
+        router that answers rejects this identity, `ConfigurationError`, `ClosedError` when it was abandoned.
         """
         ends = time.monotonic() + self._endpoints.timeout
         backoff = Backoff(RECONNECT)
@@ -109,18 +83,23 @@ class SessionOpening:
             raise NetworkUnavailable(routers, f"no answer within {timeout:g} s") from None
 
     def _check_admitted(self) -> None:
-        """Raise `NotAdmitted` if all routers reject this identity: waiting longer would not help."""
+        """Raise `RemoteError` if all routers reject this identity: waiting longer would not help."""
         if (tls := self._endpoints.tls) is None:
             return
         from mesh.network.handshake import refusal_by
 
-        refusals = {}
+        refusals = []
         for locator in self._endpoints.connect:
             if (refusal := refusal_by(tls, locator, ATTEMPT_TIMEOUT)) is None:
                 return
-            refusals[locator] = refusal
-        raise NotAdmitted(refusals)
+            refusals.append(f"{locator}: {refusal.text}")
+        hint = "set --tls-ca, --tls-certificate and --tls-key to your site's; `aira identity show` prints them"
+        raise RemoteError(f"rejected by the Zenoh router at {'; '.join(refusals)}", hint=hint, code="not-admitted")
 
-    def _not_listening(self, error: zenoh.ZError) -> ListenFailed:
+    def _not_listening(self, error: zenoh.ZError) -> ConfigurationError:
         found = CAUSE.search(str(error))
-        return ListenFailed(self._endpoints.listen, found["cause"] if found else str(error).split(" at /", 1)[0])
+        why = found["cause"] if found else str(error).split(" at /", 1)[0]
+        hint = "is the port taken? choose another with --listen tcp/HOST:PORT"
+        return ConfigurationError(
+            f"can't listen at {', '.join(self._endpoints.listen)}: {why}", hint=hint, code="listen-failed"
+        )

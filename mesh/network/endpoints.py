@@ -6,19 +6,21 @@ import json
 import re
 import resource
 import socket
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import zenoh
 
+from mesh.base.retry import RetryPolicy
 from mesh.errors import ConfigurationError
-from mesh.network.tls import Tls, UnusableTls
-from mesh.retry import RetryPolicy
+from mesh.network._tls import Tls, unusable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from mesh.settings import NetworkSettings
+
 
 RECONNECT: Final = RetryPolicy(initial=0.1, factor=1.5, ceiling=0.5)
 """Delays between attempts to reach a router: short, so that an agent is back within a second."""
@@ -28,7 +30,6 @@ MAX_SESSIONS: Final = 10_000
 """Sessions that a router holds at a time, if the settings say nothing else. Zenoh's own default is 1,000."""
 SPARE_DESCRIPTORS: Final = 100
 """Descriptors that a router needs besides those of its sessions."""
-MOST_SESSIONS: Final = 10**9
 SEND_QUEUE_BATCHES: Final = 16
 """Batches of 64 kB queued for a link before messages are dropped. Zenoh's default of two drops some of 100 puts."""
 LOCATOR: Final = re.compile(
@@ -47,6 +48,27 @@ SEND_WAIT: Final = 0.02
 A busy machine may give Zenoh's threads no time for so long. A router waits Zenoh's own 1 ms: while it waits for one
 slow client, it serves the others late.
 """
+
+
+def with_free_ports(locators: tuple[str, ...]) -> tuple[str, ...]:
+    """The locators with a free port in place of port 0, so that others can be told where this session listens."""
+    return tuple(_with_free_port(locator) for locator in locators)
+
+
+def free_endpoint() -> str:
+    """A loopback TCP locator on a port that is free now, for a router inside this process."""
+    return _with_free_port("tcp/127.0.0.1:0")
+
+
+def _with_free_port(locator: str) -> str:
+    found = re.fullmatch(r"(\w+/(?:\[([^\]]+)\]|([^:]*)):)0([?#].*)?", locator)
+    if found is None:
+        return locator
+    before, six, host, after = found.groups()
+    kind = socket.SOCK_DGRAM if before.startswith(("udp/", "quic/")) else socket.SOCK_STREAM
+    with socket.socket(socket.AF_INET6 if six else socket.AF_INET, kind) as probe:
+        probe.bind((six or host, 0))
+        return f"{before}{probe.getsockname()[1]}{after or ''}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,17 +157,14 @@ class Endpoints:
 
             check_files(self.tls, mode=self.mode)
         else:
-            raise UnusableTls(
-                "no-authority",
-                "a tls/ endpoint needs the site's certificate",
-                hint="give --tls-ca, or tls_ca in the settings",
-            )
+            hint = "give --tls-ca, or tls_ca in the settings"
+            raise unusable("a tls/ endpoint needs the site's certificate", hint=hint)
 
 
 def room_for_sessions() -> int:
     """The number of sessions for which a router may have file descriptors: by the hard limit."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    return MOST_SESSIONS if hard == resource.RLIM_INFINITY else max(0, hard - SPARE_DESCRIPTORS)
+    return sys.maxsize if hard == resource.RLIM_INFINITY else max(0, hard - SPARE_DESCRIPTORS)
 
 
 def allow_sessions(count: int) -> None:
@@ -165,10 +184,3 @@ def check_locators(*locators: str) -> None:
                 f"{locator!r} is not a Zenoh endpoint",
                 hint="write it as tcp/HOST:PORT, for instance tcp/127.0.0.1:7447",
             )
-
-
-def free_endpoint() -> str:
-    """A loopback TCP locator on a port that is free now, for a router inside this process."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -11,14 +11,11 @@ import socket
 import ssl
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
-from mesh.network.tls import UnusableTls
+from mesh.network._tls import unusable
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from mesh.network._tls import Tls
 
-    from mesh.network.tls import Tls
-
-NEW_IDENTITY_HINT: Final = "`aira identity new` creates it"
 LOCATOR: Final = re.compile(r"tls/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")
 WILDCARD_HOSTS: Final = ("0.0.0.0", "::")
 """Hosts that stand for all of a router's addresses; no certificate names them."""
@@ -49,19 +46,20 @@ ALERTS: Final = {
 
 
 def check_files(tls: Tls, *, mode: str) -> None:
-    """Raise `UnusableTls` for files that can't work: missing, malformed, expired, or not matching.
+    """Raise `ConfigurationError` for files that can't work: missing, malformed, expired, or not matching.
 
     `mode` is the mode of the session that uses them: `router` or `client`.
     """
     if (tls.certificate is None) != (tls.key is None):
-        raise UnusableTls("incomplete", "only one of tls_certificate and tls_key is set", hint=NEW_IDENTITY_HINT)
+        raise unusable("only one of tls_certificate and tls_key is set")
     if tls.certificate is None and mode == "router":
-        raise UnusableTls(
-            "no-certificate", "a router needs a certificate for tls/", hint="add --tls-certificate and --tls-key"
-        )
+        raise unusable("a router needs a certificate for tls/", hint="add --tls-certificate and --tls-key")
     for what, path in (("site's certificate", tls.ca), ("certificate", tls.certificate), ("key", tls.key)):
-        if path is not None:
-            _check_readable(what, path)
+        try:
+            if path is not None:
+                path.read_bytes()
+        except OSError as error:
+            raise unusable(f"can't read the {what} {path}: {error.strerror}") from None
     if tls.certificate is None:
         _context(tls, ssl.PROTOCOL_TLS_CLIENT)
     else:
@@ -117,19 +115,16 @@ def _check_certificate(tls: Tls, mode: str) -> None:
         except ssl.SSLWantReadError:
             continue
         except ssl.SSLCertVerificationError as error:
-            reason, explained = _explained(error, tls)
-            raise UnusableTls(
-                reason,
-                f"the certificate {tls.certificate} can't be used: {explained}",
-                hint="`aira identity show` prints its contents, `aira identity renew` renews it",
-            ) from None
+            why = f"the certificate {tls.certificate} can't be used: {_explained(error, tls)}"
+            hint = "`aira identity show` prints its contents, `aira identity renew` renews it"
+            raise unusable(why, hint=hint) from None
 
 
-def _explained(error: ssl.SSLCertVerificationError, tls: Tls) -> tuple[str, str]:
+def _explained(error: ssl.SSLCertVerificationError, tls: Tls) -> str:
     said = error.verify_message
     if any(word in said for word in ("issuer", "self-signed", "signature")):
-        return "other-site", f"it is not from the site of {tls.ca}"
-    return "expired" if "expired" in said else "invalid", said.replace("certificate", "it", 1)
+        return f"it is not from the site of {tls.ca}"
+    return said.replace("certificate", "it", 1)
 
 
 def _context(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
@@ -138,37 +133,17 @@ def _context(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
     try:
         context.load_verify_locations(tls.ca)
     except ssl.SSLError:
-        raise UnusableTls(
-            "not-pem", f"the site's certificate {tls.ca} is not a PEM certificate", hint=NEW_IDENTITY_HINT
-        ) from None
+        raise unusable(f"the site's certificate {tls.ca} is not a PEM certificate") from None
     if tls.pair is not None:
         try:
             context.load_cert_chain(*tls.pair, password=_no_password)
         except ssl.SSLError as error:
-            raise _unusable(tls, error) from None
+            if error.reason in ("KEY_VALUES_MISMATCH", "KEY_TYPE_MISMATCH"):
+                why = f"the key {tls.key} does not belong to the certificate {tls.certificate}"
+            else:
+                why = f"the certificate {tls.certificate} or its key {tls.key} is not PEM, or has a password"
+            raise unusable(why) from None
     return context
-
-
-def _unusable(tls: Tls, error: ssl.SSLError) -> UnusableTls:
-    if error.reason in ("KEY_VALUES_MISMATCH", "KEY_TYPE_MISMATCH"):
-        return UnusableTls(
-            "wrong-key",
-            f"the key {tls.key} does not belong to the certificate {tls.certificate}",
-            hint=NEW_IDENTITY_HINT,
-        )
-    return UnusableTls(
-        "not-pem",
-        f"the certificate {tls.certificate} or its key {tls.key} is not PEM, or is encrypted with a password",
-        hint=NEW_IDENTITY_HINT,
-    )
-
-
-def _check_readable(what: str, path: Path) -> None:
-    try:
-        path.read_bytes()
-    except OSError as error:
-        message = f"can't read the {what} {path}: {error.strerror}"
-        raise UnusableTls("unreadable", message, hint=NEW_IDENTITY_HINT) from None
 
 
 def _no_password() -> str:

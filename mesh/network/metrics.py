@@ -10,10 +10,10 @@ from schemas.status import ALIVE
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from mesh.flood import Drops
+    from mesh.base.flood import Drops
+    from mesh.network._validation import ValidationStatistics
+    from mesh.network.channel import Subscription
     from mesh.network.session import Network
-    from mesh.network.subscription import Subscription
-    from mesh.network.validation import ValidationStatistics
 
 
 def message_families(subscriptions: Iterable[Subscription[Any]]) -> tuple[MetricFamily, ...]:

@@ -10,16 +10,15 @@ import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from mesh.background import Background
+from mesh.base.background import Background
+from mesh.base.flood import Drops, FairQueue
+from mesh.base.lifecycle import Lifecycle
 from mesh.errors import AiraError
-from mesh.flood import Drops, FairQueue
+from mesh.network._validation import ValidationStatistics
 from mesh.network.pump import Pump
-from mesh.network.validation import ValidationStatistics
-from mesh.role import Lifecycle
 from schemas import parse_address
-from schemas.agent_keys import ReadingKey, parse_agent_key
-from schemas.payloads import decode_value, payload_type
-from schemas.selectors import reading_selector
+from schemas.keys import ReadingKey, parse_agent_key, reading_selector
+from schemas.payloads import payload_type, plain_value
 
 if TYPE_CHECKING:
     from contextlib import AsyncExitStack
@@ -107,7 +106,7 @@ class ReadingSubscription(Lifecycle):
         try:
             key = parse_agent_key(str(sample.key_expr))
             if isinstance(key, ReadingKey):
-                return Reading(parse_address(key.agent), key.topic, decode_value(payload, kind), payload, kind)
+                return Reading(parse_address(key.agent), key.topic, plain_value(payload, kind), payload, kind)
         except AiraError:
             self.refuse()
         return None

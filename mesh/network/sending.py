@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
-from mesh.clock import SYSTEM_CLOCK
+from mesh.base.clock import SYSTEM_CLOCK
 
 if TYPE_CHECKING:
     from zenoh import Session
 
-    from mesh.clock import Clock
+    from mesh.base.clock import Clock
 
 QUIET: Final = 0.00025
 """Seconds without a message after which the next one may be sent at once."""

@@ -10,24 +10,24 @@ import asyncio
 import logging
 import threading
 from collections import Counter
+from contextlib import asynccontextmanager, contextmanager
 from contextvars import copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
 
 import zenoh
 
-from mesh.background import call_in_loop
-from mesh.errors import AiraError, ClosedError, RemoteError
-from mesh.flood import Rate, RateLimiter
-from mesh.log_context import log_event
-from mesh.suggestions import nearest
+from mesh.base.background import Background, call_in_loop
+from mesh.base.flood import Drops, Rate, RateLimiter
+from mesh.base.log_context import log_event
+from mesh.base.suggestions import nearest
+from mesh.errors import AiraError, ClosedError, RemoteError, public_text
 from schemas import InvalidRecord, Record, RpcKey
 from schemas.rpc import SERVICES, SPENDING
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
 
-    from mesh.flood import Drops
     from schemas.rpc import Service
 
 log = logging.getLogger(__name__)
@@ -61,12 +61,27 @@ BUSY: Final = Failure("the agent is handling too many requests", "try again late
 
 
 class ServiceFailed(RemoteError, code="service-failed"):
-    """The agent replied to a call of `service` with an error, or did not reply; `reason` says why."""
+    """The agent replied to a call of `service` with an error, or did not reply; `reason` says why.
 
-    def __init__(self, service: str, why: str, *, hint: str = "", reason: FailureReason = "agent-error") -> None:
-        super().__init__(f"{service}: {why}", hint=hint)
+    The code is `no-answer` if nobody answers at its address: no agent, provider, validator or bridge, or none that
+    offers the service.
+    """
+
+    def __init__(
+        self, message: str, *, service: str, hint: str = "", reason: FailureReason = "agent-error", code: str = ""
+    ) -> None:
+        super().__init__(message, hint=hint, code=code)
         self.service = service
         self.reason: FailureReason = reason
+
+
+def no_answer(address: str, service: str = "", *, device: str = "") -> ServiceFailed:
+    """The error that nobody answers at an address; with `device`, that its edge agent does not."""
+    who = f"the device {device} of {address}" if device else address
+    hint = (
+        "`aira peers` shows who is present: is it running, on this router and with this lighthouse, and may you ask it?"
+    )
+    return ServiceFailed(f"{who} does not answer", service=service, hint=hint, reason="no-agent", code="no-answer")
 
 
 class Services:
@@ -77,7 +92,7 @@ class Services:
     """
 
     def __init__(self, session: zenoh.Session, address: str, *, drops: Drops | None = None) -> None:
-        self._drops = drops
+        self._drops = Drops() if drops is None else drops
         self._rate = RateLimiter(per_sender=REQUESTS, total=REQUESTS_IN_TOTAL)
         self._lock = threading.Lock()
         self._session = session
@@ -116,39 +131,32 @@ class Services:
         """
         if not self._open:
             raise ClosedError("the services are not open", hint="use them inside `async with`")
-        loop, request_type = asyncio.get_running_loop(), _service(service).request
-        key, context = str(RpcKey(self._address, service)), copy_context()
+        loop, key, context = asyncio.get_running_loop(), str(RpcKey(self._address, service)), copy_context()
+        handle = partial(_handle, key, _service(service).request, handler)
 
         def received(query: zenoh.Query) -> None:
             # Zenoh's thread answers what is too much, so that the event loop is not kept busy.
-            if self._has_place(key) and self._allow(service):
-                call_in_loop(loop, self._accept, query, key, request_type, handler, context=context)
-                return
-            if self._drops is not None:
+            with self._lock:
+                is_accepted = self._has_place(key) and self._rate.allow(service)
+            if is_accepted:
+                call_in_loop(loop, self._accept, query, key, handle, context=context)
+            else:
                 self._drops.count("request")
-            with query:
-                query.reply_err(BUSY)
+                _refuse(query)
 
         self._queryables.append(self._session.declare_queryable(key, received))
 
     def _has_place(self, key: str) -> bool:
         return self._running[key] < CONCURRENT_REQUESTS and len(self._requests) < CONCURRENT_IN_TOTAL
 
-    def _allow(self, service: str) -> bool:
-        with self._lock:
-            return self._rate.allow(service)
-
-    def _accept(
-        self, query: zenoh.Query, key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]]
-    ) -> None:
+    def _accept(self, query: zenoh.Query, key: str, handle: Callable[[zenoh.Query], Coroutine[Any, Any, None]]) -> None:
         if not self._open:
             query.drop()  # type: ignore[no-untyped-call]
             return
         if not self._has_place(key):
-            with query:
-                query.reply_err(BUSY)
+            _refuse(query)
             return
-        request = asyncio.create_task(self._handle(query, key, request_type, handler), name=f"handle {key}")
+        request = asyncio.create_task(handle(query), name=f"handle {key}")
         self._requests.add(request)
         self._running[key] += 1
         request.add_done_callback(partial(self._ended, key))
@@ -157,20 +165,73 @@ class Services:
         self._requests.discard(request)
         self._running[key] -= 1
 
-    async def _handle(
-        self, query: zenoh.Query, key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]]
-    ) -> None:
-        with query:
+
+async def _handle(
+    key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]], query: zenoh.Query
+) -> None:
+    with query:
+        try:
+            payload = b"{}" if query.payload is None else query.payload.to_bytes()
+            reply = (await handler(request_type.decode(payload))).encode()
+        except AiraError as error:
+            query.reply_err(Failure(public_text(error), public_text(error.hint), error.code).encode())
+        except Exception:
+            log.exception("service %s failed", key, extra=log_event("service-failed", key=key))
+            query.reply_err(Failure("the agent failed; see its log").encode())
+        else:
+            query.reply(key, reply, encoding="application/json")
+
+
+def _refuse(query: zenoh.Query) -> None:
+    """Say that there are too many requests."""
+    with query:
+        query.reply_err(BUSY)
+
+
+@contextmanager
+def declared(session: zenoh.Session, declaration: Any) -> Iterator[None]:
+    """Undeclare a subscriber or a queryable at the end, unless its session is closed, which has none."""
+    try:
+        yield
+    finally:
+        if not session.is_closed():
+            declaration.undeclare()
+
+
+@asynccontextmanager
+async def answering(
+    session: zenoh.Session, selector: str, answer: Callable[[zenoh.Query], Awaitable[None]], rate: Rate, drops: Drops
+) -> AsyncIterator[None]:
+    """Meanwhile `answer` the queries of a selector, each in a task; those beyond the `rate` are dropped and counted.
+
+    Zenoh does not say who asks, so that all share the rate. An `AiraError` leaves a query without a reply.
+    """
+    loop, limiter, lock = asyncio.get_running_loop(), RateLimiter(per_sender=rate), threading.Lock()
+
+    async def answer_one(query: zenoh.Query) -> None:
+        with query:  # leaving it ends the answer
             try:
-                payload = b"{}" if query.payload is None else query.payload.to_bytes()
-                reply = (await handler(request_type.decode(payload))).encode()
-            except AiraError as error:
-                query.reply_err(Failure(str(error), error.hint, error.code).encode())
-            except Exception:
-                log.exception("service %s failed", key, extra=log_event("service-failed", key=key))
-                query.reply_err(Failure("the agent failed; see its log").encode())
+                await answer(query)
+            except (AiraError, zenoh.ZError) as error:
+                log.debug("a query of %s is not answered: %s", query.selector, error)
+
+    async with Background() as tasks:
+
+        def begin(query: zenoh.Query) -> None:
+            tasks.start(answer_one(query), f"answer {selector}")
+
+        def receive(query: zenoh.Query) -> None:
+            # Zenoh's thread drops what is too much, so that the event loop is not kept busy.
+            with lock:
+                is_allowed = limiter.allow("")
+            if is_allowed:
+                call_in_loop(loop, begin, query)
             else:
-                query.reply(key, reply, encoding="application/json")
+                drops.count("recall")
+                query.drop()  # type: ignore[no-untyped-call]
+
+        with declared(session, session.declare_queryable(selector, receive, complete=True)):
+            yield
 
 
 async def call(
@@ -178,9 +239,9 @@ async def call(
 ) -> Any:
     """Call `service` (one of `schemas.rpc.SERVICES`) of the agent at `agent` (address) and return its reply.
 
-    Raises `ServiceFailed` with the agent's error, or when no reply arrives within `timeout` seconds (by default
-    `TIMEOUT`, or `SPENDING_TIMEOUT` for services that send a transaction). Cancelling stops the wait; the agent may
-    complete the request all the same.
+    Raises `ServiceFailed` with the agent's error, if no such agent offers it, or when no reply arrives within `timeout`
+    seconds (by default `TIMEOUT`, or `SPENDING_TIMEOUT` for services that send a transaction). Cancelling stops the
+    wait; the agent may complete the request all the same.
     """
     if timeout is None:
         timeout = SPENDING_TIMEOUT if service in SPENDING else TIMEOUT
@@ -192,33 +253,24 @@ async def call(
     finally:
         query.cancel()  # type: ignore[no-untyped-call]
     if reply is not None and reply.ok is not None:
-        return _read(service, reply_type, reply.ok.payload.to_bytes())
-    if reply is not None and reply.err is not None:
-        raise _failed(service, reply.err.payload.to_bytes(), timeout)
-    raise ServiceFailed(
-        service, "no agent answers", reason="no-agent", hint="is the agent running, and on the same router?"
-    )
+        try:
+            return reply_type.decode(reply.ok.payload.to_bytes())
+        except InvalidRecord as error:
+            why = f"{service}: unreadable reply: {error}"
+            raise ServiceFailed(why, service=service, reason="unreadable-reply") from error
+    if reply is None or reply.err is None:
+        raise no_answer(agent, service)
+    try:
+        failure = Failure.decode(reply.err.payload.to_bytes())
+    except InvalidRecord:  # Zenoh replies `Timeout`
+        raise ServiceFailed(f"{service}: no reply within {timeout:g} s", service=service, reason="timeout") from None
+    reason: FailureReason = "busy" if failure.code == "busy" else "agent-error"
+    raise ServiceFailed(f"{service}: {failure.error}", service=service, hint=failure.hint, reason=reason)
 
 
 def _service(name: str) -> Service:
     if name not in SERVICES:
         similar = nearest(name, SERVICES)
         hint = f"did you mean {similar!r}?" if similar else "`aira rpc --list` shows all services"
-        raise ServiceFailed(name, "no such service", reason="unknown-service", hint=hint)
+        raise ServiceFailed(f"{name}: no such service", service=name, reason="unknown-service", hint=hint)
     return SERVICES[name]
-
-
-def _read(service: str, reply_type: type[Record], payload: bytes) -> Record:
-    try:
-        return reply_type.decode(payload)
-    except InvalidRecord as error:
-        raise ServiceFailed(service, f"unreadable reply: {error}", reason="unreadable-reply") from error
-
-
-def _failed(service: str, payload: bytes, timeout: float) -> ServiceFailed:
-    try:
-        failure = Failure.decode(payload)
-    except InvalidRecord:
-        return ServiceFailed(service, f"no reply within {timeout:g} s", reason="timeout")  # Zenoh replies `Timeout`
-    reason: FailureReason = "busy" if failure.code == "busy" else "agent-error"
-    return ServiceFailed(service, failure.error, hint=failure.hint, reason=reason)

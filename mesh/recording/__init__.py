@@ -1,34 +1,50 @@
 """Recordings: objectives of unknown origin (MCAP, ROS 1 bags, rosbag2) checked and played, and jobs recorded."""
 
-from mesh.recording.converting import (
+from mesh.recording._converting import (
     ConversionSummary,
+    PackSummary,
     RecordingFormat,
-    Unconvertible,
     convert,
+    messages_in,
+    pack,
+    pack_values,
     recording_file,
     recording_files,
 )
-from mesh.recording.errors import (
+from mesh.recording._json_schemas import JsonSchemas, encode_described, json_type
+from mesh.recording._recorder import (
+    ABOUT,
+    CLOCK_RECORD,
+    CLOSED,
+    NOTE_TOPIC,
+    MessageRole,
+    Recorder,
+    Recorders,
+    RecorderSettings,
+    RecordingAbout,
+    RecordingSummary,
+)
+from mesh.recording._recovery import RECOVERED, recover
+from mesh.recording._source import (
+    GENEROUS,
+    Attachment,
     CorruptRecording,
+    Limits,
     NotARecording,
     RecordingError,
-    RecordingExists,
     RecordingFailed,
-    RecordingTooLarge,
     Unrecordable,
 )
-from mesh.recording.json_schemas import JsonSchemas, encode_described, json_type
-from mesh.recording.limits import GENEROUS, Limits
 from mesh.recording.objective import (
     ChannelMessage,
     Objective,
     Played,
     TopicRates,
+    numbers_of,
     open_objective,
+    preflight,
     rates_of,
 )
-from mesh.recording.packing import InvalidLine, PackSummary, bag_to_mcap, messages_in, pack, pack_values
-from mesh.recording.partial import ABOUT, CLOCK_RECORD, CLOSED, NOTE_TOPIC, MessageRole, RecordingAbout
 from mesh.recording.playback import (
     AtOnce,
     FixedRate,
@@ -36,11 +52,4 @@ from mesh.recording.playback import (
     RecordedTimes,
     paced,
     play,
-    timeline,
 )
-from mesh.recording.preflight import preflight
-from mesh.recording.recorder import Recorder, RecorderSettings, RecordingSummary
-from mesh.recording.recorders import Recorders
-from mesh.recording.recovery import RECOVERED, recover
-from mesh.recording.source import Attachment
-from mesh.recording.values import numbers_of

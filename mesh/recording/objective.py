@@ -1,32 +1,42 @@
-"""Opening a recording of unknown origin, to read it or play it."""
+"""Opening a recording of unknown origin, to read or play it; and whether an objective can be played (`preflight`)."""
 
 from __future__ import annotations
 
 import os
 import stat
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Struct
 
-from mesh.recording import bag_records, mcap_records
-from mesh.recording.bag_source import open_bag
-from mesh.recording.errors import NotARecording, RecordingTooLarge
-from mesh.recording.limits import Limits
-from mesh.recording.mcap_source import open_mcap
-from mesh.recording.ros_values import ros_value
-from mesh.recording.sqlite_source import SQLITE_MAGIC, open_sqlite
+from mesh.errors import InvalidKey
+from mesh.recording import _bag_reader, _mcap_reader
+from mesh.recording._bag_reader import open_bag
+from mesh.recording._mcap_reader import open_mcap
+from mesh.recording._source import Limits, NotARecording, RecordingError, about
+from mesh.recording._sqlite_reader import SQLITE_MAGIC, ZSTD_MAGIC, open_sqlite
+from mesh.recording.ros import ros_value
 from schemas.errors import InvalidPayload
-from schemas.payloads import Empty, PayloadType, String, decode_value
+from schemas.keys import topic_chunks
+from schemas.model import Effort
+from schemas.payloads import PayloadType, String, decode_value, plain_value
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from typing import TypeAlias
 
     from mesh.content import Progress
-    from mesh.recording.source import OnMessage, RecordingChannel, RecordingSource
+    from mesh.recording._source import OnMessage, RecordingChannel, RecordingSource
+    from schemas.model import ModelDescription
+
+    Obstacle: TypeAlias = Callable[[str, Any], str]
+    "Returns why no handler accepts a message, given its topic and value; empty if one does."
+
 
 _DEFAULT: Final = Limits()
-_ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
+_FORMATS: Final = {_mcap_reader.MAGIC: open_mcap, _bag_reader.MAGIC: open_bag, SQLITE_MAGIC: open_sqlite}
 
 
 class Topic(Struct, frozen=True):
@@ -60,12 +70,9 @@ class Played(Struct, frozen=True):
         if self.type.encoding == "cdr":
             return ros_value(self.payload, self.type)
         try:
-            value = decode_value(self.payload, self.type)
+            return plain_value(self.payload, self.type)
         except InvalidPayload:
             return self.payload
-        if isinstance(value, String):
-            return value.data
-        return None if isinstance(value, Empty) else value
 
 
 class ChannelMessage(Struct, frozen=True):
@@ -125,8 +132,7 @@ def open_objective(path: str | Path, limits: Limits = _DEFAULT, *, progress: Pro
     """Check the whole recording at `path`, and open it: an MCAP file, a ROS 1 bag, or a database of rosbag2 (`.db3`).
 
     Reads the whole file: use a thread. The limits bound the memory, whatever the file states; schema texts are never
-    parsed. `progress` is called with the bytes read, of all. Raises `NotARecording`, `RecordingTooLarge`,
-    `CorruptRecording`.
+    parsed. `progress` is called with the bytes read, of all. Raises `RecordingError`.
     """
     return Objective(open_source(Path(path), limits, progress=progress))
 
@@ -135,19 +141,24 @@ def open_source(
     path: Path, limits: Limits, *, on_message: OnMessage | None = None, progress: Progress | None = None
 ) -> RecordingSource:
     """Like `open_objective`, but returns the source, and calls `on_message` for each message while checking."""
-    size, magic = _size_and_magic(path)
-    if size > limits.size:
-        raise RecordingTooLarge(path, f"it has {size} bytes, more than the {limits.size} allowed", limit="size")
-    if magic.startswith(mcap_records.MAGIC):
-        source = open_mcap(path, size, limits, on_message=on_message, progress=progress)
-    elif magic.startswith(bag_records.MAGIC):
-        source = open_bag(path, size, limits, on_message=on_message, progress=progress)
-    elif magic.startswith(SQLITE_MAGIC):
-        source = open_sqlite(path, size, limits, on_message=on_message, progress=progress)
-    elif magic.startswith(_ZSTD_MAGIC):
-        raise NotARecording(path, "it is compressed as a whole; decompress it first: zstd -d")
-    else:
-        raise NotARecording(path, "it is neither an MCAP file, nor a ROS 1 bag, nor a database of rosbag2")
+    with about(path):
+        try:
+            status = os.stat(path)
+            if not stat.S_ISREG(status.st_mode):  # opening it could block
+                raise NotARecording("it is not a file")
+            with path.open("rb") as file:
+                magic = file.read(len(SQLITE_MAGIC))
+        except OSError as error:
+            raise NotARecording(f"it can't be read: {error.strerror}") from error
+        size = status.st_size
+        limits.check(size=size)
+        opened = next((opened for start, opened in _FORMATS.items() if magic.startswith(start)), None)
+        if opened is not None:
+            source = opened(path, size, limits, on_message=on_message, progress=progress)
+        elif magic.startswith(ZSTD_MAGIC):
+            raise NotARecording("it is compressed as a whole; decompress it first: zstd -d")
+        else:
+            raise NotARecording("it is neither an MCAP file, nor a ROS 1 bag, nor a database of rosbag2")
     if progress is not None:
         progress(size, size)
     return source
@@ -181,13 +192,154 @@ def _played(channel: RecordingChannel, payload: bytes, log_time: int, publish_ti
     return Played(channel.topic, payload, log_time, publish_time, sequence, channel.type, role)
 
 
-def _size_and_magic(path: Path) -> tuple[int, bytes]:
-    """The size and the first bytes of a regular file. Opening anything else could block."""
+LONGEST_LIST: Final = 12
+"""Members of a list whose numbers are read."""
+
+
+def numbers_of(message: Played) -> Iterator[tuple[str, float]]:
+    """The numbers in a message with the paths of their fields: `.linear.x`, empty for a number alone.
+
+    A std_msgs/String may consist of numbers, too. Of a message that is not of its type there are none.
+    """
     try:
-        status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode):
-            raise NotARecording(path, "it is not a file")
-        with path.open("rb") as file:
-            return status.st_size, file.read(len(SQLITE_MAGIC))
-    except OSError as error:
-        raise NotARecording(path, f"it can't be read: {error.strerror}") from error
+        value = decode_value(message.payload, message.type)
+    except InvalidPayload:
+        return
+    if isinstance(value, String):
+        try:
+            value = [float(word) for word in value.data.split(maxsplit=LONGEST_LIST)[:LONGEST_LIST]]
+        except ValueError:
+            return
+        value = value[0] if len(value) == 1 else value
+    yield from _numbers_in(value, "")
+
+
+def _numbers_in(value: Any, name: str) -> Iterator[tuple[str, float]]:
+    match value:
+        case bool() | int() | float():
+            try:
+                yield name, float(value)
+            except OverflowError:
+                return
+        case dict():
+            for key, member in value.items():
+                yield from _numbers_in(member, f"{name}.{key}")
+        case list():
+            for number, member in enumerate(value[:LONGEST_LIST]):
+                yield from _numbers_in(member, f"{name}[{number}]")
+
+
+_LONGEST_JSON: Final = 4 << 20
+"""Bytes of the longest JSON message that is decoded: as objects it takes twenty times as much."""
+_MOST_VALUES: Final = 1_000_000
+"""Values in arrays and objects that are compared with a model, which takes about a second; numbers in arrays are
+compared faster, and not counted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preflight:
+    """The outcome of checking an objective.
+
+    `reason` is machine-readable: empty if the objective can be played, or one of `not-a-recording`, `too-large`,
+    `expands-too-much`, `corrupt`, `no-messages`, `too-long`, `unplayable-topic`, `unknown-topic`, `unreadable-message`
+    (its payload does not match its schema), `unfit-message` (no handler, or not the model, accepts it),
+    `missing-topic`, `too-many-messages` (for the model). `detail` is for people. `objective` is set if the file itself
+    is sound.
+    """
+
+    reason: str = ""
+    detail: str = ""
+    limit: str = ""
+    """The field of `Limits` that the file exceeds, if that is the reason."""
+    objective: Objective | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether it can be played."""
+        return not self.reason
+
+
+def preflight(
+    path: Path,
+    limits: Limits = _DEFAULT,
+    *,
+    topics: Collection[str] | None = None,
+    obstacle: Obstacle | None = None,
+    model: ModelDescription | None = None,
+    progress: Progress | None = None,
+) -> Preflight:
+    """Check the whole file at `path`. Raises nothing for a bad file. Reads the whole file: use a thread.
+
+    `topics` are those that the device accepts (None: any), `obstacle` finds messages that it does not accept, `model`
+    describes what objectives play. `progress` is called with the bytes read, of all.
+    """
+    check = _MessageCheck(limits, obstacle, model)
+    try:
+        objective = Objective(open_source(path, limits, on_message=check.on_message, progress=progress))
+    except RecordingError as error:
+        return Preflight(reason=error.reason, detail=str(error), limit=error.limit)
+    reason, detail = _recording_fault(objective, limits, topics)
+    if not reason:
+        reason, detail = check.reason, check.detail
+    if not reason and model is not None:
+        fault = model.objective_fault(check.counts, duration_ns=objective.duration_ns, size=objective.size)
+        reason, detail = fault or ("", "")
+    return Preflight(reason=reason, detail=detail, objective=objective)
+
+
+def _recording_fault(objective: Objective, limits: Limits, topics: Collection[str] | None) -> tuple[str, str]:
+    """What is wrong with the recording as a whole: a reason and a detail, or empty texts."""
+    if not objective.count:
+        return "no-messages", "it has no messages"
+    if objective.duration_ns > limits.duration_ns:
+        return "too-long", f"playing it takes {objective.duration_ns // 10**9} seconds"
+    for topic in objective.topics:
+        try:
+            topic_chunks(topic.name)
+        except InvalidKey as error:
+            return "unplayable-topic", str(error)
+        if topics is not None and topic.name not in topics:
+            return "unknown-topic", f"no handler accepts {topic.name}"
+    return "", ""
+
+
+class _MessageCheck:
+    """Finds the first message that would fail in the middle of the job."""
+
+    def __init__(self, limits: Limits, obstacle: Obstacle | None, model: ModelDescription | None) -> None:
+        self.reason = self.detail = ""
+        self.counts: Counter[str] = Counter()
+        """Messages by topic, until one has failed; only counted for a `model`."""
+        self._model = model
+        self._effort = Effort(_MOST_VALUES)
+        self._most_json = limits.json
+        self._obstacle = obstacle
+        self._messages = 0
+        self._json = 0
+
+    def on_message(self, channel: RecordingChannel, payload: bytes) -> None:
+        """Check the next message, unless one has failed already."""
+        if self.reason:
+            return
+        if channel.type.encoding == "json":
+            self._json += len(payload)
+            if len(payload) > _LONGEST_JSON or self._json > self._most_json:
+                self._fail("expands-too-much", channel, f"{len(payload)} bytes of JSON, {self._json} with those before")
+                return
+        try:
+            said = decode_value(payload, channel.type)
+        except InvalidPayload as error:
+            self._fail("unreadable-message", channel, str(error))
+            return
+        fault = None
+        if self._model is not None:
+            fault = self._model.message_fault(channel.topic, channel.type, said, self._effort)
+            self.counts[channel.topic] += 1
+        if fault is not None:
+            self._fail(fault.reason, channel, fault.detail)
+        elif self._obstacle is not None and (why := self._obstacle(channel.topic, said)):
+            self._fail("unfit-message", channel, why)
+        self._messages += 1
+
+    def _fail(self, reason: str, channel: RecordingChannel, why: str) -> None:
+        self.reason, self.detail = reason, f"message {self._messages} on {channel.topic}: {why}"

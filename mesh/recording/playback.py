@@ -18,7 +18,7 @@ from msgspec import Struct
 from mesh.recording.objective import Objective, Played
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator
+    from collections.abc import AsyncGenerator, AsyncIterable, Iterator
 
 _SECOND: Final = 10**9
 _EARLY_NS: Final = 200_000
@@ -105,38 +105,33 @@ class MonotonicClock:
             await asyncio.sleep(0)
 
 
-def timeline(messages: Iterable[Played], pace: Pace, *, first_index: int = 0, start_ns: int = 0) -> Iterator[Step]:
-    """The steps of a playback of `messages`, in the given order.
-
-    The first is due at once; `first_index` is its number in the recording. With `start_ns`, messages recorded less than
-    that after the first are skipped, and the others are due as if the recording began there.
-    """
-    schedule = _Schedule(pace, first_index=first_index, start_ns=start_ns)
-    for message in messages:
-        step = schedule.step(message)
-        if step is not None:
-            yield step
-
-
 async def paced(
     messages: AsyncIterable[Played], pace: Pace, clock: PlaybackClock, *, first_index: int = 0, start_ns: int = 0
 ) -> AsyncGenerator[Step, None]:
-    """Each step of the `timeline` of `messages` when it is due by `clock`, never earlier.
+    """Each message as a step when it is due by `clock`, never earlier.
 
-    Time starts with the first message. Cancelling is safe between two steps.
+    The first is due at once, and time starts with it; `first_index` is its number in the recording. With `start_ns`,
+    messages recorded less than that after the first are skipped, and the others are due as if the recording began
+    there. Cancelling is safe between two steps.
     """
-    schedule = _Schedule(pace, first_index=first_index, start_ns=start_ns)
-    begin, unpaused = None, 0
+    index, position, unpaused = first_index - 1, -1, 0
+    origin = begin = 0
     async for message in messages:
-        step = schedule.step(message)
-        if step is None:
+        index += 1
+        if index == first_index:
+            origin = message.log_time_ns
+        elapsed = message.log_time_ns - origin - start_ns
+        if elapsed < 0:
             continue
-        begin = clock.now_ns() if begin is None else begin
+        position += 1
+        due = pace.due_ns(position, elapsed)
+        if not position:
+            begin = clock.now_ns()
         unpaused += 1
-        if begin + step.due_ns > clock.now_ns() or unpaused >= _UNPAUSED:
+        if begin + due > clock.now_ns() or unpaused >= _UNPAUSED:
             unpaused = 0
-            await clock.sleep_until(begin + step.due_ns)
-        yield step
+            await clock.sleep_until(begin + due)
+        yield Step(index, due, message)
 
 
 _AS_RECORDED: Final = RecordedTimes()
@@ -161,28 +156,6 @@ async def play(
     async with aclosing(messages):
         async for step in paced(messages, pace, clock, first_index=start_index, start_ns=start_ns):
             yield step
-
-
-class _Schedule:
-    """Gives each message its index and due time."""
-
-    def __init__(self, pace: Pace, *, first_index: int, start_ns: int) -> None:
-        self._pace = pace
-        self._index = first_index - 1
-        self._position = -1
-        self._start_ns = start_ns
-        self._origin: int | None = None
-
-    def step(self, message: Played) -> Step | None:
-        """The step of the next message; None if it is before the start."""
-        self._index += 1
-        if self._origin is None:
-            self._origin = message.log_time_ns
-        elapsed = message.log_time_ns - self._origin - self._start_ns
-        if elapsed < 0:
-            return None
-        self._position += 1
-        return Step(self._index, self._pace.due_ns(self._position, elapsed), message)
 
 
 async def read_ahead(messages: Iterator[Played]) -> AsyncGenerator[Played, None]:

@@ -1,10 +1,11 @@
 """Settings: the options in groups, and how they are loaded."""
 
+from mesh.settings._loading import NOT_OPTIONS, load
+from mesh.settings._options import LONGEST
 from mesh.settings.groups import (
     DEFAULTS,
     MEANING,
     OPTIONS,
-    AccountNotSet,
     AccountSettings,
     ChainSettings,
     ContentSettings,
@@ -12,7 +13,6 @@ from mesh.settings.groups import (
     IpfsSettings,
     MarketSettings,
     NetworkSettings,
-    NodeNotSet,
     Ros2Settings,
     Settings,
     StorageSettings,
@@ -20,12 +20,3 @@ from mesh.settings.groups import (
     ValidatorSettings,
     options_of,
 )
-from mesh.settings.loading import (
-    NOT_OPTIONS,
-    InvalidOption,
-    SettingsNotToml,
-    SettingsUnreadable,
-    UnknownOption,
-    load,
-)
-from mesh.settings.options import LONGEST

@@ -11,21 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from mesh.errors import ConfigurationError
-from mesh.settings.options import Gwei, Interval, PositiveInt, Seconds, SecondsOrEver, option
+from mesh.settings._options import Gwei, Interval, NaturalInt, PositiveInt, Seconds, SecondsOrEver, option
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 DEADLINE_LIMIT: Final = 7200
 """Blocks, about a day where one takes 12 seconds."""
-
-
-class NodeNotSet(ConfigurationError, code="node-not-set"):
-    """The settings name no EVM node."""
-
-
-class AccountNotSet(ConfigurationError, code="account-not-set"):
-    """The settings name no keyfile, or no password file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,15 +108,21 @@ class ChainSettings(StorageSettings):
     confirmations: PositiveInt = option(1, "blocks until a transaction counts as mined, its own block included")
     reorg_depth: PositiveInt = option(12, "how many blocks behind the head a reorganisation is still detected")
     poll_interval: Interval = option(1.0, "seconds between polls for new blocks")
+    known_validators: tuple[str, ...] = option(
+        (),
+        "names or addresses of further contracts that your orders may name as validators; juries of this project and"
+        " accounts that have sent a transaction need no entry",
+    )
 
     @property
     def node(self) -> str:
-        """The node's URL, or several separated by commas. Raises `NodeNotSet`."""
+        """The node's URL, or several separated by commas. Raises `ConfigurationError`."""
         found = self.web3_http_provider.strip() or self.web3_ws_provider.strip()
         if not found:
-            raise NodeNotSet(
+            raise ConfigurationError(
                 "no EVM node is configured: web3_http_provider and web3_ws_provider are both empty",
                 hint="pass --web3-http-provider http://HOST:8545",
+                code="node-not-set",
             )
         return found
 
@@ -137,11 +135,12 @@ class AccountSettings:
     keyfile_password_file: str = option("", "file with the keyfile's password")
 
     def keyfile_and_password(self) -> tuple[Path, Path]:
-        """The keyfile and its password file. Raises `AccountNotSet`."""
+        """The keyfile and its password file. Raises `ConfigurationError`."""
         if not self.keyfile or not self.keyfile_password_file:
-            raise AccountNotSet(
+            raise ConfigurationError(
                 "this needs an account, and keyfile or keyfile_password_file is not set",
                 hint="create one with `aira account new`, then pass --keyfile and --keyfile-password-file",
+                code="account-not-set",
             )
         return Path(self.keyfile).expanduser(), Path(self.keyfile_password_file).expanduser()
 
@@ -155,6 +154,12 @@ class MarketSettings:
     open_orders_limit: PositiveInt = option(20_480, "most open orders that a provider keeps, 2 KB each")
     unmined_limit: PositiveInt = option(
         16, "most transactions of a provider that wait to be mined; some nodes keep no more of one account"
+    )
+    free_contracts: NaturalInt = option(
+        100, "contracts a day that a provider creates although they don't cover its gas; a quarter of them at once"
+    )
+    customers: tuple[str, ...] = option(
+        (), "addresses whose orders a provider always makes contracts of, also if these don't cover its gas"
     )
     deadline_limit: PositiveInt = option(
         DEADLINE_LIMIT,
@@ -181,6 +186,9 @@ class ValidatorSettings:
         ("complete",), "policies to judge by: complete (always on), acknowledged, schema, rate"
     )
     validator_fee: str = option("0", "least fee, in XRT (0.1) or wn (100wn); a job that pays less never counts")
+    validator_bags: bool = option(
+        False, "also accept ROS 1 bags, as robots of the legacy network hand in: less of them can be checked"
+    )
     validator_title: str = option("", "the validator's title in its announcement, for people")
     validator_check_timeout: Interval = option(
         60.0, "seconds that an own check may take for a recording; a result whose check takes longer is not judged"
@@ -226,6 +234,9 @@ class IpfsSettings:
     ipfs_gateway: str = option("", "IPFS gateway to read content from besides the daemon (a URL; empty: none)")
     ipfs_public_providers: tuple[str, ...] = option(
         (), "RPCs of further IPFS nodes that should pin objectives and results"
+    )
+    ipfs_large_numbers: bool = option(
+        False, "pass orders of generation 3 with numbers over 32 bits to IPFS, where older nodes stop at them"
     )
     ipfs_swarm_connect: tuple[str, ...] = option((), "swarm addresses (/…/p2p/ID) to keep the IPFS daemon connected to")
 

@@ -1,32 +1,154 @@
-"""The log of a process: a line on stderr for each event, and the last events in memory for the service `logs`."""
+"""The log of a process: a line on stderr for each event, for people or as a JSON object, and the last events in
+memory for the service `logs`.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import re
 import sys
 import threading
 import time
+import traceback
 from collections import deque
+from contextlib import suppress
+from datetime import UTC, datetime
 from itertools import islice
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from msgspec.structs import replace
 
-from mesh.errors import AiraError, InputError
-from mesh.log_context import UNKNOWN_SOURCE, LogSource, log_event
-from mesh.telemetry.events import event_of, human_line, json_line, timestamp
-from schemas.logs import LEVELS, LogsRead
+from mesh.base import log_context as context
+from mesh.base.log_context import UNKNOWN_SOURCE, LogSource, log_event
+from mesh.errors import AiraError, InputError, public_text
 from schemas.records import MAX_RECORD_SIZE
+from schemas.status import LEVELS, LogEvent, LogsRead
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import TracebackType
 
     from mesh.settings import TelemetrySettings
-    from schemas.logs import LogEvent, ReadLogs
+    from schemas.status import ReadLogs
+
 
 log = logging.getLogger(__name__)
+
+MAX_MESSAGE: Final = 4_000
+"""Characters kept of a message; an event must fit into a reply."""
+MAX_TRACEBACK: Final = 12_000
+"""Characters kept of a traceback: the last ones."""
+MAX_EVENT: Final = 40_000
+"""Bytes of an encoded event. A larger one (with many escapes) has its texts cut to `MAX_SHORT_TEXT`."""
+MAX_SHORT_TEXT: Final = 1_000
+MAX_FACTS: Final = 16
+MARGIN: Final = "    | "
+"""Before each line of a traceback. It may quote untrusted text, which must not pass for an event."""
+FIELDS: Final = frozenset(LogEvent.__struct_fields__)
+"""Names that a fact can't have."""
+_URL: Final = re.compile(r"\b(?:https?|wss?)://[^\s'\"<>]+")
+_USER: Final = re.compile(r"//[^/?#]*@")
+_KEY: Final = re.compile(r"/(?!Qm)[\w-]{16,}")
+_QUERY: Final = re.compile(r"\?.*", re.DOTALL)
+
+
+def event_of(record: logging.LogRecord, *, default: LogSource = context.UNKNOWN_SOURCE) -> LogEvent:
+    """The event of a log record in the current context; `default` is its source where the context has none."""
+    source = context.current_source()
+    if source is context.UNKNOWN_SOURCE:
+        source = default
+    error = record.exc_info[1] if record.exc_info else None
+    found: dict[str, str] = getattr(record, "facts", {})
+    facts = {name: _cut(_encodable(value), MAX_SHORT_TEXT) for name, value in list(found.items())[:MAX_FACTS]}
+    raised = "" if error is None else f"{type(error).__name__}: {error}".removesuffix(": ")
+    event = LogEvent(
+        time=timestamp(record.created),
+        level=level_of(record.levelno),
+        logger=record.name,
+        event=getattr(record, "event", ""),
+        message=_cut(_encodable(record.getMessage()), MAX_MESSAGE),
+        role=source.role,
+        address=source.address,
+        lighthouse=source.lighthouse,
+        liability=context.current_liability() or facts.get("liability", ""),
+        facts=facts,
+        error=_cut(_encodable(raised), MAX_SHORT_TEXT),
+        trace="" if error is None else _encodable("".join(traceback.format_exception(error)))[-MAX_TRACEBACK:],
+    )
+    if len(event.encode()) > MAX_EVENT:
+        message, trace = _cut(event.message, MAX_SHORT_TEXT), event.trace[-MAX_SHORT_TEXT:]
+        event = replace(event, message=message, trace=trace, facts={})
+    return event
+
+
+def json_line(event: LogEvent) -> str:
+    """The event as one JSON object in ASCII. Facts are members of it; empty fields are left out."""
+    fields: dict[str, Any] = {name: getattr(event, name) for name in event.__struct_fields__}
+    fields |= {name: value for name, value in event.facts.items() if name not in FIELDS}
+    del fields["facts"]
+    return json.dumps({name: value for name, value in fields.items() if value not in ("", 0)})
+
+
+def human_line(event: LogEvent) -> str:
+    """The event for people: local time, level, liability, message; below it the traceback of an error."""
+    about = f"{event.liability}: " if event.liability else ""
+    line = printable(f"{_local_time(event.time)} {event.level.upper():<7} {about}{event.message}")
+    return "\n".join([line, *(MARGIN + printable(part.rstrip()) for part in event.trace.splitlines())])
+
+
+def printable(text: str) -> str:
+    """The text on one line, with unprintable characters escaped as in Python, so that it can't control a terminal."""
+    if text.isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape", "surrogatepass").decode() for letter in text
+    )
+
+
+def without_secrets(text: str) -> str:
+    """The text without the secrets of URLs in it: user names and passwords, keys in the path, queries.
+
+    Node providers put their customers' keys in the path.
+    """
+    return _URL.sub(_without_secrets, text) if "://" in text else text
+
+
+def timestamp(seconds: float) -> str:
+    """Seconds since the epoch as ISO 8601, UTC, with milliseconds."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def level_of(number: int) -> str:
+    """The name of a level; a number between two levels counts as the lower."""
+    place = min(max(number // 10, 1), len(LEVELS))
+    return LEVELS[place - 1]
+
+
+def _cut(text: str, longest: int) -> str:
+    if len(text) <= longest:
+        return text
+    return f"{text[:longest]}… ({len(text) - longest:,} characters more)"
+
+
+def _encodable(text: str) -> str:
+    """The text without secrets and without lone surrogates, which stand for undecodable bytes in file names."""
+    return without_secrets(text).encode("utf-8", "backslashreplace").decode()
+
+
+def _without_secrets(found: re.Match[str]) -> str:
+    scheme, host, path = re.split(r"(?<=//)([^/?#]*)", _USER.sub("//", found[0]), maxsplit=1)
+    return f"{scheme}{host}{_QUERY.sub('?…', _KEY.sub('/…', path))}"
+
+
+def _local_time(time: str) -> str:
+    """The local time of day; dashes if another process sent something that is no time."""
+    try:
+        return f"{datetime.fromisoformat(time).astimezone():%H:%M:%S}"
+    except (ValueError, OverflowError, OSError):
+        return "--:--:--"
+
 
 LIBRARIES: Final = ("aiohttp", "asyncio", "eth", "eth_tester", "urllib3", "web3", "websockets", "zenoh")
 """Loggers of libraries; below level debug only their warnings are shown."""
@@ -36,10 +158,6 @@ MAX_BYTES: Final = 2 * 1024 * 1024
 """Bytes of encoded events that a process keeps."""
 MAX_REPLY: Final = MAX_RECORD_SIZE - 4_096
 """Bytes of events in a reply; the rest of the record is for its other fields."""
-
-
-class NoLog(AiraError, code="log-not-kept"):
-    """The process keeps no log: a program embeds the role and logs in its own way."""
 
 
 class _BufferedEvent(NamedTuple):
@@ -165,17 +283,11 @@ class LogHandler(logging.Handler):
             vars(record).update(log_event("record-malformed"))
             event = event_of(record, default=self.source)
         self.buffer.add(event)
-        if not (getattr(record, "is_said", False) and not self.writes_json):
-            self._write(event)
-
-    def _write(self, event: LogEvent) -> None:
-        if self._format_line is None:
+        if self._format_line is None or (getattr(record, "is_said", False) and not self.writes_json):
             return
-        try:
+        with suppress(OSError, ValueError):  # stderr is closed; the event is in the buffer
             sys.stderr.write(f"{self._format_line(event)}\n")
             sys.stderr.flush()
-        except (OSError, ValueError):
-            pass  # stderr is closed; the event is in the buffer
 
 
 class LogService:
@@ -190,18 +302,29 @@ class LogService:
         self._address = address
 
     async def logs(self, request: ReadLogs) -> LogsRead:
-        """The requested events. Raises `NoLog`, `InputError`."""
+        """The requested events. Raises `AiraError`, `InputError`."""
         return self.read(request)
 
     def read(self, request: ReadLogs) -> LogsRead:
         """The same for callers without an event loop."""
         handler = process_log()
         if handler is None:
-            raise NoLog(
+            raise AiraError(
                 f"this {self._role} is part of a program that keeps no log",
                 hint="the program may call mesh.telemetry.logs.keep_log()",
+                code="log-not-kept",
             )
-        return handler.buffer.read(request, address=self._address, role=self._role)
+        found = handler.buffer.read(request, address=self._address, role=self._role)
+        return replace(found, entries=tuple(map(_public, found.entries)))
+
+
+def _public(event: LogEvent) -> LogEvent:
+    """The event as strangers may read it. Its own limits are kept: nothing gets longer."""
+    message, error, trace = (
+        public_text(text, longest=MAX_TRACEBACK) for text in (event.message, event.error, event.trace)
+    )
+    facts = {name: public_text(value, longest=MAX_TRACEBACK) for name, value in event.facts.items()}
+    return replace(event, message=message, error=error, trace=trace, facts=facts)
 
 
 def configure_logging(*, level: str = "info", form: str = "human", role: str = "") -> None:

@@ -2,14 +2,23 @@
 
 Names end in their unit (`_seconds`, `_bytes`, `_wei`, `_wn`), and counters in `_total`. Amounts of money are floats
 here, because Prometheus has no other numbers: precise enough for a graph, not for accounting.
+
+The health of a role is the state of each of its parts, for `/health` and `aira health`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+
+import msgspec
+
+from mesh.errors import ConfigurationError, public_text
+from schemas.decoding import decode_json
+from schemas.status import ALIVE, OFF
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+
 
 MetricType = Literal["counter", "gauge"]
 """A counter only grows while a process runs; a gauge goes up and down."""
@@ -70,3 +79,62 @@ def merged(families: Iterable[MetricFamily]) -> tuple[MetricFamily, ...]:
             raise ValueError(f"two families named {family.name}")
         found[family.name] = known._replace(samples=known.samples + family.samples)
     return tuple(found.values())
+
+
+STARTING: Final = "still waits"
+"""The state of a role's part `start` until the role has started."""
+
+
+class Health(msgspec.Struct, frozen=True):
+    """The state of each part of a role. `ok` if every part is `ALIVE`, or `OFF` by its settings."""
+
+    ok: bool
+    parts: dict[str, str]
+
+    @classmethod
+    def of(cls, parts: Mapping[str, str]) -> Health:
+        """The health of a role with these parts (name → state).
+
+        Anyone who reaches the page can read it.
+        """
+        return cls(all(is_healthy(state) for state in parts.values()), public_parts(parts))
+
+    def encode(self) -> bytes:
+        """The JSON object that `/health` answers."""
+        return msgspec.json.encode(self)
+
+    @classmethod
+    def decode(cls, answer: bytes) -> Health:
+        """Read an answer of `/health`. Raises `InvalidData`."""
+        return decode_json(answer, cls)
+
+
+def public_parts(parts: Mapping[str, str]) -> dict[str, str]:
+    """The states of parts as strangers may read them."""
+    return {part: public_text(state) for part, state in parts.items()}
+
+
+def is_healthy(state: str) -> bool:
+    """Whether a part in this state needs no attention."""
+    return state in (ALIVE, OFF)
+
+
+def health_metrics(parts: Mapping[str, str]) -> MetricFamily:
+    """Health as a metric, so that alerts can use it: 1 for each part that works, 0 for each that does not."""
+    values = {part: float(is_healthy(state)) for part, state in parts.items()}
+    return by_label(
+        "aira_part_up", "gauge", "1 for a part of this role that does what it is for, 0 otherwise", "part", values
+    )
+
+
+def listen_address(listen: str) -> tuple[str, int]:
+    """Parse HOST:PORT; an IPv6 address is in brackets. Raises `ConfigurationError`."""
+    host, _, port = listen.rpartition(":")
+    bare = host.removeprefix("[").removesuffix("]")
+    if not bare or (":" in bare) == (bare == host) or not (port.isascii() and port.isdigit()) or int(port) > 65_535:
+        raise ConfigurationError(
+            f"metrics_listen is {listen!r}, not HOST:PORT",
+            hint="give --metrics-listen 127.0.0.1:9464, or 0.0.0.0:9464 for other machines; empty serves no metrics",
+            code="invalid-listen-address",
+        )
+    return bare, int(port)

@@ -7,16 +7,16 @@ import concurrent.futures
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
 
+from mesh.base.extras import needs_extra
 from mesh.errors import ClosedError
-from mesh.extras import needs_extra
-from mesh.telemetry.health import STARTING, Health, health_metrics, listen_address
+from mesh.telemetry.metrics import STARTING, Health, health_metrics, listen_address
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
     from typing import Any
 
+    from mesh.telemetry._server import TelemetryServer
     from mesh.telemetry.metrics import MetricFamily
-    from mesh.telemetry.server import TelemetryServer
 
     Measure = Callable[[], Awaitable[Iterable[MetricFamily]]]
     HealthCheck = Callable[[], Mapping[str, str]]
@@ -37,7 +37,7 @@ def open_server(
     """
     host, port = listen_address(listen)
     with needs_extra("metrics", "metrics_listen"):
-        from mesh.telemetry.server import TelemetryServer
+        from mesh.telemetry._server import TelemetryServer
     return TelemetryServer(host, port, families=families, health=health)
 
 

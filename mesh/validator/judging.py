@@ -5,33 +5,42 @@ Needs neither a chain nor a network. The recording is read once for all policies
 
 from __future__ import annotations
 
+import logging
 import struct
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from mesh.errors import InvalidMessage
-from mesh.evidence import Claim, Finding, verify
+from mesh.base.log_context import log_event
 from mesh.recording import Limits
-from mesh.validator.evidence import Evidence
-from mesh.validator.policies import COMPLETE
-from mesh.validator.policy import CHECK_TIMEOUT, OwnPolicy
-from schemas import Result, cid_of_file
+from mesh.validator.policies import CHECK_TIMEOUT, COMPLETE, Evidence
+from mesh.validator.verification import (
+    NOT_IN_BAGS,
+    Claim,
+    Finding,
+    LegacyRecording,
+    RecordingObserver,
+    read_result,
+    verify,
+)
+from schemas import cid_of_file
 from schemas.signing import is_word
-from schemas.signing import verify as verify_signature
 from schemas.verdicts import LONGEST_REPORT, LONGEST_TEXT, MOST_FINDINGS, ReportFinding
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from mesh.content import Progress
     from mesh.recording import Objective, Played
-    from mesh.validator.policy import Policy, PolicyCheck
-    from schemas import Liability
+    from mesh.validator.policies import Policy, PolicyCheck
+    from mesh.validator.verification import RecordedJob
+    from schemas import Liability, Result
     from schemas.model import ModelDescription
+
+log = logging.getLogger(__name__)
 
 _LIMITS: Final = Limits()
 _NOT_JUDGED: Final = frozenset({"finalized"})
@@ -39,9 +48,7 @@ _NOT_JUDGED: Final = frozenset({"finalized"})
 _MAY_STAY_OPEN: Final = frozenset({"closed", CHECK_TIMEOUT})
 """Findings that may stay undecided: that an agent crashed, and may have lost a second of the recording, is no fault of
 the robot, and neither is a check that takes too long."""
-_FINDINGS_SIZE: Final = LONGEST_REPORT - 4096
-"""Bytes of a report that are left for its findings."""
-_INTERVAL: Final = struct.Struct("<q")
+_INTERVAL: Final = struct.Struct("<Q")
 _DISTINCT: Final = 8
 """Different times between messages without which a recording has no hash."""
 
@@ -101,34 +108,42 @@ class Judgement:
 
 
 def judge(
-    case: Case, *, objective: Path, recording: Path, policies: Sequence[Policy], limits: Limits = _LIMITS
+    case: Case,
+    *,
+    objective: Path,
+    recording: Path,
+    policies: Sequence[Policy],
+    bags: bool = False,
+    limits: Limits = _LIMITS,
 ) -> Judgement:
     """Judge a result by `complete` and the `policies`. Files beyond the `limits` are not readable.
 
+    With `bags` the recording may be a bag of the legacy software, of which less can be checked.
+
     Use a thread. Raises `OSError` if a file can't be read; whatever is in the files is a finding.
     """
-    trial = _Trial(Evidence(case.liability, model=case.model, keep=_has_own(policies)), policies)
+    trial = _Trial(case.liability, case.model, policies)
     cid = case.recording_cid or cid_of_file(recording)
-    signed = _result_in(case.message)
-    result = "" if signed is None else signed.result
+    signed = read_result(case.message)
+    claimed = None if isinstance(signed, str) else signed.message
     claim = Claim.of_contract(case.liability)
-    verdict = verify(
-        msgspec.structs.replace(claim, result=result, success=case.claimed, finalized=None),
+    complete, own = trial.run(
+        msgspec.structs.replace(claim, result=claimed.result if claimed else "", success=case.claimed, finalized=None),
         objective=objective,
         result=recording,
         message=case.message,
         objective_cid=case.objective_cid,
         result_cid=cid,
         period=(case.since_ns, case.until_ns),
+        bags=bags,
         limits=limits,
-        observer=trial,
     )
-    found = [_check_claimed(case, signed)]
-    found += [_decided(finding) for finding in verdict.findings if finding.name not in _NOT_JUDGED]
+    found = [_check_claimed(case, claimed)]
+    found += [one if trial.is_legacy and one.name in NOT_IN_BAGS else _decided(one) for one in complete]
     marks = trial.marks(cid)
     found.append(_check_replayed(case, marks))
     reported = [_reported(COMPLETE.name, finding) for finding in found]
-    reported += [_reported(policy, _decided(finding)) for policy, finding in trial.findings()]
+    reported += [_reported(policy, _decided(finding)) for policy, finding in own]
     holds = all(one.holds is not False and (one.code != CHECK_TIMEOUT or one.holds) for one in reported)
     return Judgement(success=case.claimed and holds, findings=_bounded(reported), marks=marks)
 
@@ -141,6 +156,7 @@ def examine(
     policies: Sequence[Policy],
     message: bytes | None = None,
     model: ModelDescription | None = None,
+    bags: bool = False,
     progress: Progress | None = None,
 ) -> tuple[ReportFinding, ...]:
     """What a validator would find in a recording that nobody has handed in: `aira validator check`.
@@ -148,28 +164,46 @@ def examine(
     The `liability` is what own checks get. Findings for which there is nothing to compare with stay undecided. Use a
     thread. Raises `OSError` if a file can't be read.
     """
-    trial = _Trial(Evidence(liability, model=model, keep=_has_own(policies)), policies)
-    verdict = verify(Claim(), objective=objective, result=recording, message=message, observer=trial, progress=progress)
-    found = [(COMPLETE.name, finding) for finding in verdict.findings if finding.name not in _NOT_JUDGED]
-    return tuple(_reported(policy, finding) for policy, finding in [*found, *trial.findings()])
+    trial = _Trial(liability, model, policies)
+    files = {"objective": objective, "result": recording}
+    complete, own = trial.run(Claim(), **files, message=message, bags=bags, progress=progress)
+    found = [*((COMPLETE.name, finding) for finding in complete), *own]
+    return tuple(_reported(policy, finding) for policy, finding in found)
 
 
-def _has_own(policies: Sequence[Policy]) -> bool:
-    return any(isinstance(policy, OwnPolicy) for policy in policies)
-
-
-class _Trial:
+class _Trial(RecordingObserver):
     """Shows the recording to all policies while it is verified, and computes its hash."""
 
-    def __init__(self, evidence: Evidence, policies: Sequence[Policy]) -> None:
-        self._evidence = evidence
+    def __init__(self, liability: Liability, model: ModelDescription | None, policies: Sequence[Policy]) -> None:
+        self._evidence = Evidence(liability, model=model, keep=any(policy.is_own for policy in policies))
         self._policies = policies
         self._checks: list[PolicyCheck] = []
         self._hash = blake2b(digest_size=32)
         self._intervals: set[int] = set()
         self._last = 0
+        self.is_legacy = False
+        """Whether it is a bag of the legacy software, in which most findings of `verify` stay undecided."""
 
-    def open(self, recording: Objective) -> None:
+    def run(self, claim: Claim, **files: Any) -> tuple[list[Finding], list[tuple[str, Finding]]]:
+        """What `verify` and then the policies find in the files (the arguments of `verify`).
+
+        A recording that they can't deal with proves nothing, which is a finding: if it raised an error, its maker
+        could keep the validator from judging. Raises `OSError` if a file can't be read.
+        """
+        try:
+            verdict = verify(claim, observer=self, **files)
+            found = [one for one in verdict.findings if one.name not in _NOT_JUDGED]
+            # Without a readable recording no check was begun.
+            pairs = zip(self._policies, self._checks, strict=False)
+            return found, [(policy.name, one) for policy, check in pairs for one in check.findings()]
+        except OSError:
+            raise
+        except Exception as error:
+            log.exception("a recording can't be judged", extra=log_event("judging-impossible"))
+            return [Finding("readable", False, f"the recording can't be judged ({type(error).__name__})")], []
+
+    def open(self, recording: RecordedJob) -> None:
+        self.is_legacy = isinstance(recording, LegacyRecording)
         self._evidence.open(recording)
         self._checks = [policy.begin(self._evidence) for policy in self._policies]
         self._last = recording.start_ns
@@ -179,7 +213,7 @@ class _Trial:
         for check in self._checks:
             check.add(judged)
         since, self._last = message.log_time_ns - self._last, message.log_time_ns
-        self._hash.update(_INTERVAL.pack(since))
+        self._hash.update(_INTERVAL.pack(since % (1 << 64)))
         if len(self._intervals) < _DISTINCT:
             self._intervals.add(since)
 
@@ -189,21 +223,6 @@ class _Trial:
     def marks(self, cid: str) -> tuple[str, ...]:
         """What identifies the recording."""
         return (cid, self._hash.hexdigest()) if len(self._intervals) == _DISTINCT else (cid,)
-
-    def findings(self) -> Iterator[tuple[str, Finding]]:
-        """What the policies have found, with their names; nothing if the recording is not readable."""
-        for policy, check in zip(self._policies, self._checks, strict=False):
-            for finding in check.findings():
-                yield policy.name, finding
-
-
-def _result_in(message: bytes) -> Result | None:
-    """The Result in an encoded message; None if there is none, which a finding says."""
-    try:
-        signed = verify_signature(message).message
-    except InvalidMessage:
-        return None
-    return signed if isinstance(signed, Result) else None
 
 
 def _check_claimed(case: Case, signed: Result | None) -> Finding:
@@ -245,6 +264,6 @@ def _bounded(findings: Sequence[ReportFinding]) -> tuple[ReportFinding, ...]:
     kept, size = set[int](), 0
     for number in sorted(range(len(findings)), key=lambda number: findings[number].holds is not False):
         size += len(findings[number].encode()) + 1
-        if len(kept) < MOST_FINDINGS and size <= _FINDINGS_SIZE:
+        if len(kept) < MOST_FINDINGS and size <= LONGEST_REPORT - 4096:  # for the rest of the report
             kept.add(number)
     return tuple(finding for number, finding in enumerate(findings) if number in kept)

@@ -7,11 +7,11 @@ before anybody sees it. Every write survives `kill -9` once the call has returne
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from mesh.work.database import Database
+from mesh.role.database import RoleLedger
 from schemas import Liability, Result, decode, encode
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ CREATE TABLE IF NOT EXISTS verdicts (
     changed REAL NOT NULL
 );
 CREATE TABLE IF NOT EXISTS marks (mark TEXT NOT NULL, liability TEXT NOT NULL, PRIMARY KEY (mark, liability));
-CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL, history BLOB NOT NULL DEFAULT x'');
 """
 COLUMNS: Final = "record, since, result, seen, signed, report, ended"
 STAGE: Final = (
@@ -63,23 +62,17 @@ class StoredVerdict(msgspec.Struct, frozen=True, kw_only=True):
     is_ended: bool
 
 
-class VerdictLedger:
+class VerdictLedger(RoleLedger):
     """The ledger in the file at `path`, created if missing: `async with VerdictLedger(path, signer) as ledger`.
 
-    A file belongs to one juror, whose key `signer` has; without a signer it is only read. Calls run in order, in a
-    thread of their own. Every call raises `LedgerUnusable`.
+    Its juror's key has `signer`; without a signer it is only read.
     """
 
+    schema = SCHEMA
+
     def __init__(self, path: Path, signer: Signer | None = None) -> None:
-        self._database = Database(path, SCHEMA)
+        super().__init__(path)
         self._signer = signer
-
-    async def __aenter__(self) -> Self:
-        await self._database.open()
-        return self
-
-    async def __aexit__(self, *exc_info: object) -> None:
-        await self._database.close()
 
     async def open(self, liability: Liability, *, since_ns: int) -> StoredVerdict:
         """Add a liability, or bring back one that was set aside; what is known of it."""
@@ -153,16 +146,6 @@ class VerdictLedger:
         """The number of liabilities in each of `STAGES`."""
         rows = await self._database.rows(f"SELECT {STAGE}, COUNT(*) FROM verdicts WHERE NOT aside GROUP BY 1")
         return dict.fromkeys(STAGES, 0) | dict(rows)
-
-    async def cursor(self) -> tuple[int | None, bytes]:
-        """The last block that was handled (None: none was), and the encoded chain history."""
-        rows = await self._database.rows("SELECT block, history FROM cursors WHERE name = 'validator'")
-        return rows[0] if rows else (None, b"")
-
-    async def set_cursor(self, block: int, *, history: bytes = b"") -> None:
-        """Save that all of `block` was handled, with the encoded chain history."""
-        statement = "INSERT OR REPLACE INTO cursors (name, block, history) VALUES ('validator', ?, ?)"
-        await self._database.run(statement, (block, history), sync=False)
 
 
 def signed_result(stored: StoredVerdict) -> Result:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mesh.watching.market import JobEvent, MarketCounters, MarketEvent, MarketWatch
+from mesh.watching.market import JobEvent, MarketCounters, MarketEvent, MarketWatch, ReadingFetcher
 from mesh.watching.presence import (
     BRIDGE,
     PROVIDER,
@@ -13,4 +13,3 @@ from mesh.watching.presence import (
     status_of,
     statuses,
 )
-from mesh.watching.readings import ReadingFetcher

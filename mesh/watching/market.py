@@ -7,18 +7,27 @@ be on a key of the agent that its liability names as promisor. A router with a r
 from __future__ import annotations
 
 import asyncio
+import logging
+import tempfile
 import threading
 from collections import Counter
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeAlias, TypeVar
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeAlias, TypeVar
 
 import msgspec
+import zenoh
 
-from mesh.background import Background
+from mesh.base.background import Background
+from mesh.base.flood import BoundedDict
+from mesh.base.lifecycle import Lifecycle
+from mesh.base.log_context import log_event
+from mesh.content import Exchange, Store
 from mesh.errors import AiraError, InputError
-from mesh.flood import BoundedDict
 from mesh.network import PresentAgents, Pump, Reading, ReadingSubscription, ValidationStatistics
-from mesh.role import Lifecycle
+from mesh.network.readings import LARGEST_READING
+from mesh.recording import Limits, open_objective
 from schemas import (
     Demand,
     EventKey,
@@ -33,6 +42,7 @@ from schemas import (
     parse_cid,
     parse_key,
 )
+from schemas.payloads import plain_value
 from schemas.signing import Decline, Rejection
 from schemas.verdicts import ValidatorReport
 
@@ -40,9 +50,47 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
     from contextlib import AsyncExitStack
 
-    import zenoh
-
     from mesh.network import Channel, Subscription
+
+
+log = logging.getLogger(__name__)
+
+TIMEOUT: Final = 3.0
+"""Seconds to wait for replies."""
+MAX_REPLIES: Final = 256
+"""Replies read per query."""
+
+
+async def query_all(
+    session: zenoh.Session, keys: Iterable[str], *, payload: bytes | None = None, timeout: float = TIMEOUT
+) -> list[zenoh.Reply]:
+    """All replies, errors included, to queries on these keys, sent at once. Empty if nobody replies within `timeout`
+    seconds. Cancelling ends the queries."""
+    token = zenoh.CancellationToken()
+    try:
+        return await asyncio.to_thread(_query_all, session, list(keys), payload, timeout, token)
+    finally:
+        token.cancel()  # type: ignore[no-untyped-call]
+
+
+def _query_all(
+    session: zenoh.Session, keys: list[str], payload: bytes | None, timeout: float, token: zenoh.CancellationToken
+) -> list[zenoh.Reply]:
+    queries = [
+        session.get(
+            key,
+            zenoh.handlers.FifoChannel(MAX_REPLIES),
+            payload=payload,
+            encoding=None if payload is None else "application/json",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout,
+            cancellation_token=token,
+        )
+        for key in keys
+    ]
+    return [reply for replies in queries for reply in islice(replies, MAX_REPLIES)]
+
 
 WAITING: Final = 256
 """Events that wait for the consumer; beyond, the oldest incoming messages are dropped and counted."""
@@ -67,39 +115,42 @@ C = TypeVar("C", bound=Claim)
 S = TypeVar("S", Rejection, Decline, ValidatorReport)
 
 
-class ClaimReader(Generic[C]):
-    """Decodes samples for a pump and counts refused ones under `reason`."""
+class ClaimPump(Pump[C]):
+    """The claims on `selector`, as `read` decodes them; refused ones are counted under `reason`."""
 
-    def __init__(self, read: Callable[[str, bytes], C | None], *, reason: str) -> None:
+    def __init__(
+        self, session: zenoh.Session, selector: str, read: Callable[[str, bytes], C | None], *, reason: str
+    ) -> None:
+        super().__init__(session, selector, self._claim)
         self._read = read
         self._reason = reason
-        self._lock = threading.Lock()
-        self._refused: Counter[str] = Counter()
+        self._counting = threading.Lock()
+        self._refused = 0
         self._accepted = 0
 
-    def __call__(self, sample: zenoh.Sample) -> C | None:
+    def _claim(self, sample: zenoh.Sample) -> C | None:
         """The claim in a sample; None if it is refused, or none that is read."""
         try:
             claim = self._read(str(sample.key_expr), sample.payload.to_bytes())
         except AiraError:
             self.refuse()
             return None
-        with self._lock:
+        with self._counting:
             self._accepted += claim is not None
         return claim
 
     def refuse(self) -> None:
-        """Count a refused sample."""
-        with self._lock:
-            self._refused[self._reason] += 1
+        """Count a refused claim."""
+        with self._counting:
+            self._refused += 1
 
-    def statistics(self, *, received: int, dropped: int) -> ValidationStatistics:
-        """The counts of this reader, with what its pump received and dropped."""
-        with self._lock:
-            refused = dict(self._refused)
-            return ValidationStatistics(
-                received=received, accepted=self._accepted, invalid=refused, duplicate=0, dropped=dropped
-            )
+    def statistics(self) -> ValidationStatistics:
+        """What was received, accepted, refused and dropped."""
+        with self._counting:
+            accepted, invalid = self._accepted, {self._reason: self._refused} if self._refused else {}
+        return ValidationStatistics(
+            received=self.received, accepted=accepted, invalid=invalid, duplicate=0, dropped=self.dropped
+        )
 
 
 class MarketCounters(msgspec.Struct, frozen=True, kw_only=True):
@@ -152,15 +203,15 @@ class MarketWatch(Lifecycle):
         self._demands = await stack.enter_async_context(channel.subscribe(Demand, model=self._model))
         self._offers = await stack.enter_async_context(channel.subscribe(Offer, model=self._model))
         self._results = await stack.enter_async_context(channel.subscribe(Result))
-        self._rejection_reader = ClaimReader(partial(read_statement, Rejection), reason="rejection")
-        self._decline_reader = ClaimReader(partial(read_statement, Decline), reason="decline")
-        self._report_reader = ClaimReader(partial(read_statement, ValidatorReport), reason="report")
-        self._event_reader = ClaimReader(read_event, reason="event")
+
+        def claims(selector: str, kind: type[S], reason: str) -> ClaimPump[S]:
+            return ClaimPump(self._session, selector, partial(read_statement, kind), reason=reason)
+
         enter, selector = stack.enter_async_context, partial(market_selector, channel.lighthouse)
-        self._rejected = await enter(Pump(self._session, selector("reject"), self._rejection_reader))
-        self._declined = await enter(Pump(self._session, selector("decline"), self._decline_reader))
-        self._reported = await enter(Pump(self._session, selector("report"), self._report_reader))
-        self._events = await enter(Pump(self._session, event_selector(), self._event_reader))
+        self._rejected = await enter(claims(selector("reject"), Rejection, "rejection"))
+        self._declined = await enter(claims(selector("decline"), Decline, "decline"))
+        self._reported = await enter(claims(selector("report"), ValidatorReport, "report"))
+        self._events = await enter(ClaimPump(self._session, event_selector(), read_event, reason="event"))
         if self._readings is not None:
             await stack.enter_async_context(self._readings)
         tasks = await stack.enter_async_context(Background())
@@ -191,19 +242,15 @@ class MarketWatch(Lifecycle):
 
     def counters(self) -> MarketCounters:
         """What was received so far, and what of it was refused."""
-        claims: tuple[tuple[Pump[Any], ClaimReader[Any]], ...] = (
-            (self._rejected, self._rejection_reader),
-            (self._declined, self._decline_reader),
-            (self._reported, self._report_reader),
-            (self._events, self._event_reader),
-        )
-        return _sum_of(
-            [
-                *(subscription.statistics() for subscription in (self._demands, self._offers, self._results)),
-                *(reader.statistics(received=pump.received, dropped=pump.dropped) for pump, reader in claims),
-                *([] if self._readings is None else [self._readings.statistics()]),
-            ]
-        )
+        refused: Counter[str] = Counter()
+        received = duplicate = lost = 0
+        sources: list[Any] = [self._demands, self._offers, self._results]
+        sources += [self._rejected, self._declined, self._reported, self._events]
+        for source in (*sources, *([] if self._readings is None else [self._readings])):
+            one = source.statistics()
+            refused.update(one.invalid)
+            received, duplicate, lost = received + one.received, duplicate + one.duplicate, lost + one.dropped
+        return MarketCounters(received=received, refused=dict(refused), duplicate=duplicate, lost=lost)
 
     async def _move(self, items: AsyncIterator[MarketEvent]) -> None:
         async for item in items:
@@ -229,14 +276,14 @@ class MarketWatch(Lifecycle):
     async def _seen_declines(self) -> AsyncIterator[MarketEvent]:
         async for decline in self._declined:
             if not await self._agents.is_present(decline.agent):
-                self._decline_reader.refuse()
+                self._declined.refuse()
             elif self._is_new(decline, decline.code):
                 yield decline
 
     async def _seen_reports(self) -> AsyncIterator[MarketEvent]:
         async for report in self._reported:
             if not await self._agents.is_present(report.juror):
-                self._report_reader.refuse()
+                self._reported.refuse()
             elif (self._model == "*" or report.liability in self._contracts) and self._statements.add(
                 f"{report.liability} {report.juror}"  # it is put once for each party
             ):
@@ -250,7 +297,7 @@ class MarketWatch(Lifecycle):
     async def _seen_events(self) -> AsyncIterator[MarketEvent]:
         async for event in self._events:
             if not await self._agents.is_present(event.agent):
-                self._event_reader.refuse()
+                self._events.refuse()
             elif self._model in ("*", event.liability.model):
                 self._contracts.add(event.liability.address)
                 yield event
@@ -288,11 +335,82 @@ def read_event(key: str, payload: bytes) -> JobEvent | None:
     return JobEvent(parse_address(place.agent), place.event, liability)
 
 
-def _sum_of(statistics: Iterable[ValidationStatistics]) -> MarketCounters:
-    """The sum of several statistics."""
-    refused: Counter[str] = Counter()
-    received = duplicate = lost = 0
-    for one in statistics:
-        refused.update(one.invalid)
-        received, duplicate, lost = received + one.received, duplicate + one.duplicate, lost + one.dropped
-    return MarketCounters(received=received, refused=dict(refused), duplicate=duplicate, lost=lost)
+LARGEST: Final = LARGEST_READING + 64 * 1024
+"""Bytes of a result that is fetched: a reading and what a file adds. Larger recordings are not fetched unasked."""
+LIMITS: Final = Limits(size=LARGEST, expanded=LARGEST, messages=100)
+KEPT: Final = 16 * 1024 * 1024
+"""Bytes of results kept in the temporary store; beyond, the oldest are evicted."""
+MAX_FETCHES: Final = 4
+"""Results fetched at the same time."""
+MAX_PENDING: Final = 64
+"""Results being fetched or waiting; more are skipped."""
+FETCH_TIMEOUT: Final = 10.0
+"""Seconds without a block after which fetching a result fails."""
+
+
+class ReadingFetcher(Lifecycle):
+    """Fetches the results without a liability among the events given to `handle`, and passes each reading to `deliver`.
+
+    Use with `async with`; files are in a temporary folder meanwhile. Agents' job events show which results have a
+    liability. Results that can't be fetched or read are logged.
+    """
+
+    title = "fetcher of readings"
+
+    def __init__(
+        self, session: zenoh.Session, deliver: Callable[[Reading], None], *, timeout: float = FETCH_TIMEOUT
+    ) -> None:
+        self._session = session
+        self._deliver = deliver
+        self._timeout = timeout
+        self._contracts = RecentSet()
+        self._turns = asyncio.Semaphore(MAX_FETCHES)
+        self._pending = 0
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-readings-"))
+        store = await asyncio.to_thread(Store, Path(folder), limit=LARGEST, quota=KEPT)
+        stack.callback(store.close)
+        self._exchange = await stack.enter_async_context(Exchange(self._session, store))
+        self._tasks = await stack.enter_async_context(Background())
+
+    @property
+    def pending(self) -> int:
+        """Results being fetched or waiting."""
+        return self._pending
+
+    def handle(self, event: MarketEvent) -> None:
+        """Take an event of the market."""
+        if isinstance(event, JobEvent):
+            self._contracts.add(event.liability.address)
+        elif isinstance(event, Verified) and isinstance(event.message, Result):
+            result = event.message
+            if result.liability in self._contracts:
+                return
+            if self._pending == MAX_PENDING:
+                fields = log_event("result-skipped", result=result.result, signer=event.signer)
+                log.warning("skipped the result %s of %s: too many at once", result.result, event.signer, extra=fields)
+                return
+            self._pending += 1
+            self._tasks.start(self._fetch(result.result, event.signer), f"reading {result.result}")
+
+    async def _fetch(self, cid: str, signer: str) -> None:
+        try:
+            async with self._turns:
+                path = await self._exchange.fetch(cid, size_limit=LARGEST, timeout=self._timeout)
+                readings = await asyncio.to_thread(_read, path, cid, signer)
+        except AiraError as error:
+            fields = log_event("result-unreadable", result=cid, signer=signer, code=error.code)
+            log.warning("can't read the result %s of %s: %s", cid, signer, error, extra=fields)
+        else:
+            for reading in readings:
+                self._deliver(reading)
+        finally:
+            self._pending -= 1
+
+
+def _read(path: Path, cid: str, signer: str) -> list[Reading]:
+    return [
+        Reading(signer, one.topic, plain_value(one.payload, one.type), one.payload, one.type, cid)
+        for one in open_objective(path, LIMITS).messages()
+    ]

@@ -53,7 +53,10 @@ class Payment:
 
 @dataclass
 class Books:
-    """Balances by token and holder, what the factory and the lighthouse may take, stakes, and the supply of XRT."""
+    """Balances by token and holder, what the factory and the lighthouse may take, stakes, and the supply of XRT.
+
+    `blocked` are the accounts that the foreign token refuses to pay, and `owed` is what it has refused to pay to each.
+    """
 
     xrt: str
     factory: str
@@ -63,6 +66,8 @@ class Books:
     supply: int
     allowances: dict[str, int] = field(default_factory=dict)
     stakes: dict[str, int] = field(default_factory=dict)
+    blocked: set[str] = field(default_factory=set)
+    owed: dict[tuple[str, str], int] = field(default_factory=dict)
     gas: int = 0
 
     def create(self, terms: Terms, provider: str) -> str | None:
@@ -77,7 +82,7 @@ class Books:
 
     def finish(self, terms: Terms, *, paid: bool, provider: str | None) -> None:
         """Pay for a liability that ends with a result; `provider` is None if it was ended without a turn."""
-        self._give(terms.token, self.factory, terms.promisor if paid else terms.promisee, terms.cost)
+        self._pay_cost(terms, terms.promisor if paid else terms.promisee)
         self._give(self.xrt, self.factory, terms.validator, terms.judging)
         self.gas += terms.gas
         accounts = {terms.promisee, terms.promisor, provider}
@@ -88,9 +93,20 @@ class Books:
 
     def give_back(self, terms: Terms) -> None:
         """Return the cost and the validator's fee to the promisee."""
-        self._give(terms.token, self.factory, terms.promisee, terms.cost)
+        self._pay_cost(terms, terms.promisee)
         self._give(self.xrt, self.factory, terms.promisee, terms.judging)
         self.gas += terms.gas
+
+    def claim(self, token: str, account: str, to: str) -> str | None:
+        """Pay an account, at `to`, what it is owed, or the refusal."""
+        value = self.owed.get((token, account), 0)
+        if not value:
+            return "NothingOwed"
+        if to in self.blocked:
+            return "refused by the token"
+        del self.owed[token, account]
+        self._give(token, self.factory, to, value)
+        return None
 
     def refill(self, provider: str, value: int) -> str | None:
         """Stake more, or the refusal."""
@@ -118,8 +134,10 @@ class Books:
         return None
 
     def held_for(self, open_terms: Iterable[Terms]) -> dict[str, int]:
-        """What the factory has to hold for liabilities that are open, by token."""
+        """What the factory has to hold for liabilities that are open and for what is owed, by token."""
         held = {token: 0 for token, _ in self.balances}
+        for (token, _), value in self.owed.items():
+            held[token] += value
         for terms in open_terms:
             held[terms.token] += terms.cost
             held[self.xrt] += terms.judging
@@ -148,6 +166,12 @@ class Books:
             return "ERC20InsufficientBalance" if payment.token == self.xrt else "Panic"
         self._give(payment.token, payment.giver, payment.receiver, payment.value)
         return None
+
+    def _pay_cost(self, terms: Terms, receiver: str) -> None:
+        if terms.token != self.xrt and receiver in self.blocked and terms.cost:
+            self.owed[terms.token, receiver] = self.owed.get((terms.token, receiver), 0) + terms.cost
+        else:
+            self._give(terms.token, self.factory, receiver, terms.cost)
 
     def _give(self, token: str, giver: str, receiver: str, value: int) -> None:
         if value:

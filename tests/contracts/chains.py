@@ -10,7 +10,7 @@ from eth_tester.exceptions import TransactionFailed  # type: ignore[import-untyp
 from web3 import EthereumTesterProvider, HTTPProvider, Web3
 from web3.exceptions import ContractLogicError, Web3RPCError
 
-from mesh.chain.reverts import explain
+from mesh.chain.answers import explain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -35,6 +35,11 @@ def anybody() -> SearchStrategy[str]:
     return st.sampled_from(stage().people)
 
 
+def party() -> SearchStrategy[str]:
+    """One of those who are promisees and promisors."""
+    return st.sampled_from(stage().people[:3])
+
+
 def provider() -> SearchStrategy[str]:
     """An account that may have a stake (the first is sometimes a party); mostly the current provider."""
     return st.sampled_from((NEXT, NEXT, NEXT, NEXT, *stage().people[2:]))
@@ -50,7 +55,7 @@ def agreement() -> SearchStrategy[Terms]:
         return st.builds(
             Terms,
             generation=st.just(generation),
-            token=st.sampled_from((market.xrt, market.xrt, market.xrt, market.foreign)),
+            token=st.sampled_from((market.xrt, market.xrt, market.foreign)),
             cost=COSTS,
             validator=st.sampled_from((ZERO_ADDRESS, ZERO_ADDRESS, judge)),
             validator_fee=FEES,
@@ -63,5 +68,6 @@ def agreement() -> SearchStrategy[Terms]:
 
 
 ANYBODY: Final = st.deferred(anybody)
+PARTY: Final = st.deferred(party)
 PROVIDER: Final = st.deferred(provider)
 AGREEMENT: Final = st.deferred(agreement)

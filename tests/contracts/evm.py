@@ -12,7 +12,7 @@ from eth.vm.message import Message
 from eth_abi.abi import encode
 from eth_typing import Address
 
-from mesh.chain.reverts import explain
+from mesh.chain.answers import explain
 from schemas import address_bytes, checksum_address, keccak256
 
 if TYPE_CHECKING:

@@ -42,6 +42,9 @@ ROWS: Final = {
     "finalize_1_juror": Row("  by a validator", ("-", "-"), (120_000, 115_000)),
     "finalize_2_of_3": Row("  by 2 of 3 jurors", ("-", "-"), (125_000, None)),
     "finalize_4_of_7": Row("  by 4 of 7 jurors", ("-", "-"), (150_000, None)),
+    "finalize_token": Row("  in a foreign token", ("-", "-"), (110_000, 110_000)),
+    "finalize_owed": Row("  that refuses to pay", ("-", "-"), (125_000, 125_000)),
+    "claim": Row("claim what is owed", ("-", "-"), (50_000, 50_000)),
     "deploy_jury": Row("deploy 2 of 3 jurors", ("-", "-"), (600_000, None)),
     "withdraw_order": Row("withdraw an order", ("-", "-"), (35_000, 50_000)),
     "revert_mismatch": Row("reverted create (mismatch)", ("the limit", "~700,000"), (60_000, 60_000)),
@@ -71,6 +74,7 @@ def _measure(market: Market) -> dict[str, int]:
         used[f"create_{ending}"] = created["gasUsed"]
         used[f"finalize_{ending}"] = market.finalize(market.liability_of(created))["gasUsed"]
     used |= _measure_validator(market)
+    used |= _measure_foreign_token(market)
     used["withdraw_order"] = suite.send(market.withdrawal(market.demand()), market.promisee)["gasUsed"]
     mismatch = market.creation(market.demand(cost=XRT), market.offer(cost=2 * XRT))
     used["revert_mismatch"] = suite.attempt(mismatch, market.provider)["gasUsed"]
@@ -95,6 +99,23 @@ def _measure_validator(market: Market) -> dict[str, int]:
         verdict = market.verdict(market.liability_of(created), *jury.jurors[-quorum:])
         used[f"finalize_{key}"] = suite.send(verdict, market.provider)["gasUsed"]
     return {**used, "create_validator": created["gasUsed"], "deploy_jury": jury.gas}
+
+
+def _measure_foreign_token(market: Market) -> dict[str, int]:
+    suite, paid = market.suite, 5
+    token = suite.deploy("BlockingToken", 10 * paid)
+    suite.send(token.functions.transfer(market.promisee.address, 9 * paid))
+    suite.send(token.functions.transfer(market.promisor.address, 1))
+    terms = {"token": token.address, "cost": paid}
+    waiting, liability, refused = (market.create(**terms) for _ in range(3))
+    used = {"finalize_token": market.finalize(liability)["gasUsed"]}
+    suite.send(token.functions.setBlocked(market.promisor.address, True))
+    used["finalize_owed"] = market.finalize(refused)["gasUsed"]
+    suite.send(token.functions.setBlocked(market.promisor.address, False))
+    claim = suite.factory.functions.claim(token.address, market.promisor.address)
+    used["claim"] = suite.send(claim, market.outsider)["gasUsed"]
+    assert not waiting.functions.isFinalized().call()
+    return used
 
 
 def exceeded(gas: Gas) -> list[str]:

@@ -51,7 +51,7 @@ class Stage:
         self.judge = self.people[-1]
         self.keeper = suite.deployer.address
         self.lighthouse = str(suite.create_lighthouse(timeout=TIMEOUT).address)
-        foreign, jury = suite.deploy("SilentToken", PEOPLE * FUNDS), suite.deploy("Jury", self.xrt, [self.judge], 1)
+        foreign, jury = suite.deploy("BlockingToken", PEOPLE * FUNDS), suite.deploy("Jury", self.xrt, [self.judge], 1)
         self.foreign, self.jury = str(foreign.address), str(jury.address)
         for person in suite.people[1 : 1 + PEOPLE]:
             suite.fund(person, FUNDS, self.factory)
@@ -162,6 +162,23 @@ class Stage:
     def approve(self, value: int, owner: str) -> Answer:
         """Approve the factory for an amount of an account's XRT."""
         return self.evm.call(self.xrt, "approve(address,uint256)", self.factory, value, sender=owner)
+
+    def block(self, person: str, *, is_blocked: bool, way: int) -> None:
+        """Put a person on the foreign token's blocklist, or take it off; `way` is how it refuses to pay from now on."""
+        for function, values in (("setBlocked(address,bool)", (person, is_blocked)), ("setRefusal(uint8)", (way,))):
+            assert self.evm.call(self.foreign, function, *values, sender=self.keeper).refusal is None
+
+    def claim(self, account: str, caller: str) -> Answer:
+        """Have an account paid what it is owed in the foreign token."""
+        return self.evm.call(self.factory, "claim(address,address)", self.foreign, account, sender=caller)
+
+    def claim_to(self, account: str, to: str) -> Answer:
+        """Have what an account is owed in the foreign token paid to another one."""
+        return self.evm.call(self.factory, "claimTo(address,address)", self.foreign, to, sender=account)
+
+    def owed(self, account: str) -> int:
+        """Units of the foreign token that an account is owed."""
+        return self.ask(self.factory, "owed(address,address)", self.foreign, account)
 
     def collect_fees(self) -> Answer:
         """Take the jury's fees out of it."""

@@ -57,14 +57,14 @@ class Person:
 class Suite:
     """The deployed contracts. The first person deploys and holds the XRT that the others are given."""
 
-    def __init__(self, chain: Chain, *, refund_delay: int = REFUND_DELAY) -> None:
+    def __init__(self, chain: Chain, *, refund_delay: int = REFUND_DELAY, supply: int = SUPPLY) -> None:
         self.chain = chain
         self.web3 = chain.web3
         self.people = tuple(Person(Signer(key).address, Signer(key)) for key in chain.keys)
         self.deployer = self.people[0]
         self.ens = self.deploy("ENSRegistry")
         self.resolver = self.deploy("Resolver", self.ens.address)
-        self.xrt = self.deploy("XRT", SUPPLY)
+        self.xrt = self.deploy("XRT", supply)
         self.factory = self.deploy("Factory", self.ens.address, self.xrt.address, refund_delay)
         self.send(self.xrt.functions.setMinter(self.factory.address))
         self._name()

@@ -1,7 +1,8 @@
 """Invariants of the money under random actions: none is lost or paid twice, and all can be withdrawn in the end.
 
-Histories are made up by Hypothesis: orders of both generations, paid in XRT and in another token, that are taken,
-finished well or badly, judged, refunded, cancelled and sent again, while providers come and go. Each call must be
+Histories are made up by Hypothesis: orders of both generations, paid in XRT and in a token that refuses to pay those on
+its blocklist, that are taken, finished well or badly, judged, refunded, cancelled and sent again, while providers come
+and go. Each call must be
 refused for the reason that the books give, or change what they change and nothing else. `AIRA_MONEY_HISTORIES` says
 how many histories to play.
 """
@@ -27,7 +28,7 @@ from hypothesis.stateful import (
 )
 
 from schemas import ZERO_ADDRESS
-from tests.contracts.choices import AGREEMENT, ALLOWANCES, ANYBODY, MOSTLY, NEXT, PROVIDER, STAKES, stage
+from tests.contracts.choices import AGREEMENT, ALLOWANCES, ANYBODY, MOSTLY, NEXT, PARTY, PROVIDER, STAKES, stage
 from tests.contracts.stage import FOREVER, TIMEOUT, Work
 from tests.contracts.suite import REFUND_DELAY, XRT
 from tests.support.ci import IN_CI, seed_of_part
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from tests.contracts.evm import Answer
 
 HISTORIES: Final = int(os.environ.get("AIRA_MONEY_HISTORIES", "30" if IN_CI else "10"))
-AT_A_TIME: Final = 250
+AT_A_TIME: Final = 100
 """Histories in one test: few enough to stay far below the time limit of a test."""
 
 STEPS: Final = 15
@@ -166,6 +167,25 @@ class Histories(RuleBasedStateMachine):
         assert self.stage.approve(value, person).refusal is None
         self.books.allowances[person] = value
 
+    @rule(person=PARTY, is_blocked=st.booleans(), way=st.integers(0, 3))
+    def blocks(self, person: str, is_blocked: bool, way: int) -> None:
+        self.stage.block(person, is_blocked=is_blocked, way=way)
+        (self.books.blocked.add if is_blocked else self.books.blocked.discard)(person)
+
+    @rule(person=PARTY, caller=ANYBODY)
+    def claims(self, person: str, caller: str) -> None:
+        self.claimed(self.books.claim(self.stage.foreign, person, person), self.stage.claim(person, caller))
+
+    @rule(person=PARTY, to=ANYBODY)
+    def claims_to(self, person: str, to: str) -> None:
+        self.claimed(self.books.claim(self.stage.foreign, person, to), self.stage.claim_to(person, to))
+
+    def claimed(self, refusal: str | None, answer: Answer) -> None:
+        if refusal == "refused by the token":
+            assert answer.refusal in ("", "TokenTransferFailed")
+        else:
+            assert answer.refusal == refusal
+
     @rule(blocks=st.sampled_from((1, TIMEOUT + 1, 2 * TIMEOUT + 1, REFUND_DELAY)))
     def blocks_pass(self, blocks: int) -> None:
         self.stage.evm.advance(blocks)
@@ -184,18 +204,22 @@ class Histories(RuleBasedStateMachine):
         assert held == {self.stage.xrt: self.books.supply, self.stage.foreign: self.stage.foreign_supply}
 
     @invariant()
-    def the_factory_holds_what_open_liabilities_hold(self) -> None:
+    def the_factory_holds_what_open_liabilities_hold_and_what_it_owes(self) -> None:
         held = self.books.held_for(work.terms for work in self.made if not work.ended)
         assert {token: self.stage.stored_balance(token, self.stage.factory) for token in held} == held
+        for person in self.stage.people:
+            assert self.stage.owed(person) == self.books.owed.get((self.stage.foreign, person), 0)
         assert self.stage.stored_balance(self.stage.xrt, self.stage.lighthouse) == sum(self.books.stakes.values())
 
     def teardown(self) -> None:
-        """Everything can be withdrawn: open liabilities are finalized or refunded, stakes and fees are withdrawn."""
+        """Everything can be withdrawn: open liabilities are finalized or refunded, and stakes, fees and debts paid."""
         if sys.exc_info()[0] is not None:
             return
         self.stage.evm.advance(REFUND_DELAY)
         for number, work in enumerate([work for work in self.made if not work.ended], self.stage.evm.block % 4):
             self.end_somehow(work, number)
+        for _, person in list(self.books.owed):
+            self.claims_to(person, self.stage.judge)  # whom nobody blocks
         for person, stake in list(self.books.stakes.items()):
             self.stakes(person, stake, "withdraw")
         for (token, holder), value in self.books.balances.items():

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from mesh.chain import NewLiability
-from mesh.chain.reader import list_created
+from mesh.chain.following import list_created
 from schemas import ZERO_ADDRESS
 from tests.crashes.points import GO, REACHED
 from tests.crashes.process import CONTROL, COST, OBJECTIVE, POINT, VALIDATOR, WORDS

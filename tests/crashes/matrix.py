@@ -7,15 +7,15 @@ from typing import Final, NamedTuple
 
 from tests.crashes.points import Point
 
-BOOK, SETTLEMENT = "mesh.market.book:OrderBook", "mesh.market.settlement:Settlement"
-RESULTS, JUDGEMENTS = "mesh.market.judgements:ResultSettlement", "mesh.market.judgements:Judgements"
-QUEUE, SENDER = "mesh.market.transaction_queue:TransactionQueue", "mesh.chain.transactions:TransactionSender"
-STORE, CONFIRMATION = "mesh.chain.transaction_store:TransactionStore", "mesh.chain.confirmation:Confirmation"
-TRADER, OUTBOX = "mesh.agent.trade:Trader", "mesh.work.outbox:Outbox"
-LEDGER, LISTENER = "mesh.work.ledger:Ledger", "mesh.agent.listener:ChainListener"
-PLAYBACKS, RUN = "mesh.work.playbacks:Playbacks", "mesh.work.run:JobRun"
-EXECUTOR, CONTENT = "mesh.work.executor:Executor", "mesh.content.store:Store"
-CASES, JUDGE = "mesh.validator.cases:Cases", "mesh.validator.decisions:CaseJudge"
+BOOK, SETTLEMENT = "mesh.market.book:OrderBook", "mesh.market._settlement:Settlement"
+RESULTS = "mesh.market._settlement:Results"
+QUEUE, SENDER = "mesh.market.transactions:TransactionQueue", "mesh.chain.transactions:TransactionSender"
+STORE, CONFIRMATION = "mesh.chain._pending:TransactionStore", "mesh.chain.transactions:Confirmation"
+TRADER, OUTBOX = "mesh.agent.trade:Trader", "mesh.agent._outbox:Outbox"
+LEDGER, LISTENER = "mesh.agent.ledger:Ledger", "mesh.agent._runtime:AgentRuntime"
+RUN, CONTENT = "mesh.agent.jobs:JobRun", "mesh.content.store:Store"
+EXECUTOR = "mesh.agent.jobs:Executor"
+CASES, JUDGE = "mesh.validator._cases:Cases", "mesh.validator._cases:CaseJudge"
 VERDICTS = "mesh.validator.ledger:VerdictLedger"
 
 POINTS: Final = {
@@ -30,7 +30,7 @@ POINTS: Final = {
         Point("before", f"{CONFIRMATION}.wait"),
         Point("after", f"{CONFIRMATION}.wait"),
         Point("after", f"{SETTLEMENT}._create"),
-        Point("before", f"{RESULTS}.add"),
+        Point("before", f"{RESULTS}.settle"),
         Point("before", f"{RESULTS}._finalize"),
         Point("after", f"{SENDER}._send_numbered", 2),
         Point("after", f"{CONFIRMATION}.wait", 2),
@@ -44,10 +44,10 @@ POINTS: Final = {
         Point("after", f"{LEDGER}.add_job"),
         Point("before", f"{EXECUTOR}._fetch"),
         Point("after", f"{LEDGER}.set_phase"),
-        Point("before", f"{PLAYBACKS}.begin"),
+        Point("before", f"{EXECUTOR}._begin"),
         Point("before", f"{RUN}._handle_one", 3),
-        Point("after", f"{PLAYBACKS}._save"),
-        Point("before", f"{PLAYBACKS}.stop"),
+        Point("after", f"{RUN}._save"),
+        Point("before", f"{EXECUTOR}._stop"),
         Point("after", f"{RUN}.close"),
         Point("after", f"{CONTENT}.put_file"),
         Point("before", f"{LEDGER}.complete"),
@@ -95,10 +95,10 @@ SETTLING: Final = (f"{CASES}._settle", f"{SENDER}._send_numbered", f"{CONFIRMATI
 
 JURY_POINTS: Final = {
     "provider": (
-        Point("before", f"{JUDGEMENTS}.add"),
-        Point("after", f"{JUDGEMENTS}.add"),
-        Point("before", f"{JUDGEMENTS}._hold"),
-        Point("after", f"{JUDGEMENTS}._hold"),
+        Point("before", f"{RESULTS}._judge"),
+        Point("after", f"{RESULTS}._judge"),
+        Point("before", f"{RESULTS}._hold"),
+        Point("after", f"{RESULTS}._hold"),
         *POINTS["provider"][-4:],  # from the finalization on
     ),
     "validator": (

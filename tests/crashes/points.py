@@ -25,7 +25,7 @@ POLL_SECONDS: Final = 0.005
 
 @dataclass(frozen=True)
 class Point:
-    """`before` or `after` the `nth` call of a method, as in `before mesh.work.ledger:Ledger.complete 1`."""
+    """`before` or `after` the `nth` call of a method, as in `before mesh.agent.ledger:Ledger.complete 1`."""
 
     when: str
     method: str

@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent import Agent
-from mesh.retry import RetryPolicy
+from mesh.agent.agent import Agent
+from mesh.base.retry import RetryPolicy
 from schemas import cid_of_bytes
 from tests.crashes.points import Point
 
 if TYPE_CHECKING:
-    from mesh.agent import Contract
+    from mesh.agent.contracts import Contract
     from schemas import Demand, Verified
 
 MODEL: Final = cid_of_bytes(b"what the robots of the crash matrix can do")

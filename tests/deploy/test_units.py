@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from mesh.cli import main
 from mesh.settings import OPTIONS
-from mesh.settings.loading import PREFIX
+from mesh.settings._loading import PREFIX
 from tests.support.peers import require
 
 if TYPE_CHECKING:

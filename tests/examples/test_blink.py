@@ -54,9 +54,9 @@ def assert_three_blinks(changes: list[PinChange]) -> None:
     ("example", "name", "line"),
     [
         ("blink", "blink", {"topic": "/blink"}),
-        ("blink_arguments", "red", {"topic": "/blink", "data": "red"}),
-        ("blink_arguments", "blue", {"topic": "/blink", "data": "blue"}),
-        ("blink_arguments", "green", {"topic": "/blink", "data": "green"}),
+        ("blink_arguments", "red", {"topic": "/blink", "value": "red"}),
+        ("blink_arguments", "blue", {"topic": "/blink", "value": "blue"}),
+        ("blink_arguments", "green", {"topic": "/blink", "value": "green"}),
     ],
 )
 def test_the_readme_commands_reproduce_the_objectives(

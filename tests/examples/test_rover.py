@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.agent.objectives import ObjectiveUnfit
 from mesh.recording import open_objective
-from mesh.work.objectives import ObjectiveUnfit
 from schemas import cid_of_file
 from schemas.model import read_description
 from tests.support.commands import AIRA, Serving, aira, run

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.background import Background
+from mesh.base.background import Background
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

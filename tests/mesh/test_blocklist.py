@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from mesh.blocklist import Blocklist, BlocklistUnusable, blocklist_at
-from mesh.fresh_file import CHECK_INTERVAL
-from mesh.network.validation import MessageValidator, message_key
+from mesh.base.blocklist import Blocklist, blocklist_at
+from mesh.base.fresh_file import CHECK_INTERVAL
+from mesh.errors import ConfigurationError
+from mesh.network import MarketRules, MessageValidator, message_key
 from schemas import Demand, Signer, encode
 from tests.mesh.network.validating import check_payload
 from tests.schemas.samples import DEMAND
@@ -52,7 +53,7 @@ def test_a_change_that_can_not_be_read_changes_nothing(tmp_path: Path, broken: s
     path.unlink()
     clock.pass_by(int(CHECK_INTERVAL * SECOND))
     assert MALLORY.address in blocked
-    with pytest.raises(BlocklistUnusable):
+    with pytest.raises(ConfigurationError):
         blocklist_at(str(path))
 
 
@@ -63,9 +64,7 @@ def test_nobody_is_blocked_without_a_file() -> None:
 def test_messages_of_a_blocked_signer_are_rejected(tmp_path: Path) -> None:
     path, clock = tmp_path / "blocked.txt", SetClock()
     path.write_text("")
-    validator = MessageValidator(
-        Demand, lighthouse=LIGHTHOUSE, address=None, head=lambda: 0, blocked=Blocklist(path, clock=clock)
-    )
+    validator = MessageValidator(Demand, MarketRules(LIGHTHOUSE, blocked=Blocklist(path, clock=clock)))
     first, second = (MALLORY.sign(replace(DEMAND, nonce=f"{number}" * 64)) for number in (1, 2))
     assert check_payload(validator, message_key(LIGHTHOUSE, first), encode(first)) is not None
     path.write_text(MALLORY.address)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.flood import BoundedDict, Drops, FairQueue, Rate, RateLimiter, forget_oldest
+from mesh.base.flood import BoundedDict, Drops, FairQueue, Rate, RateLimiter, forget_oldest
 from tests.support.clocks import SECOND, SetClock
 
 

@@ -6,8 +6,8 @@ import logging
 
 import pytest
 
+from mesh.base.outage_log import OutageLog
 from mesh.chain import NodeUnreachable, Reverted
-from mesh.outage_log import OutageLog
 
 
 @pytest.fixture

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import os
 import stat
+from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from bridges.ipfs.journal import RelayJournal
-from mesh.chain.transaction_store import TransactionStore
-from mesh.clock import SYSTEM_CLOCK
+from bridges.ipfs._relay import RelayJournal
+from mesh.base.clock import SYSTEM_CLOCK
+from mesh.base.private_files import make_private_folder
+from mesh.chain._pending import TransactionStore
 from mesh.content import Store
-from mesh.private_files import make_private_folder
-from mesh.recording.partial import PartialFile, RecordingAbout
-from mesh.recording.recovery import recover
-from mesh.work.database import Database
+from mesh.recording._recorder import PartialFile, RecordingAbout
+from mesh.recording._recovery import recover
+from mesh.role.database import Database
 from schemas import cid_of_bytes
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def open_umask() -> Iterator[None]:
 
 
 async def ledger(folder: Path) -> None:
-    database = Database(folder / "chain" / "ledger.sqlite")
+    database = Database(folder / "chain" / "ledger.sqlite", "CREATE TABLE IF NOT EXISTS one (row);")
     await database.open()
     await database.run("PRAGMA user_version = 1")
     check_private(folder)  # with the write-ahead log beside it
@@ -51,8 +52,8 @@ async def content(folder: Path) -> None:
 
 
 async def unfinished_recording(folder: Path) -> None:
-    with PartialFile(folder / "recordings" / "job.mcap", SYSTEM_CLOCK) as file:
-        file.begin(RecordingAbout())
+    with PartialFile(folder / "recordings" / "job.mcap", RecordingAbout(), SYSTEM_CLOCK):
+        pass
 
 
 async def recovered_recording(folder: Path) -> None:
@@ -61,10 +62,9 @@ async def recovered_recording(folder: Path) -> None:
 
 
 async def transactions(folder: Path) -> None:
-    store = TransactionStore(folder / "transactions")
-    locked = store.add(0, {"hash": "0x" + "11" * 32})
-    if locked is not None:
-        os.close(locked._descriptor)
+    with closing(TransactionStore(folder / "transactions")) as store:
+        store.add(0, {"hash": "0x" + "11" * 32})
+        check_private(folder)
 
 
 async def journal(folder: Path) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from mesh.base.retry import Backoff, RetryPolicy
 from mesh.errors import ConfigurationError
-from mesh.retry import Backoff, RetryPolicy
 
 
 def waits(policy: RetryPolicy, count: int, *, chance: float = 0.0) -> list[float | None]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.base.lifecycle import Role
 from mesh.errors import ClosedError
-from mesh.role import Role
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -15,7 +15,7 @@ from tests.support.commands import environment, run
 PROGRAM: Final = """
 import asyncio, signal, sys, threading, time
 from mesh.errors import ConfigurationError, InputError, NetworkUnavailable, RemoteError
-from mesh.running import run_to_end, run_until_stopped
+from mesh.role.running import run_to_end, run_until_stopped
 
 async def done():
     print("done")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable, RemoteError
-from mesh.running import run_to_end, run_until_stopped
+from mesh.role.running import run_to_end, run_until_stopped
 from tests.support.commands import run
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ main()
 
 
 @pytest.mark.parametrize(
-    "module", ["mesh.cli", "click", "schemas.errors", "mesh.cli.demo", "aiohttp", "zenoh", "mesh.demo.narration"]
+    "module", ["mesh.cli", "click", "schemas.errors", "mesh.cli.demo", "aiohttp", "zenoh", "mesh.dev.demo"]
 )
 def test_an_interrupt_while_modules_are_imported_ends_the_program_quietly(module: str) -> None:
     done = run(sys.executable, "-c", LOADING.format(module=module))

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.base.retry import RetryPolicy
 from mesh.chain import Account
 from mesh.errors import ConfigurationError, RemoteError
-from mesh.retry import RetryPolicy
+from mesh.role.running import file_delays, open_when_ready
 from mesh.settings import Settings
-from mesh.starting import file_delays, open_when_ready
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

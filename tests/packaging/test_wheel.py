@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.base.extras import install
 from tests.support.commands import environment
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def test_every_command_works_or_names_its_extra(base: Path, tmp_path: Path) -> N
         if "[package-missing]" in one["stderr"]:
             missing += 1
             assert one["code"] in (1, 2)
-            assert "pip install 'aira-mesh[" in one["stderr"], one
+            assert "pip install '.[" in one["stderr"], one
     assert missing > 5
 
 
@@ -116,7 +117,7 @@ def test_each_public_name_can_be_imported_or_names_its_extra(base: Path, tmp_pat
     assert done.returncode == 0, done.stderr
     for name, (kind, _, hint) in json.loads(done.stdout).items():
         assert (name, kind) == (name, "PackageMissing")
-        assert hint == "pip install 'aira-mesh[chain]'"
+        assert hint == install("chain")
 
 
 def test_an_agent_with_a_keyfile_names_the_extra(base: Path, tmp_path: Path) -> None:
@@ -124,7 +125,7 @@ def test_an_agent_with_a_keyfile_names_the_extra(base: Path, tmp_path: Path) -> 
     assert done.returncode == 2
     first, second = done.stderr.splitlines()
     assert first.endswith("[package-missing]")
-    assert second.strip() == "pip install 'aira-mesh[chain]'"
+    assert second.strip() == install("chain")
 
 
 @pytest.mark.parametrize("words", [["--version"], ["cid", "it"]])

@@ -48,7 +48,7 @@ def test_installing_continues_when_a_recipe_fails_and_reports_it_at_the_end(cach
     assert "pip ended with 1, see" in lines["libkubo"]
     assert "absent" in lines["kubo"]
     assert done.returncode == 1
-    assert "missing: anvil, solc, robonomics-3, robonomics-5, slither, zenohd" in done.stderr
+    assert "missing: anvil, solc, robonomics-3, robonomics-5, ipfs-api, slither, zenohd" in done.stderr
 
 
 @pytest.mark.parametrize(("required", "code"), [("0", 0), ("1", 1)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from schemas import (
     CidKey,
+    CreatedKey,
     DeclineKey,
     DemandKey,
     DeviceTopicKey,
@@ -38,6 +39,7 @@ KEYS: list[tuple[Key, str]] = [
     (ResultKey(NAME), f"aira/{NAME}/result"),
     (FeedbackKey(NAME), f"aira/{NAME}/feedback"),
     (PendingKey(NAME), f"aira/{NAME}/pending"),
+    (CreatedKey(NAME, MODEL), f"aira/{NAME}/created/{MODEL}"),
     (RejectKey(NAME, SENDER), f"aira/{NAME}/reject/{A}"),
     (DeclineKey(NAME, SENDER), f"aira/{NAME}/decline/{A}"),
     (PresenceKey(NAME, "provider", SENDER), f"aira/{NAME}/@agent/provider/{A}"),

@@ -10,8 +10,17 @@ from hypothesis import given
 from msgspec.structs import asdict, replace
 
 from schemas import Demand, InvalidMessage, InvalidRecord, Offer, Order, Result
-from schemas.message_requests import SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
-from schemas.rpc import GUARDED, SERVICES, SPENDING
+from schemas.rpc import (
+    GUARDED,
+    SERVICES,
+    SPENDING,
+    SendDemand,
+    SendOffer,
+    SendResult,
+    SignDemand,
+    SignOffer,
+    SignResult,
+)
 from tests.schemas.samples import DEMAND, DEMAND_5, OFFER, RESULT
 from tests.schemas.strategies import addresses, orders, results
 

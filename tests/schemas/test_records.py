@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas import MAX_UINT256, ZERO_ADDRESS, InvalidRecord, Liability, PlaybackPosition, Record
-from schemas.message_requests import SignDemand
 from schemas.rpc import (
     SERVICES,
     Accounts,
@@ -23,8 +22,9 @@ from schemas.rpc import (
     Done,
     FinishLiability,
     LiabilityRead,
+    LiabilityRequest,
     Nothing,
-    StartLiability,
+    SignDemand,
     TransferEvent,
     TransferFromRequest,
 )
@@ -123,7 +123,7 @@ def test_amount_beyond_256_bits_is_refused_on_the_wire() -> None:
 @pytest.mark.parametrize(
     ("record", "expected"),
     [
-        (StartLiability(LIGHTHOUSE), {"address": LIGHTHOUSE}),
+        (LiabilityRequest(LIGHTHOUSE), {"address": LIGHTHOUSE}),
         (FinishLiability(LIGHTHOUSE, success=True), {"address": LIGHTHOUSE, "success": True}),
         (Done(success=False, msg="no such liability"), {"success": False, "msg": "no such liability"}),
         (Nothing(), {}),
@@ -175,8 +175,8 @@ def test_demand_to_sign_has_the_names_of_the_message() -> None:
 )
 def test_invalid_records_are_refused(data: bytes) -> None:
     with pytest.raises(InvalidRecord) as caught:
-        StartLiability.decode(data)
-    assert caught.value.kind == "StartLiability"
+        LiabilityRequest.decode(data)
+    assert caught.value.kind == "LiabilityRequest"
     assert "\n" not in str(caught.value)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from contextlib import suppress
 from typing import Any
 
@@ -28,8 +27,7 @@ from schemas import (
     encode,
     verify,
 )
-from schemas.messages import MESSAGE_TYPES
-from schemas.wire import parse_cids_ahead
+from schemas.messages import MESSAGE_TYPES, parse_cids_ahead
 from tests.schemas.samples import (
     DEMAND,
     DEMAND_5,
@@ -159,9 +157,7 @@ def test_invalid_json_is_refused(data: bytes) -> None:
 
 
 def test_deep_json_is_refused() -> None:
-    """As no JSON up to Python 3.13, where it is too deep."""
-    expected = "not-json" if sys.version_info < (3, 14) else "unknown-kind"
-    assert reason(b'{"a":' + b"[" * 8_000 + b"]" * 8_000 + b"}") == expected
+    assert reason(b'{"a":' + b"[" * 8_000 + b"]" * 8_000 + b"}") == "not-json"
 
 
 @pytest.mark.parametrize("data", [b"[" * 16_000, b"[]", b"5", b"null", b'"tx"', b"{}", b'{"model":1}', b'[{"tx":"a"}]'])
@@ -328,5 +324,5 @@ def test_new_cids_of_many_messages_are_parsed_together(
     cids = [cid_of_digest(bytes([number] * 32)) for number in range(20)]
     payloads = [encode(replace(message, **{field: cid})) for cid in cids]
     parse_cids_ahead([*payloads, b"", b'"objective":"', b'"result":"\xff'], type(message))
-    monkeypatch.setattr(cid, "base58_number", None)
+    monkeypatch.setattr(cid, "_blocks", None)
     assert [getattr(schemas.decode(payload), field) for payload in payloads] == cids

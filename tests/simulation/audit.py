@@ -7,10 +7,9 @@ from collections import defaultdict
 from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
+from mesh.agent.ledger import Phase
 from mesh.chain import Chain, Finalized, NewLiability, Transfer
-from mesh.evidence.claims import Claim
-from mesh.evidence.verification import verify
-from mesh.work.phases import Phase
+from mesh.validator.verification import Claim, verify
 from schemas import ZERO_ADDRESS
 from tests.simulation.chain import NodeFaults, SimulatedNode
 from tests.simulation.faults import MOST_BLOCKS
@@ -19,8 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from mesh.agent.ledger import JobRecord
     from mesh.chain import ChainEvent
-    from mesh.work.ledger import JobRecord
     from schemas import Liability
     from tests.simulation.market import Market
     from tests.simulation.roles import Ordered, Role
@@ -227,7 +226,7 @@ class Audit:
 
 
 def _jobs(folder: Path) -> list[JobRecord]:
-    from mesh.work.ledger import _job
+    from mesh.agent.ledger import _job
 
     found: list[JobRecord] = []
     for path in sorted(folder.rglob("ledger.sqlite")):

@@ -13,12 +13,9 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import msgspec
 
 from mesh.chain.answers import ANSWERS, Count, decode_answer
-from mesh.chain.events import decode_log
-from mesh.devchain.bounded_vm import GAS_LIMIT
-from mesh.devchain.calls import Call, Calls, parse_call
-from mesh.devchain.evm import Evm
-from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
-from mesh.devchain.methods import Methods
+from mesh.chain.following import decode_log
+from mesh.dev._evm import GAS_LIMIT, Call, Calls, Evm, Methods, parse_call
+from mesh.dev._rpc import SERVER_ERROR, RpcError, parse_data
 from tests.simulation.chance import FaultDraw
 from tests.simulation.memo import Answer
 from tests.simulation.model import ModelChain

@@ -26,7 +26,7 @@ from tests.simulation.scheduler import REAL_TIME, SECOND
 
 router.install(lambda: history.CURRENT[-1])  # type: ignore[arg-type,return-value]
 
-from mesh.chain.rpc_client import RpcClient  # noqa: E402, F401
+from mesh.chain.rpc import RpcClient  # noqa: E402, F401
 from tests.simulation.deployment import CROWDED_JOBS, JOBS, ON_EVM, ON_MODEL, Deployments  # noqa: E402
 from tests.simulation.fault_plan import KINDS  # noqa: E402
 from tests.simulation.mutants import find_mutants  # noqa: E402

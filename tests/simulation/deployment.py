@@ -7,10 +7,10 @@ import random
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-import mesh.agent.runtime  # noqa: F401 - loaded once, before histories fork
+import mesh.agent._runtime  # noqa: F401 - loaded once, before histories fork
 from mesh.chain import XRT, Account, Chain, Timing
 from mesh.chain.deploy import DeploymentPlan
-from mesh.devchain.development import ALLOWANCE, DevelopmentMarket, deploy_market
+from mesh.dev.development import ALLOWANCE, DevelopmentMarket, deploy_market
 from schemas import cid_of_bytes, keccak256
 from tests.simulation import loop, threads
 from tests.simulation.chain import EvmChain, NodeFaults, SimulatedChain, SimulatedNode
@@ -127,7 +127,7 @@ def found(chain: SimulatedChain, scheduler: Scheduler, *, jurors: int = 0) -> De
     keys = chain.evm.funded_keys
     names = [f"person-{number}" for number in range(PEOPLE)] + [f"robot-{number}" for number in range(ROBOTS)]
     names += ["provider-1", *(f"person-{number}" for number in range(PEOPLE, MOST_PEOPLE))]
-    accounts = {name: Account.from_key(key) for name, key in zip(names, keys[3:], strict=False)}
+    accounts = {name: Account(key) for name, key in zip(names, keys[3:], strict=False)}
 
     async def main() -> None:
         node = SimulatedNode(chain, NodeFaults())
@@ -150,7 +150,7 @@ def found(chain: SimulatedChain, scheduler: Scheduler, *, jurors: int = 0) -> De
 
 async def _found_jury(client: Chain, accounts: dict[str, Account], jurors: int) -> str:
     """Deploy a jury of new accounts, and add these to the others; its address."""
-    judges = {f"juror-{number}": Account.from_key(keccak256(b"juror %d" % number)) for number in range(jurors)}
+    judges = {f"juror-{number}": Account(keccak256(b"juror %d" % number)) for number in range(jurors)}
     accounts.update(judges)
     addresses = [account.address for account in judges.values()]
     return (await client.validators.deploy(addresses, jurors // 2 + 1)).address

@@ -1,8 +1,7 @@
 """What a crash of the machine leaves of a folder (what was synced, and chance decides about the rest), and full disks.
 
-Files are real. What `os.fsync` was called for is remembered here, and what SQLite has synced: the database itself; of
-its log, each commit with `synchronous = FULL`, and what it has moved to the database. A process may crash at each
-commit.
+Files are real. What `os.fsync` was called for is remembered here, and what SQLite has synced: the database itself, and
+of its log what it has moved there. A process may crash at each commit.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
-from mesh.content.files import is_locked
+from mesh.base.private_files import is_locked
 from tests.simulation.threads import scheduler
 
 if TYPE_CHECKING:
@@ -30,8 +29,6 @@ LOG: Final = "-wal"
 """How SQLite names the log of a database."""
 INDEX: Final = "-shm"
 """The index of that log, which SQLite makes again."""
-FULL: Final = 2
-"""SQLite's `synchronous` from which each commit is synced."""
 LOG_HEADER: Final = 32
 FRAME_HEADER: Final = 24
 """Bytes before the first frame of a log, and before the page of each."""
@@ -270,8 +267,6 @@ class DatabaseConnection(sqlite3.Connection):
     disk: SimulatedDisk
     path: str
     _log = 0
-    _level: int | None = None
-    """What `synchronous` is; None if that may have changed."""
     _moved: tuple[bytes, int] | None = None
 
     def execute(self, statement: str, *arguments: Any) -> sqlite3.Cursor:
@@ -287,7 +282,6 @@ class DatabaseConnection(sqlite3.Connection):
     def executescript(self, statements: str) -> sqlite3.Cursor:
         """Execute several statements."""
         done: sqlite3.Cursor = self._guarded("CREATE", super().executescript, statements)
-        self._level = None
         return done
 
     def commit(self) -> None:
@@ -307,20 +301,16 @@ class DatabaseConnection(sqlite3.Connection):
         found = function(*arguments)
         if is_commit:
             self._committed()
-        elif word.startswith("PRAGMA"):
-            self._level = None
         return found
 
     def _committed(self) -> None:
-        """A commit is synced if SQLite does that, and in any case once it is moved from the log to the database."""
+        """A commit is synced by who made it, or once SQLite moves it from the log to the database."""
         if not self._log:
             self._find_files()
         latest = LogState.of(self.path)
         if latest is not None:
-            if self._level is None:
-                (self._level,) = super().execute("PRAGMA synchronous").fetchone()
             moved = (latest.salts, latest.moved)
-            if self._level >= FULL or (latest.moved and moved != self._moved):
+            if latest.moved and moved != self._moved:
                 self.disk.logs[self._log] = latest
             else:
                 self.disk.logs.setdefault(self._log, latest._replace(frames=0))

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain import NoContracts, NotALiability
 from mesh.errors import AiraError
-from mesh.recording.mcap_writer import McapWriter
-from mesh.running import cause_of
+from mesh.recording._mcap_writer import McapWriter
+from mesh.role.running import cause_of
 from schemas import EMPTY, cid_of_file
 from tests.simulation.chance import FaultDraw
 from tests.simulation.deployment import ROBOTS, Deployed, MarketPlan
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from mesh.market.book import Match
+    from mesh.market import Match
     from tests.simulation.audit import Audit
 
 GONE: Final = (NoContracts, NotALiability)

@@ -10,9 +10,10 @@ from __future__ import annotations
 from functools import wraps
 from typing import TYPE_CHECKING, Any, Final
 
+import mesh.chain._node
 import mesh.chain.answers
-import mesh.chain.events
-import mesh.chain.rpc_client
+import mesh.chain.following
+import mesh.chain.rpc
 import schemas.signing
 from mesh.chain.answers import decode_answer
 
@@ -24,22 +25,23 @@ MOST: Final = 50_000
 
 
 class Answer(dict[str, Any]):
-    """A JSON-RPC response that nobody changes, with what it means once it was decoded."""
+    """A JSON-RPC response that nobody changes, with what it means once it was decoded as a type."""
 
+    kind: Any = None
     meaning: Any = None
 
 
 def install() -> None:
     """Share the results of what follows, for the rest of this process."""
     for module, name, key_of in (
-        (mesh.chain.answers, "decode", _words),
+        (mesh.chain._node, "decode", _words),
         (mesh.chain.answers, "checksum_address", bytes),
-        (mesh.chain.events, "decode_values", _words),
+        (mesh.chain.following, "decode", _words),
         (schemas.signing, "checksum_address", bytes),
         (schemas.signing, "recover", _pair),
     ):
         setattr(module, name, _shared(getattr(module, name), key_of))
-    setattr(mesh.chain.rpc_client, decode_answer.__name__, _decode_answer)
+    setattr(mesh.chain.rpc, decode_answer.__name__, _decode_answer)
 
 
 def _words(types: list[str], data: bytes) -> tuple[tuple[str, ...], bytes]:
@@ -69,6 +71,6 @@ def _shared(function: Callable[..., Any], key_of: Callable[..., Any]) -> Callabl
 def _decode_answer(method: str, response: object, kind: Any = Any) -> Any:
     if not isinstance(response, Answer):
         return decode_answer(method, response, kind)
-    if response.meaning is None:
-        response.meaning = decode_answer(method, response, kind)
+    if response.meaning is None or response.kind is not kind:
+        response.kind, response.meaning = kind, decode_answer(method, response, kind)
     return list(response.meaning) if isinstance(response.meaning, list) else response.meaning

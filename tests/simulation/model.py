@@ -11,23 +11,22 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
 
-from mesh.chain.answers import NO_TRANSACTIONS
-from mesh.chain.multicall import decode_calls, encode_answers
-from mesh.chain.reverts import REVERTED
-from mesh.devchain.evm import FUNDS_WEI
-from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
+from mesh.chain._node import decode_calls, encode_answers
+from mesh.chain.answers import NO_TRANSACTIONS, REVERTED
+from mesh.dev._evm import FUNDS_WEI, MinedBlocks
+from mesh.dev._rpc import SERVER_ERROR, RpcError, parse_data
 from schemas import Signer, keccak256
 from schemas.address import address_bytes
 from tests.simulation.model_abi import ModelRevert, artifact
-from tests.simulation.model_contracts import ModelJury, ModelNames, ModelResolver, ModelToken
+from tests.simulation.model_contracts import ModelBlockingToken, ModelJury, ModelNames, ModelResolver, ModelToken
 from tests.simulation.model_factory import ModelFactory
 from tests.simulation.model_state import ModelRun, ModelState
 from tests.simulation.model_transactions import ModelTransaction, read_transaction
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
-    from mesh.devchain.calls import Call
+    from mesh.dev._evm import Call
 
     ModelLog = tuple[bytes, list[bytes], bytes]
 
@@ -36,7 +35,7 @@ CHAIN_ID: Final = 131277322940537
 GAS_LIMIT: Final = 30_000_000
 BASE_FEE: Final = 10**9
 """wei a gas in the first block."""
-CREATED: Final = (ModelToken, ModelNames, ModelResolver, ModelFactory, ModelJury)
+CREATED: Final = (ModelToken, ModelBlockingToken, ModelNames, ModelResolver, ModelFactory, ModelJury)
 
 
 class _Applied(NamedTuple):
@@ -51,14 +50,14 @@ class _Applied(NamedTuple):
     price: int
 
 
-class ModelChain:
+class ModelChain(MinedBlocks):
     """The chain. Heights are block numbers; amounts are wei."""
 
     def __init__(self, funded_keys: tuple[bytes, ...], *, max_logs: int = 100_000) -> None:
+        super().__init__(head=-1)
         self.funded_keys = funded_keys
         self.chain_id = CHAIN_ID
         self.max_logs = max_logs
-        self.head = -1
         self.base_fee = BASE_FEE
         self.calls = self
         self._state = ModelState()
@@ -66,23 +65,9 @@ class ModelChain:
         self._base_fees: list[int] = []
         """Of the block after each one."""
         self._by_hash: dict[str, int] = {}
-        self._receipts: dict[bytes, dict[str, Any]] = {}
-        self._transactions: dict[bytes, dict[str, Any]] = {}
-        self._logs: dict[int, list[dict[str, Any]]] = {}
         accounts = [_address_of(key) for key in funded_keys]
         self._state.apply(0, {(account, "wei"): FUNDS_WEI for account in accounts})
         self._add_block()
-
-    def height(self, tag: object) -> int:
-        """The block number behind a tag (`latest`, …) or a number. Raises `RpcError` for a missing block."""
-        match tag:
-            case "latest" | "pending" | "safe" | "finalized":
-                return self.head
-            case "earliest":
-                return 0
-            case int() if 0 <= tag <= self.head:
-                return tag
-        raise RpcError(SERVER_ERROR, f"block {tag!r} not found; the latest is {self.head}")
 
     def balance(self, address: bytes, height: int) -> int:
         """Wei of an account."""
@@ -110,19 +95,6 @@ class ModelChain:
             mined = [self._transactions[bytes.fromhex(hash_[2:])] for hash_ in block["transactions"]]
             return block | {"transactions": mined}
         return block
-
-    def transaction(self, hash_: bytes) -> dict[str, Any] | None:
-        """A mined transaction, None if there is none."""
-        return self._transactions.get(hash_)
-
-    def receipt(self, hash_: bytes) -> dict[str, Any] | None:
-        """The receipt of a mined transaction, None if there is none."""
-        return self._receipts.get(hash_)
-
-    def logs(self, first: int, last: int) -> Iterator[dict[str, Any]]:
-        """All logs of the blocks from `first` to `last`, both included, in order."""
-        for height in range(first, min(last, self.head) + 1):
-            yield from self._logs.get(height, ())
 
     def call(self, fields: Call, height: int) -> bytes:
         """What a call returns. Raises `RpcError` with the revert data when it fails."""

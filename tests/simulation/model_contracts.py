@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 NOBODY = bytes(20)
 UNLIMITED = 2**256 - 1
+MOST_XRT = 2**96 - 1
 MOST_JURORS = 7
 
 
@@ -102,7 +103,7 @@ class ModelToken(ModelContract):
     def mint(self, account: bytes, value: int) -> bool:
         if self.sender != self.minter():
             raise refused("NotTheMinter", self.sender)
-        self._mint(account, value)
+        self._mint(account, min(value, MOST_XRT - self.totalSupply()))
         return True
 
     def approve(self, spender: bytes, value: int) -> bool:
@@ -137,11 +138,56 @@ class ModelToken(ModelContract):
         if account == NOBODY:
             raise refused("ERC20InvalidReceiver", account)
         supply = checked(self.totalSupply() + value)
-        if supply >= 1 << 96:
+        if supply > MOST_XRT:
             raise refused("SupplyTooLarge", supply)
         self.set("supply", supply)
         self.set("balance", account, self.balanceOf(account) + value)
         self.log("Transfer", NOBODY, account, value)
+
+
+class ModelBlockingToken(ModelContract):
+    """A token of the tests (`contracts/fixtures/Tokens.sol`) that refuses to pay accounts on its blocklist."""
+
+    NAME = "BlockingToken"
+
+    def begin(self, supply: int = 0) -> None:
+        self.set("balance", self.sender, supply)
+        self.set("supply", supply)
+
+    def totalSupply(self) -> int:
+        return int(self.get("supply"))
+
+    def allowance(self, owner: bytes, spender: bytes) -> int:
+        return UNLIMITED
+
+    def balanceOf(self, account: bytes) -> int:
+        return int(self.get("balance", account))
+
+    def isBlocked(self, account: bytes) -> bool:
+        return bool(self.get("blocked", account))
+
+    def setBlocked(self, account: bytes, blocked: bool) -> None:
+        self.set("blocked", account, blocked)
+
+    def setRefusal(self, way: int) -> None:
+        if way > 3:
+            raise ModelRevert
+        self.set("way", way)
+
+    def transfer(self, to: bytes, value: int) -> bool:
+        way = self.get("way")
+        if self.isBlocked(to) and way != 1:
+            raise ModelRevert({0: keccak256(b"Blocked(address)")[:4] + word(to), 3: bytes(200_000)}.get(way, b""))
+        self._move(self.sender, to, value)
+        return not self.isBlocked(to)
+
+    def transferFrom(self, owner: bytes, to: bytes, value: int) -> bool:
+        self._move(owner, to, value)
+        return True
+
+    def _move(self, owner: bytes, to: bytes, value: int) -> None:
+        self.set("balance", owner, checked(self.balanceOf(owner) - value))
+        self.set("balance", to, checked(self.balanceOf(to) + value))
 
 
 class ModelNames(ModelContract):

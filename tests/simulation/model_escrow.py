@@ -1,16 +1,18 @@
-"""A model of how the factory takes and pays tokens (`Tokens.sol` and what the factory does with it)."""
+# ruff: noqa: N802 - functions have the names of those in contracts/src, where they are described
+"""A model of how the factory takes and pays tokens (`Tokens.sol`, `PullPayments.sol`, and what it does with them)."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from tests.simulation.model_abi import ModelRevert, encode, functions, refused, word
+from tests.simulation.model_abi import ModelRevert, checked, encode, functions, refused, word
 from tests.simulation.model_contracts import NOBODY, ModelContract, ModelToken
 
 if TYPE_CHECKING:
     from tests.simulation.model_orders import ModelTerms
 
 ERC20: Final = {one.name: selector for selector, one in functions("XRT").items()}
+PAY: Final = next(selector for selector, one in functions("Factory").items() if one.name == "pay")
 
 
 class ModelEscrow(ModelContract):
@@ -19,6 +21,33 @@ class ModelEscrow(ModelContract):
     def xrt(self) -> bytes:
         """The token of fees and stakes."""
         return bytes(self.get("xrt"))
+
+    def owed(self, token: bytes, account: bytes) -> int:
+        return int(self.get("owed", token, account))
+
+    def claim(self, token: bytes, account: bytes) -> None:
+        self._claim(token, account, account)
+
+    def claimTo(self, token: bytes, to: bytes) -> None:
+        self._claim(token, self.sender, to)
+
+    def pay(self, token: bytes, to: bytes, value: int) -> None:
+        if self.sender != self.address:
+            raise refused("NotTheFactory", self.sender)
+        self._call_token(token, ERC20["transfer"] + word(to) + word(value))
+
+    def _pay_or_owe(self, token: bytes, to: bytes, value: int) -> None:
+        if not self.run.attempt(self.address, self.address, PAY + word(token) + word(to) + word(value)):
+            self.set("owed", token, to, checked(self.owed(token, to) + value))
+            self.log("PaymentRefused", token, to, value)
+
+    def _claim(self, token: bytes, account: bytes, to: bytes) -> None:
+        value = self.owed(token, account)
+        if not value:
+            raise refused("NothingOwed", token, account)
+        self.set("owed", token, account, 0)
+        self.log("Claimed", token, account, to, value)
+        self._call_token(token, ERC20["transfer"] + word(to) + word(value))
 
     def _collect(self, terms: ModelTerms, provider: bytes) -> None:
         xrt = ModelToken(self.run, self.xrt(), self.address)
@@ -33,10 +62,14 @@ class ModelEscrow(ModelContract):
             xrt.transferFrom(terms.promisee, self.address, terms.validator_fee)
 
     def _pay_out(self, terms: ModelTerms, cost_to: bytes, fee_to: bytes) -> None:
+        xrt = ModelToken(self.run, self.xrt(), self.address)
         if terms.cost:
-            self._call_token(terms.token, ERC20["transfer"] + word(cost_to) + word(terms.cost))
+            if terms.token == self.xrt():
+                xrt.transfer(cost_to, terms.cost)
+            else:
+                self._pay_or_owe(terms.token, cost_to, terms.cost)
         if terms.validator != NOBODY and terms.validator_fee:
-            ModelToken(self.run, self.xrt(), self.address).transfer(fee_to, terms.validator_fee)
+            xrt.transfer(fee_to, terms.validator_fee)
 
     def _take_exactly(self, token: bytes, owner: bytes, value: int) -> None:
         if not self.run.code(token):

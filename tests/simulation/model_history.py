@@ -7,13 +7,14 @@ from functools import cache
 from typing import Any, Final
 
 from mesh.chain import XRT
-from mesh.chain.names import namehash
+from mesh.chain._names import namehash
 from schemas import keccak256
 from tests.simulation.model_abi import encode, functions, word
 from tests.simulation.model_twins import PEOPLE, REFUND_DELAY, TIMEOUT, Outcome, Twins, call_of, reads
 
 NOBODY: Final = bytes(20)
 CREATED: Final = keccak256(b"NewLiability(address)")
+REFUSED: Final = keccak256(b"PaymentRefused(address,address,uint256)")
 LIGHTHOUSE: Final = keccak256(b"NewLighthouse(address,string)")
 RESULT: Final = bytes.fromhex("1220") + keccak256(b"result")
 KINDS: Final = {
@@ -21,6 +22,7 @@ KINDS: Final = {
     "resolver": "Resolver",
     "xrt": "XRT",
     "other": "XRT",
+    "blocking": "BlockingToken",
     "factory": "Factory",
     "lighthouse": "Lighthouse",
     "jury": "Jury",
@@ -49,16 +51,20 @@ class ModelHistory:
         self.made: list[tuple[bytes, dict[str, Any]]] = []
         self.sent: list[tuple[bytes, bytes, bytes]] = []
         self.hashes: list[bytes] = [bytes(32)]
+        self.debts: list[tuple[bytes, bytes]] = []
         self.nonces = 0
 
     def play(self) -> None:
         actions = [
             self.token, self.token, self.stake, self.stake, self.create, self.create, self.create, self.create,
             self.finish, self.finish, self.finish, self.end, self.withdraw, self.name, self.jury, self.lighthouse,
-            self.again, self.again, self.spoil, self.spoil, self.garbage, self.wait,
+            self.refuse, self.claim, self.again, self.again, self.spoil, self.spoil, self.garbage, self.wait,
         ]  # fmt: skip
         for person in self.chance.sample(self.twins.people, 3):
             self.do(person, self.known["lighthouse"], call_of("Lighthouse", "refill", 3 * XRT))
+        for who in self.chance.sample((1, 2, 3), 2):
+            data = call_of("BlockingToken", "setBlocked", self.twins.people[who], True)
+            self.do(self.person(), self.known["blocking"], data)
         for _ in range(self.steps):
             self.pick(*actions)()
         self.compare_everything()
@@ -86,6 +92,8 @@ class ModelHistory:
         for _, topics, _ in found.logs:
             if topics[0] == LIGHTHOUSE:
                 self.lighthouses.append(topics[1][12:])
+            if topics[0] == REFUSED:
+                self.debts.append((topics[1][12:], topics[2][12:]))
         return found
 
     def wait(self) -> None:
@@ -173,12 +181,15 @@ class ModelHistory:
         data = call_of("Factory", "nonceOf", person)
         return int.from_bytes(self.twins.call(person, self.known["factory"], data, keep=False)[1].data, "big")
 
-    def create(self) -> None:
-        terms = {
+    def create(self, **changes: Any) -> None:
+        """A liability, with these changes of its terms."""
+        terms: dict[str, Any] = {
             "generation": self.pick(3, 5),
             "model": bytes.fromhex("1220") + keccak256(b"model"),
             "objective": bytes.fromhex("1220") + keccak256(self.pick(b"objective", b"more")),
-            "token": self.pick(*[self.known["xrt"]] * 12, *[self.known["other"]] * 4, self.anybody()),
+            "token": self.pick(
+                *[self.known["xrt"]] * 12, *[self.known["other"]] * 4, *[self.known["blocking"]] * 8, self.anybody()
+            ),
             "cost": self.pick(0, 1, XRT, XRT, XRT, 3 * XRT, self.amount()),
             "lighthouse": self.pick(*[self.known["lighthouse"]] * 12, *self.lighthouses[-2:]),
             "validator": self.pick(
@@ -193,7 +204,7 @@ class ModelHistory:
             "lighthouse_fee": self.pick(0, 0, 1, XRT),
             "promisee": self.pick(1, 1, 2),
             "promisor": self.pick(2, 3, 1),
-        }
+        } | changes
         demand, offer = self.orders(terms)
         to = self.pick(*[terms["lighthouse"]] * 24, self.known["lighthouse"], self.known["factory"])
         done = self.do(self.provider(to), to, call_of("Lighthouse", "createLiability", demand, offer))
@@ -255,6 +266,23 @@ class ModelHistory:
             ),
         }
         self.do(self.person(), *calls[self.pick("refund", "refund", "cancel", "settle", "ask")])
+
+    def refuse(self) -> None:
+        """A token refuses to pay a party from now on, or pays it again."""
+        values = self.pick(1, 2, 3), self.pick(True, True, False)
+        data = call_of("BlockingToken", "setBlocked", self.twins.people[values[0]], values[1])
+        if self.pick(True, False):
+            data = call_of("BlockingToken", "setRefusal", self.pick(0, 1, 2, 3, 4))
+        self.do(self.person(), self.known["blocking"], data)
+
+    def claim(self) -> None:
+        token, account = self.pick(*self.debts * 10, (self.known["blocking"], self.person()))
+        calls = (
+            call_of("Factory", "claim", token, account),
+            call_of("Factory", "claimTo", token, self.anybody()),
+            call_of("Factory", "pay", token, account, self.amount()),
+        )
+        self.do(self.pick(account, self.person()), self.known["factory"], self.pick(*calls[:2], *calls))
 
     def withdraw(self) -> None:
         person = self.person()

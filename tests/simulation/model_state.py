@@ -88,6 +88,17 @@ class ModelRun:
             raise ModelRevert
         return found.answer()
 
+    def attempt(self, sender: bytes, to: bytes, data: bytes) -> bool:
+        """Call an account; if that reverts, nothing has changed, and the answer is False."""
+        writes, logs = dict(self.writes), len(self.logs)
+        try:
+            self.call(sender, to, data)
+        except ModelRevert:
+            self.writes = writes
+            del self.logs[logs:]
+            return False
+        return True
+
     def contract(self, sender: bytes, to: bytes, data: bytes = b"") -> ModelContract | None:
         """The contract at an address, called by `sender`; None if there is none."""
         made: tuple[Callable[..., ModelContract], bytes] | None = self.get(to, "contract", default=None)

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
 
-from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError
+from mesh.dev._rpc import SERVER_ERROR, RpcError
 from schemas import keccak256
 from schemas.address import address_bytes
 from schemas.signing import recover_keys, signer_of

@@ -9,13 +9,13 @@ from eth.vm.message import Message
 from eth_abi.abi import encode
 
 from mesh.chain import XRT, Account
+from mesh.chain._names import namehash
+from mesh.chain._node import Node
 from mesh.chain.deploy import DeploymentPlan
-from mesh.chain.names import namehash
-from mesh.chain.node import Node
 from mesh.chain.transactions import TransactionSender
-from mesh.devchain.development import deploy_market
-from mesh.devchain.jsonrpc import RpcError
-from mesh.devchain.methods import Methods
+from mesh.dev._evm import Methods
+from mesh.dev._rpc import RpcError
+from mesh.dev.development import deploy_market
 from schemas import Signer, address_bytes
 from tests.simulation.chain import EvmChain
 from tests.simulation.model import ModelChain
@@ -24,7 +24,7 @@ from tests.simulation.model_abi import encode as encode_words
 from tests.simulation.model_state import ModelRun
 
 if TYPE_CHECKING:
-    from mesh.devchain.evm import Evm
+    from mesh.dev._evm import Evm
 
 GAS: Final = 8_000_000
 REFUND_DELAY: Final = 12
@@ -127,24 +127,25 @@ class Twins:
         return Outcome(True, returned, run.logs)
 
     async def _deploy(self, evm: Evm | ModelChain) -> dict[str, bytes]:
-        """The market of `mesh.devchain`, and more providers, another token and a jury."""
+        """The market of `mesh.dev`, and more providers, another token and a jury."""
         endpoint = NodeOf(evm)
         market = await deploy_market(endpoint, evm.funded_keys, plan=PLAN)
         found = market.deployment
         names = ("ens", "resolver", "xrt", "factory", "lighthouse")
         addresses = {name: address_bytes(getattr(found, name)) for name in names}
         async with Node(endpoint) as node:
-            sender = TransactionSender(node, Account.from_key(evm.funded_keys[0]))
+            sender = TransactionSender(node, Account(evm.funded_keys[0]))
             token = node.contract("XRT", found.xrt)
             for key in evm.funded_keys[3:PEOPLE]:
                 await sender.call(token.transfer(Signer(key).address, 30 * XRT))
             for key in evm.funded_keys[:PEOPLE]:
-                each = TransactionSender(node, Account.from_key(key))
+                each = TransactionSender(node, Account(key))
                 for spender in (found.factory, found.lighthouse):
                     await each.call(token.approve(spender, 1000 * XRT))
             jurors = sorted((Signer(key).address for key in evm.funded_keys[3:PEOPLE]), key=address_bytes)
             arguments: dict[str, tuple[str, list[str], list[Any]]] = {
                 "other": ("XRT", ["uint256"], [500 * XRT]),
+                "blocking": ("BlockingToken", ["uint256"], [500 * XRT]),
                 "jury": ("Jury", JURY, [found.xrt, jurors[-1:], 1]),
                 "panel": ("Jury", JURY, [found.xrt, jurors, 2]),
             }
@@ -153,6 +154,9 @@ class Twins:
                 receipt = await sender.send(to=None, data=data)
                 assert receipt.contract is not None
                 addresses[name] = address_bytes(receipt.contract)
+                if name == "blocking":
+                    for promisee in self.signers[1:3]:
+                        await sender.call(node.contract("XRT", receipt.contract).transfer(promisee.address, 200 * XRT))
         return addresses
 
 
@@ -172,7 +176,10 @@ def reads(kind: str, accounts: list[bytes], hashes: list[bytes]) -> list[bytes]:
         ("bytes32",): [(digest,) for digest in (*hashes[:4], namehash("eth"), namehash("factory.3.robonomics.eth"))],
         ("bytes4",): [(bytes.fromhex("3b3b57de"),), (bytes(4),)],
         ("bytes32", "address"): [(digest, account) for digest in hashes[-4:] for account in people[1:4]],
-        ("address", "address"): [(owner, spender) for owner in people for spender in accounts[-3:]],
+        ("address", "address"): [
+            *[(owner, spender) for owner in people for spender in accounts[-3:]],
+            *[(token, account) for token in accounts[PEOPLE:] for account in people[1:4]],
+        ],
         ("address", "uint256"): [(bytes(20), 10), (bytes(20), 1), (people[3], 2), (people[0], 0)],
     }
     for entry in artifact(kind)["abi"]:

@@ -7,13 +7,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent import Agent, JobFailed
+from mesh.agent.agent import Agent
 from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
+from mesh.agent.handlers import JobFailed
 from mesh.agent.orders import OrderState
 from mesh.chain import XRT, Chain
-from mesh.composition import provider_files
 from mesh.errors import AiraError
-from mesh.market.provider import Provider
+from mesh.market.provider import Provider, ProviderOptions, provider_file
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
 from mesh.validator.validator import Validator
@@ -26,8 +26,8 @@ from tests.simulation.scheduler import Process
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from mesh.agent import Contract
-    from mesh.market.book import Match
+    from mesh.agent.contracts import Contract
+    from mesh.market import Match
     from schemas import Demand
     from tests.simulation.market import Market
 
@@ -184,13 +184,10 @@ class ProviderRole(Role):
         """Match and settle."""
         async with Network(Endpoints(connect=(ENDPOINT,), timeout=-1)) as network, self.chain() as chain:
             await chain.lighthouses.become_provider(self.lighthouse, STAKE)
-            files = await provider_files(self.settings(), chain, self.account.address, self.lighthouse)
+            store = await provider_file(self.settings(), chain, self.account.address, self.lighthouse)
+            options = ProviderOptions(free_contracts=1_000_000, store=store)
             async with Provider(
-                network.session,
-                chain,
-                self.lighthouse,
-                matched=self._matched,
-                **files,
+                network.session, chain, self.lighthouse, options, matched=self._matched
             ) as self.provider:
                 await self.provider.run()
 

@@ -9,15 +9,13 @@ from eth_utils.crypto import keccak
 
 from mesh.agent.orders import OrderState
 from mesh.chain import Finalized, NewLiability, Transfer
-from mesh.market.refusals import Refusal
-from mesh.market.versions import lasting_hash
 from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, Offer, Result, address_bytes, decode
-from schemas.signing import Rejection
-from schemas.wire import message_hash
+from schemas.messages import lasting_hash, message_hash
+from schemas.signing import Refusal, Rejection
 from tests.simulation.scheduler import SECOND
 
 if TYPE_CHECKING:
-    from mesh.market.book import Match
+    from mesh.market import Match
     from tests.simulation.chain import PooledTransaction
     from tests.simulation.market import Market
     from tests.simulation.messages import Sample

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 from typing import Any, Final
 
 import pytest
@@ -11,8 +12,8 @@ from eth_bloom.bloom import BloomFilter
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from mesh.chain import Account
-from mesh.chain.accounts import created_address
+from mesh.chain import XRT, Account
+from mesh.chain._accounts import created_address
 from schemas import address_bytes, keccak256
 from tests.simulation.model import ModelChain, bloom_of
 from tests.simulation.model_abi import artifact
@@ -36,6 +37,34 @@ def test_the_model_does_what_the_contracts_do(first: int) -> None:
         ModelHistory(number, steps).play()
 
     play()
+
+
+class Usual(random.Random):
+    """Chooses what comes first, which is what works."""
+
+    def choice(self, seq: Any) -> Any:
+        return seq[0]
+
+
+@pytest.mark.parametrize("way", range(4))
+def test_the_model_owes_what_a_token_refuses_to_pay_and_pays_it_when_it_is_claimed(way: int) -> None:
+    history = ModelHistory(0, 0)
+    history.chance = Usual()
+    token, factory, people = history.known["blocking"], history.known["factory"], history.twins.people
+    history.do(people[3], history.known["lighthouse"], call_of("Lighthouse", "refill", 3 * XRT))
+    history.do(people[0], token, call_of("BlockingToken", "setRefusal", way))
+    history.do(people[0], token, call_of("BlockingToken", "setBlocked", people[2], True))
+    for _ in range(2):
+        history.create(token=token, cost=XRT, promisee=1, promisor=2)
+        history.made.reverse()
+        history.finish()
+    assert history.debts == [(token, people[2])] * 2
+
+    claim = call_of("Factory", "claim", token, people[2])
+    elsewhere = call_of("Factory", "claimTo", token, people[4])
+    calls = (people[2], claim), (people[4], elsewhere), (people[2], elsewhere), (people[2], elsewhere)
+    assert [history.do(sender, factory, data).succeeded for sender, data in calls] == [False, False, True, False]
+    history.compare_everything()
 
 
 def test_the_chain_of_the_model_shows_what_the_chain_of_the_evm_shows() -> None:
@@ -62,7 +91,7 @@ def test_a_modelled_block_has_the_bloom_filter_of_its_logs() -> None:
 
 def test_the_transactions_of_a_block_see_what_those_before_them_did() -> None:
     chain = ModelChain(twins().evm.funded_keys)
-    maker, friend = (Account.from_key(key) for key in chain.funded_keys[:2])
+    maker, friend = (Account(key) for key in chain.funded_keys[:2])
     token = created_address(maker.address, 0)
     fees = {"chainId": chain.chain_id, "maxPriorityFeePerGas": 1, "maxFeePerGas": 2 * chain.base_fee, "value": 0}
 

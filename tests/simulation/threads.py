@@ -22,7 +22,7 @@ from tests.simulation.scheduler import SECOND, START_WALL_NS, Fiber, Scheduler
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-TOO_EARLY: Final = ("aiosqlite", "concurrent.futures.thread", "mesh.network", "mesh.work", "web3", "zenoh")
+TOO_EARLY: Final = ("concurrent.futures.thread", "mesh.network", "mesh.agent", "web3", "zenoh")
 
 
 class World:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bridges.serial import firmware as compiler
-from bridges.serial import libraries
 from bridges.serial.boards import SimulatedBoard
 from tests.support.commands import AIRA, Serving
 from tests.support.peers import require
@@ -26,6 +25,7 @@ COUNTER = "tests/support/firmware/counter"
 DIMMER = "tests/support/firmware/dimmer"
 TALKER = "tests/support/firmware/talker"
 ROSSERIAL_ECHO = "tests/support/firmware/rosserial_echo"
+ROSSERIAL_TWINS = "tests/support/firmware/rosserial_twins"
 
 
 @cache
@@ -51,7 +51,6 @@ def firmware(sketch: str, *defines: str) -> Path:
 def _digest(sketch: Path, defines: tuple[str, ...]) -> str:
     sources = [
         Path(compiler.__file__),
-        Path(libraries.__file__),
         *(path for top in (sketch, LIBRARIES) for path in sorted(top.rglob("*"))),
     ]
     parts = [repr(defines).encode(), *(path.read_bytes() for path in sources if path.is_file())]

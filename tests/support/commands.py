@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from click.testing import CliRunner
 
@@ -16,13 +19,14 @@ from tests.support.processes import Server
 from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 
+    import click
     from click.testing import Result
 
     from mesh.errors import AiraError
 
+CODES = Path(__file__).parents[2] / "docs" / "codes.md"
 AIRA = (sys.executable, "-m", "mesh")
 SECONDS = 200.0
 SOON = 40
@@ -50,27 +54,48 @@ def run(*command: str | Path, **variables: str) -> subprocess.CompletedProcess[s
     return subprocess.run(words, env=environment(variables), capture_output=True, text=True, timeout=SECONDS)
 
 
+def coroutine(command: click.Command) -> Callable[..., Coroutine[Any, Any, None]]:
+    """The coroutine function of a command that takes settings, for tests that run in an event loop."""
+    assert command.callback is not None
+    function: Callable[..., Coroutine[Any, Any, None]] = command.callback.__wrapped__  # type: ignore[attr-defined]
+    return function
+
+
 def refused(
     done: subprocess.CompletedProcess[str] | Result,
-    error: type[AiraError],
+    error: type[AiraError] | str,
     *values: object,
     exit_code: int | None = None,
+    code: str = "",
 ) -> str:
-    """Assert that a command failed with this error (or a subclass) in one line with its code and these values.
+    """Assert that a command failed with this error (a code, or a class, then with `code` or any of it) in one line with
+    its code and these values.
 
-    Returns the hint. The exit code must be the error's, unless another is given.
+    Returns the hint. The exit code must be the error's as documented, unless another is given.
     """
-    code = done.returncode if isinstance(done, subprocess.CompletedProcess) else done.exit_code
-    own = 2 if issubclass(error, InputError | ConfigurationError) else 1
+    ended = done.returncode if isinstance(done, subprocess.CompletedProcess) else done.exit_code
+    if isinstance(error, str):
+        codes, own = {error}, documented()[error][1]
+    else:
+        names = {one.__name__ for one in _with_subclasses(error)}
+        codes = {code} if code else {one for one, (name, _) in documented().items() if name in names}
+        own = 2 if issubclass(error, InputError | ConfigurationError) else 1
     lines = done.stderr.splitlines()
     place = next((number for number, line in enumerate(lines) if line.startswith("aira: ")), len(lines))
-    assert code == (own if exit_code is None else exit_code), (done.stdout, done.stderr)
+    assert ended == (own if exit_code is None else exit_code), (done.stdout, done.stderr)
     assert done.stdout == ""
     assert len(lines) - place in (1, 2), done.stderr
-    assert lines[place].rpartition(" ")[2] in {f"[{one.code}]" for one in _with_subclasses(error)}, lines[place]
+    assert lines[place].rpartition(" ")[2] in {f"[{one}]" for one in codes}, lines[place]
     for value in values:
         assert str(value) in lines[place], lines[place]
     return lines[place + 1].strip() if lines[place + 1 :] else ""
+
+
+@cache
+def documented() -> Mapping[str, tuple[str, int]]:
+    """The class and the exit code of each error, by its code, as docs/codes.md says."""
+    rows = re.findall(r"^\| `([\w-]+)` \| `(\w+)` \| (\d) \|", CODES.read_text(), re.MULTILINE)
+    return {code: (name, int(number)) for code, name, number in rows}
 
 
 def _with_subclasses(error: type[AiraError]) -> Iterator[type[AiraError]]:

@@ -15,7 +15,7 @@ import zenoh
 
 from mesh.content import session_address
 from schemas.cid import cid_of_digest
-from schemas.selectors import cid_selector
+from schemas.keys import cid_selector
 from schemas.unixfs import UnixfsBlock, blocks_of_stream, write_bytes, write_number
 from tests.support.waiting import until_found
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 from web3 import HTTPProvider
 
 from mesh.chain.answers import ANSWERS, decode_answer
-from mesh.chain.events import ChainEvent, Finalized, NewLiability, Transfer, decode_log
+from mesh.chain.following import ChainEvent, Finalized, NewLiability, Transfer, decode_log
 from schemas import ZERO_ADDRESS, Empty, cid_of_file
 from tests.support.compose import Project, log_text
 from tests.support.containers import BASE_IMAGE, FOUNDRY_IMAGE, EngineFailed

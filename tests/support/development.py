@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mesh.dev import EmbeddedChain, JsonRpcServer
 from mesh.settings import Settings
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
 
@@ -36,3 +39,22 @@ def settings_of(role: str, folder: Path, *, url: str, endpoint: str, **options: 
         keyfile_password_file=str(keys / "password"),
         **options,
     )
+
+
+class ServedChain(NamedTuple):
+    """An embedded chain, and the server in front of it."""
+
+    node: EmbeddedChain
+    server: JsonRpcServer
+
+    @property
+    def url(self) -> str:
+        """Where other processes reach it, e.g. `http://127.0.0.1:8545`."""
+        return self.server.url
+
+
+@asynccontextmanager
+async def serve_embedded(*, port: int = 0) -> AsyncIterator[ServedChain]:
+    """An embedded chain that other processes share over JSON-RPC; port 0 takes a free one."""
+    async with EmbeddedChain() as node, JsonRpcServer(node.provider, port=port) as server:
+        yield ServedChain(node, server)

@@ -15,7 +15,7 @@ from schemas import PresenceKey, ReportKey, Signer, ValidatorKey
 from schemas.verdicts import PolicyNote, ReportFinding, ValidatorAnnouncement, ValidatorReport
 
 if TYPE_CHECKING:
-    from mesh.agent import Contract
+    from mesh.agent.contracts import Contract
     from schemas import Liability
 
 COMPLETE = PolicyNote(name="complete", description="everything that was commanded was played and recorded")

@@ -7,8 +7,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Self, TypeVar
 
-from bridges.serial.dialect import BoardReady, CallStatus, Command, CommandFinished
-from bridges.serial.errors import InvalidBoardMessage
+from bridges.serial.dialect import BoardReady, CallStatus, Command, CommandFinished, CommandRefused
 from bridges.serial.line import PortName, SerialLine
 
 if TYPE_CHECKING:
@@ -60,8 +59,8 @@ class LineClient:
     def _submit(self, command: Command) -> None:
         try:
             self.dialect.submit(command, time.monotonic())
-        except InvalidBoardMessage as error:
-            self._arrived.put(CommandFinished(command, CallStatus.FAILED, reason="unfit", detail=str(error)))
+        except CommandRefused as error:
+            self._arrived.put(CommandFinished(command, CallStatus.FAILED, reason=error.reason, detail=str(error)))
 
     def call(self, topic: str, payload: bytes = b"") -> CommandFinished:
         """Submit a command and wait for its outcome."""

@@ -1,4 +1,4 @@
-"""The events in a captured log (`mesh.log_context.log_event`), for tests that assert names and fields."""
+"""The events in a captured log (`mesh.base.log_context.log_event`), for tests that assert names and fields."""
 
 from __future__ import annotations
 

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 import pytest
 
-from mesh.agent import Agent
-from mesh.background import Background
+from mesh.agent.agent import Agent
+from mesh.base.background import Background
+from mesh.base.retry import RetryPolicy
 from mesh.chain import Chain, Timing
-from mesh.devchain import EmbeddedChain
-from mesh.devchain.development import DevelopmentMarket, deploy_market
-from mesh.market.provider import Provider
+from mesh.dev import EmbeddedChain
+from mesh.dev.development import DevelopmentMarket, deploy_market
+from mesh.market.provider import Provider, ProviderOptions
 from mesh.network import Endpoints, Network
-from mesh.retry import RetryPolicy
 from mesh.settings import Settings
 from schemas import Offer, cid_of_bytes
 from tests.support.waiting import until_found
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
-    from mesh.agent import Contract, Phase
+    from mesh.agent.contracts import Contract
+    from mesh.agent.ledger import Phase
     from mesh.chain import Account
     from schemas import Demand, Verified
     from tests.support.routers import EmbeddedRouter
@@ -62,10 +63,14 @@ def founded() -> Iterator[Founded]:
 
 
 class Place:
-    """Where a test's agents meet. `async with Place(founded, endpoint, folder) as place`."""
+    """Where a test's agents meet. `async with Place(founded, endpoint, folder) as place`.
 
-    def __init__(self, founded: Founded, endpoint: str, folder: Path) -> None:
+    `node` is the address by which they reach the chain, if not directly.
+    """
+
+    def __init__(self, founded: Founded, endpoint: str, folder: Path, *, node: str = "") -> None:
         self.founded = founded
+        self._url = node
         self.node = founded.node
         self.market = founded.market
         self.endpoint = endpoint
@@ -88,7 +93,7 @@ class Place:
     def chain_of(self, account: Account, generation: Literal[3, 5]) -> Chain:
         """The chain for any account in a generation, not yet open."""
         return Chain(
-            self.node.provider,
+            self._url or self.node.provider,
             account=account,
             ens=self.market.deployment.ens,
             generation=generation,
@@ -133,7 +138,10 @@ class Place:
             asyncio.timeout(seconds),
             Network(Endpoints(connect=(self.endpoint,))) as network,
             Provider(
-                network.session, self.chains["provider"], self.market.deployment.lighthouse_name, **options
+                network.session,
+                self.chains["provider"],
+                self.market.deployment.lighthouse_name,
+                ProviderOptions(**options),
             ) as provider,
             Background() as tasks,
         ):

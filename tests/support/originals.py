@@ -16,7 +16,7 @@ import pytest
 from web3 import Web3
 
 from mesh.chain import XRT, Deployment, namehash
-from mesh.chain.events import lighthouse_created
+from mesh.chain.following import NewLighthouse, first_event
 from mesh.chain.transactions import TransactionSender
 from schemas import keccak256
 
@@ -78,7 +78,7 @@ class Originals:
         """The address of a new lighthouse."""
         name = "LiabilityFactory" if self.generation == 3 else "Factory"
         create = self.contract(name, factory).functions.createLighthouse(XRT, timeout_blocks, label)
-        return lighthouse_created((await self.send(by, create)).logs).lighthouse
+        return first_event((await self.send(by, create)).logs, NewLighthouse).lighthouse
 
     def contract(self, name: str, address: Any = None) -> Any:
         """A contract by the name of its artifact; without an address, to be created."""

@@ -48,10 +48,10 @@ def answers(port: int) -> bool:
 
 
 def hold_unreachable_ports() -> list[int]:
-    """Hold the ephemeral ports until this process ends whose connections on loopback get lost, and return them.
+    """Hold the ephemeral ports until this process ends that can't be reached on loopback, and return them.
 
-    A sandbox or a firewall may have one or two. A server that got one by chance would never be reached, and its test
-    would wait for minutes. Looking takes two seconds.
+    A sandbox or a firewall may lose or refuse the connections to one or two. A server that got one by chance would
+    never be reached, and its test would wait for minutes. Looking takes two seconds.
     """
     if not EPHEMERAL.exists():
         return []
@@ -71,9 +71,7 @@ def _is_reachable(port: int) -> bool:
     with socket.socket() as client:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
         client.settimeout(PATIENCE)
-        try:
-            client.connect(("127.0.0.1", port))
-        except TimeoutError:
+        if client.connect_ex(("127.0.0.1", port)):
             atexit.register(server.close)
             return False
     server.close()

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import zenoh
 
-from mesh.identity.routers import nested
 from mesh.network.endpoints import SEND_WAIT, Endpoints
+from mesh.ops.identity.routers import nested
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
 from tests.support.processes import Server

@@ -9,7 +9,7 @@ from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]
 if TYPE_CHECKING:
     from xdist.workermanage import WorkerController  # type: ignore[import-untyped]
 
-TOGETHER: Final = ("tests/web", "tests/bridges/ipfs", "tests/contracts")
+TOGETHER: Final = ("tests/web", "tests/bridges/ipfs", "tests/bridges/ros1", "tests/contracts")
 """Folders whose files share servers: one process runs all of them, and its servers end with the last file."""
 
 SECONDS: Final[dict[str, int]] = {
@@ -23,10 +23,11 @@ SECONDS: Final[dict[str, int]] = {
     "tests/mesh/cli/test_serving.py": 125,
     "tests/mesh/cli/test_killed_validator.py": 120,
     "tests/mesh/operations/test_killed_demand.py": 100,
-    "tests/mesh/demo/test_demo.py": 90,
+    "tests/bridges/ros1": 110,
+    "tests/mesh/dev/test_demo.py": 90,
     "tests/mesh/cli/test_demand_validator.py": 90,
     "tests/peers/test_install.py": 80,
-    "tests/bridges/serial/test_firmware.py": 75,
+    "tests/bridges/serial/test_firmware.py": 90,
     "tests/mesh/cli/test_restarts.py": 75,
     "tests/mesh/validator/test_tampered_on_chain.py": 70,
     "tests/mesh/operations/test_two_providers.py": 70,
@@ -39,11 +40,11 @@ SECONDS: Final[dict[str, int]] = {
     "tests/mesh/operations/test_unfit_at_the_start.py": 50,
     "tests/bridges/serial/test_unplugged.py": 50,
     "tests/mesh/content/test_names.py": 45,
-    "tests/mesh/demo/test_narration.py": 45,
+    "tests/mesh/dev/test_narration.py": 45,
     "tests/mesh/validator/test_policies.py": 40,
     "tests/bridges/foxglove/test_foxglove_front.py": 40,
     "tests/examples/test_own_policy.py": 40,
-    "tests/bridges/serial/test_detection.py": 40,
+    "tests/bridges/serial/test_dialect.py": 40,
     "tests/mesh/agent/test_spoiled_jobs.py": 35,
     "tests/mesh/validator/test_validator.py": 35,
     "tests/mesh/validator/test_juries.py": 35,

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from mesh.identity import Member, entry_of
-from mesh.identity.certificates import Holder
-from mesh.identity.folders import MemberFolder, SiteFolder
-from mesh.identity.routers import router_endpoints, zenohd_configuration
 from mesh.network import Endpoints, Tls
+from mesh.ops.identity import Member, entry_of
+from mesh.ops.identity.certificates import Holder, MemberFolder, SiteFolder
+from mesh.ops.identity.routers import router_endpoints, zenohd_configuration
 from mesh.settings import Settings
 from tests.support.peers import require
 from tests.support.ports import answers, free_port

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import errno
 import socket
 import sys
 from typing import TYPE_CHECKING
+
+import pytest
 
 from tests.support import ports
 from tests.support.commands import run
@@ -10,8 +13,6 @@ from tests.support.ports import answers, free_port, hold_unreachable_ports
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    import pytest
 
 OTHER = "from tests.support.ports import free_port, SHARE; print(*(free_port() for _ in range(SHARE)))"
 
@@ -52,12 +53,10 @@ def test_ports_that_can_be_reached_or_are_taken_are_not_held(monkeypatch: pytest
         assert answers(free)
 
 
-def test_a_port_that_can_t_be_reached_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    def lost(client: socket.socket, address: tuple[str, int]) -> None:
-        raise TimeoutError(f"{client} waits for {address}")
-
+@pytest.mark.parametrize("failure", [errno.EAGAIN, errno.ECONNREFUSED], ids=["lost", "refused"])
+def test_a_port_that_can_t_be_reached_is_held(failure: int, monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     with monkeypatch.context() as patched:
-        patched.setattr(socket.socket, "connect", lost)
+        patched.setattr(socket.socket, "connect_ex", lambda client, address: failure)
         assert not ports._is_reachable(port)
     assert not ports._is_free(port)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import DeploymentPlan, write_keyfile
-from mesh.devchain.development import deploy_market
+from mesh.dev.development import deploy_market
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.nodes import Anvil
 from tests.support.routers import Zenohd
@@ -129,6 +129,7 @@ def test_the_price_of_a_job_that_nobody_finishes_is_taken_back(fragile: Fragile,
             browser.find("#account")
             fill_in(browser, site, seconds=120)
             browser.click("#order:not([disabled])")
+            browser.click("#sign")
             browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
         else:
             order(browser, site, seconds=120)

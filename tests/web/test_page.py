@@ -100,13 +100,13 @@ NOBODYS_MODEL = "QmS9JArPwa55ePgDnyg6TzX24mYTS1b1vLqWNebyVotKxQ"
 def order_of_nobodys_model(browser: Browser, site: Site) -> None:
     """An order that stays open."""
     fill_in(browser, site)
-    objective = browser.find(".chosen-objective .name").get_attribute("title")
+    review(browser)
+    objective = browser.find("#in-words .name").get_attribute("title")
     browser.go(f"order/model/{NOBODYS_MODEL}")
     browser.click("#way-cid")
     browser.type("CID of the objective", objective or "")
-    browser.click("#take-cid")
     browser.find(".chosen-objective")
-    review(browser)
+    browser.click("#order:not([disabled])")
     browser.click("#sign")
 
 
@@ -135,8 +135,8 @@ def test_a_page_outlives_its_server(site: Site) -> None:
             browser.sees("Your order is in the market")
 
 
-def test_an_order_shows_in_the_market_of_another_tab(browser: Browser, site: Site) -> None:
-    with Browser(site.url) as other:
+def test_an_order_shows_in_the_market_of_another_tab(browser: Browser, site: Site, pictures: Path) -> None:
+    with Browser(site.url, size=PHONE) as other:
         other.go("market")
         other.sees("Live")
         browser.go()
@@ -146,6 +146,11 @@ def test_an_order_shows_in_the_market_of_another_tab(browser: Browser, site: Sit
         browser.click("#sign")
         browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
         other.until(lambda: other.all(".kind.demand") and other.all(".kind.offer"), "the demand and the offer")
+        other.sees("ready")
+        check(other, pictures / "market-with-an-order.png")
+        matched = other.find("tr:has(.kind.matched) a")
+        assert matched.text.startswith("0x")
+        assert matched.get_attribute("href") == browser.driver.current_url
         assert other.log() == []
 
 
@@ -169,7 +174,7 @@ def test_two_tabs_of_a_person_show_the_same_job(browser: Browser, site: Site) ->
 
 def test_an_order_needs_no_mouse(browser: Browser, site: Site) -> None:
     browser.go(f"order/model/{site.model}")
-    browser.find("#make")
+    browser.find(".form")
     browser.keys(Keys.TAB, Keys.ENTER)  # skip what all pages have
     assert browser.driver.execute_script("return document.activeElement.id") == "main"
     browser.tab_to("#connect")
@@ -177,9 +182,6 @@ def test_an_order_needs_no_mouse(browser: Browser, site: Site) -> None:
     browser.tab_to(".choice")
     browser.keys(Keys.ENTER)
     browser.find("#account")
-    browser.tab_to("#make")
-    browser.keys(Keys.ENTER)
-    browser.sees("Fits the model")
     browser.until(lambda: browser.all("#allow") or browser.all("#order:not([disabled])"), "a way to go on")
     if browser.all("#allow"):
         browser.tab_to("#allow")
@@ -187,6 +189,7 @@ def test_an_order_needs_no_mouse(browser: Browser, site: Site) -> None:
     browser.find("#order:not([disabled])")
     browser.tab_to("#order")
     browser.keys(Keys.ENTER)
+    browser.sees("Fits the model")
     browser.tab_to("#sign")
     browser.keys(Keys.ENTER)
     browser.sees("the robot was paid")
@@ -201,12 +204,13 @@ def test_the_local_account_orders_and_is_labelled(site: Site) -> None:
         fill_in(browser, site)
         browser.sees("It signs without asking again")
         browser.click("#order:not([disabled])")
+        browser.click("#sign")
         browser.sees("the robot was paid")
 
 
 def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_path: Path, pictures: Path) -> None:
     origin = f"http://127.0.0.1:{free_port()}"
-    with site.page("--model", site.model, "--cost", "2000000000", "--embed", origin) as url:
+    with site.page("--model", site.model, "--cost", "2", "--embed", origin) as url:
         (tmp_path / "index.html").write_text(f'<!doctype html><iframe src="{url}/" width="500" height="800"></iframe>')
         serve = (sys.executable, "-m", "http.server", "--bind", "127.0.0.1", "--directory", tmp_path)
         with (
@@ -220,7 +224,6 @@ def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_pa
             browser.picture(pictures / "robot-frame.png")
             assert browser.violations() == []
             browser.connect()
-            browser.click("#make")
             sign(browser)
             browser.sees("the robot was paid")
         other = f"http://localhost:{origin.rpartition(':')[2]}"

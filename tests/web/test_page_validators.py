@@ -28,9 +28,12 @@ def test_a_validator_says_how_it_judges_before_it_is_named(browser: Browser, sit
         browser.connect()
         fill_in(browser, site)
         browser.press("With a validator")
+        person = site.wallet()
+        person.give(person.address)  # orders may name accounts that have sent a transaction
         for named, fee, refusal in (
-            (market["lighthouse"]["address"], "", "is a lighthouse"),
-            (site.wallet().address, "", "nobody answers as this validator on the mesh"),
+            (market["lighthouse"]["address"], "", "it may be a lighthouse"),
+            (site.poor_wallet().address, "", "an account that has sent a transaction"),
+            (person.address, "", "nobody answers as this validator on the mesh"),
             (validator, "0.1", "the fee is 0.1 XRT, but the validator wants 0.25 XRT"),
         ):
             browser.type("Validator", named)

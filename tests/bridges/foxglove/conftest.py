@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.foxglove.front import FoxgloveFront
-from bridges.foxglove.options import FoxgloveOptions
-from bridges.foxglove.server import FoxgloveServer
-from mesh.flood import Drops
+from bridges.foxglove.server import FoxgloveFront, FoxgloveOptions, FoxgloveServer
+from mesh.base.flood import Drops
 from tests.support.market import founded, place
 
 if TYPE_CHECKING:
@@ -38,7 +36,7 @@ def serve(front: Callable[..., FoxgloveFront]) -> Callable[..., AbstractAsyncCon
     async def serving(known: Any = (), **options: Any) -> AsyncIterator[FoxgloveServer]:
         async with (
             front(**options) as open_front,
-            FoxgloveServer(open_front, "test", open_front.drops, known=known) as server,
+            FoxgloveServer(open_front, "test", known=known) as server,
         ):
             yield server
 

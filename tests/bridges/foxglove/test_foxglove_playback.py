@@ -11,9 +11,9 @@ from foxglove.websocket import PlaybackCommand, PlaybackStatus
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridges.foxglove.player import FASTEST, SLOWEST, PlaybackHead, RecordingPlayer
+from bridges.foxglove._player import FASTEST, SLOWEST, PlaybackHead, RecordingPlayer
 from bridges.foxglove.server import FoxgloveServer
-from mesh.background import Background
+from mesh.base.background import Background
 from mesh.recording import GENEROUS, open_objective
 from tests.bridges.foxglove.viewer import PAUSE, PLAY, Viewer, viewing
 from tests.support.objectives import timed
@@ -35,7 +35,7 @@ async def playing(front: Any, folder: Path, *messages: tuple[str, object, float]
     player = RecordingPlayer(open_objective(path, GENEROUS))
     async with (
         front() as view,
-        FoxgloveServer(view, "a recording", view.drops, control=player.control) as server,
+        FoxgloveServer(view, "a recording", control=player.control) as server,
         Background() as tasks,
     ):
         tasks.start(player.run(server), "playback")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from bridges.foxglove.server import CHANNELS, LARGEST, NEW_CHANNELS
-from mesh import foxglove
-from mesh.ros import RosTypes
+from mesh.recording import foxglove
+from mesh.recording.ros import RosTypes
 from schemas.payloads import JSON, RAW, Payload, PayloadType, encode_value
 from tests.bridges.foxglove.viewer import viewing
 from tests.support.waiting import until

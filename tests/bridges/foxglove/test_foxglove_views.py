@@ -6,22 +6,20 @@ import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
-from bridges.foxglove.jobs import show_job_until_end, show_recording
+from bridges.foxglove._player import show_job_until_end, show_recording
 from bridges.foxglove.server import FoxgloveServer
 from bridges.foxglove.sources import show_agent, show_market
 from bridges.web.components import opened
 from mesh import Job, String  # noqa: TC001  handlers are read at run time
-from mesh.agent.components import watching
-from mesh.background import Background
-from mesh.cli.errors import NoRecording
-from schemas.agent_keys import DeviceTopicKey, ReadingKey
-from schemas.definitions import with_definition
-from schemas.payloads import Payload, PayloadType
+from mesh.base.background import Background
+from mesh.errors import InputError
+from mesh.role.composition import watching
+from schemas.keys import DeviceTopicKey, ReadingKey
+from schemas.payloads import Payload, PayloadType, SentDefinitions
 from tests.bridges.foxglove.viewer import PLAY, viewing
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
+from tests.support.raising import raises_with
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
@@ -52,7 +50,7 @@ async def showing_market(place: Place, front: Any) -> AsyncIterator[str]:
         enter = stack.enter_async_context
         view = await enter(front())
         network, channel = await enter(watching(place.settings("viewer")))
-        server = await enter(FoxgloveServer(view, "market", view.drops))
+        server = await enter(FoxgloveServer(view, "market"))
         tasks = await enter(Background())
         tasks.start(show_market(server, network.session, channel), "market")
         yield view.url
@@ -84,10 +82,10 @@ async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, fron
         enter = stack.enter_async_context
         view = await enter(front())
         network, channel = await enter(watching(place.settings("viewer")))
-        server = await enter(FoxgloveServer(view, "agent", view.drops))
+        server = await enter(FoxgloveServer(view, "agent"))
         person = await enter(place.at_work(robot))
         tasks = await enter(Background())
-        shown = show_agent(server, network.session, robot.address, channel.lighthouse, drops=view.drops)
+        shown = show_agent(server, network.session, robot.address, channel.lighthouse)
         tasks.start(shown, "agent")
         viewer = await enter(viewing(view.url))
         (status, *_) = await viewer.until_seen("/aira/status")
@@ -100,7 +98,7 @@ async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, fron
         robot.parts.network.session.put(key, b'{"degrees": 3}', encoding="application/json")
         assert await viewer.until_seen("/device/arm/angle") == [{"degrees": 3}]
         key = str(DeviceTopicKey(robot.address, "arm", "/own"))
-        defined = with_definition(b"", OWN)
+        defined = SentDefinitions().attachment(b"", "", OWN, 0.0)
         robot.parts.network.session.put(key, b"\x05", encoding=OWN.zenoh_encoding, attachment=defined)
         assert [value.a for value in await viewer.until_seen("/device/arm/own")] == [5]
         contract = await person.demand(place.save(objective(("/blink", "on"))), model=MODEL, cost=COST)
@@ -131,7 +129,7 @@ async def test_a_job_is_seen_live_and_then_played_from_its_recording(place: Plac
         contract = await person.demand(held, model=MODEL, cost=COST)
         tasks = await enter(Background())
         tasks.start(show(parts, view, contract.address), "job")
-        await until(lambda: view.inner is not None)
+        await until(lambda: view.inner)
         live = view.inner
         async with viewing(view.url) as viewer:
             assert viewer.info["capabilities"] == []
@@ -139,7 +137,7 @@ async def test_a_job_is_seen_live_and_then_played_from_its_recording(place: Plac
             await until(lambda: any(message.data == "99" for message in viewer.values("/blinked")))
             assert (await viewer.until_seen("/aira/progress"))[0]["total"] == 100
         assert (await contract.outcome()).success
-        await until(lambda: view.inner not in (None, live), what="the playback")
+        await until(lambda: view.inner not in ("", live), what="the playback")
         async with viewing(view.url) as viewer:
             assert "playbackControl" in viewer.info["capabilities"]
             await viewer.control(PLAY, request="play", speed=10)
@@ -155,5 +153,5 @@ async def test_a_job_without_a_recording_is_told(place: Place, front: Any) -> No
             result, address = "", place.address("robot")
 
         ended: Any = Ended()
-        with pytest.raises(NoRecording):
+        with raises_with(InputError, code="no-recording"):
             await show_recording(parts, view, ended)

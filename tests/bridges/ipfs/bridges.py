@@ -7,10 +7,11 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from bridges.ipfs import ChannelBridge, Daemon, RelayJournal, RelayValidator
+from bridges.ipfs import BridgeParts, ChannelBridge, Daemon, RelayJournal, RelayValidator
 from bridges.ipfs.daemon import CALL_TIMEOUT
-from mesh.background import Background
-from mesh.network import Channel, Endpoints, Network, Pump
+from mesh.base.background import Background
+from mesh.base.flood import Drops
+from mesh.network import Channel, Endpoints, MarketRules, Network, Pump
 from schemas.status import BridgeStatus, bridge_status_key
 from tests.support.orders import LIGHTHOUSE
 from tests.support.waiting import until_found
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     import zenoh
 
     from mesh.market.withdrawals import Withdrawals
+    from schemas import Signer
 
 
 @asynccontextmanager
@@ -33,21 +35,23 @@ async def bridging(
     *,
     call_timeout: float = CALL_TIMEOUT,
     withdrawals: Withdrawals | None = None,
+    drops: Drops | None = None,
+    signer: Signer | None = None,
     **options: Any,
 ) -> AsyncIterator[ChannelBridge]:
     """A running bridge between the router at `endpoint` and the daemon at `api`."""
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         daemon = await stack.enter_async_context(Daemon(api, call_timeout=call_timeout))
-        relay_journal = stack.enter_context(RelayJournal(journal))
-        bridge = ChannelBridge(
-            network,
-            daemon,
-            RelayValidator(topic, address=lambda: LIGHTHOUSE, withdrawals=withdrawals),
-            relay_journal,
-            lighthouse=topic,
-            **options,
+        parts = BridgeParts(
+            network=network,
+            daemon=daemon,
+            validator=RelayValidator(MarketRules(topic, address=LIGHTHOUSE), withdrawals=withdrawals),
+            journal=stack.enter_context(RelayJournal(journal)),
+            drops=drops or Drops(),
+            signer=signer,
         )
+        bridge = ChannelBridge(parts, **options)
         await stack.enter_async_context(bridge)
         tasks = await stack.enter_async_context(Background())
         tasks.start(bridge.run(), "bridge of the test")

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from bridges.ipfs.addresses import base_url, without_credentials
+from bridges.ipfs.daemon import base_url, without_credentials
 from mesh.errors import ConfigurationError
 
 

@@ -6,9 +6,9 @@ import asyncio
 import signal
 from typing import TYPE_CHECKING
 
-from bridges.ipfs.validation import legacy_json
-from mesh.identity.roster import Member
+from bridges.ipfs._messages import legacy_json
 from mesh.network import Channel, Network
+from mesh.ops.identity.roster import Member
 from schemas import encode
 from tests.bridges.ipfs.bridges import on_mesh, status_of_the_bridge, until_seen
 from tests.bridges.ipfs.statuses import health

@@ -14,12 +14,11 @@ import pytest
 from aiohttp import web
 
 from bridges.ipfs import Daemon
-from bridges.ipfs.content import ContentBridge
+from bridges.ipfs._content import RAW, ContentBridge, ContentParts, ContentSources, Gateway
 from bridges.ipfs.daemon import ADD_OPTIONS
-from bridges.ipfs.transfers import RAW, ContentSource, ContentSources, Gateway
+from mesh.base.retry import RetryPolicy
 from mesh.content import ContentTooLarge, ContentUnavailable, Exchange, Store
 from mesh.network import Endpoints, Network
-from mesh.retry import RetryPolicy
 from schemas import CHUNK_SIZE, MAX_LINKS, blocks_of_stream, cid_of_bytes
 from tests.bridges.ipfs.legacy import LegacyClient
 from tests.support.content import chunked
@@ -65,15 +64,25 @@ class RunningBridge:
 
 @asynccontextmanager
 async def bridged(
-    endpoint: str, api: str, folder: Path, *more: ContentSource, **options: Any
+    endpoint: str, api: str, folder: Path, *more: Gateway, **options: Any
 ) -> AsyncIterator[RunningBridge]:
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         store = stack.enter_context(Store(folder))
         exchange = await stack.enter_async_context(Exchange(network.session, store))
         daemon = await stack.enter_async_context(Daemon(api))
-        settings = {"size_limit": 2**26, "timeout": 30.0} | options
-        bridge = ContentBridge(network.session, store, exchange, ContentSources(daemon, *more), daemon, **settings)
+        names = ("size_limit", "timeout", "providers", "drops")
+        given: dict[str, Any] = {"size_limit": 2**26, "timeout": 30.0}
+        given |= {name: options.pop(name) for name in names if name in options}
+        parts = ContentParts(
+            session=network.session,
+            store=store,
+            exchange=exchange,
+            sources=ContentSources(daemon, *more),
+            daemon=daemon,
+            **given,
+        )
+        bridge = ContentBridge(parts, **options)
         yield RunningBridge(await stack.enter_async_context(bridge), store, daemon)
 
 
@@ -155,7 +164,7 @@ async def test_a_file_of_the_mesh_is_added_under_its_cid_and_pinned_on_providers
 async def test_a_file_named_before_it_exists_is_added_later(
     swarm: Swarm, bob: LegacyClient, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.DEBUG, "bridges.ipfs.transfer_queue")
+    caplog.set_level(logging.DEBUG, "bridges.ipfs._content")
     content = content_of(1000, str(tmp_path))
     async with (
         agent(router.endpoint, tmp_path / "agent") as person,
@@ -167,7 +176,7 @@ async def test_a_file_named_before_it_exists_is_added_later(
             add_retry=RetryPolicy(initial=0.5, factor=1.0, attempts=40),
         ) as bridge,
     ):
-        bridge.content.schedule_add(cid_of_bytes(content))
+        bridge.content.adds.add(cid_of_bytes(content), "")
         await until(lambda: "transfer-retried" in events(caplog), seconds=SECONDS)
         cid = await asyncio.to_thread(person.store.put_bytes, content)
         await until(lambda: bridge.content.metrics().added == 1, seconds=SECONDS)
@@ -184,7 +193,7 @@ async def test_a_file_that_never_appears_counts_as_failed(router: EmbeddedRouter
         timeout=0.2,
         add_retry=RetryPolicy(initial=0.05, factor=1.0, attempts=4),
     ) as bridge:
-        bridge.content.schedule_add(cid_of_bytes(str(tmp_path).encode()))
+        bridge.content.adds.add(cid_of_bytes(str(tmp_path).encode()), "")
         await until(lambda: bridge.content.metrics().failed == 1, seconds=SECONDS)
         assert bridge.content.metrics().added == 0
 
@@ -201,7 +210,7 @@ async def test_a_file_chunked_otherwise_is_added_block_by_block(
         Gateway(address) as source,
         bridged(router.endpoint, swarm.a.api, tmp_path / "bridge") as bridge,
     ):
-        await ContentSources(source).fetch(bridge.store, cid, size_limit=2**20, timeout=SECONDS, block_timeout=10.0)
+        await ContentSources(source).fetch(bridge.store, cid, size_limit=2**20, timeout=SECONDS)
         await bridge.content.add(cid)
         counts = bridge.content.metrics()
         assert (counts.added, counts.by_blocks, counts.added_bytes) == (1, 1, len(content))
@@ -260,7 +269,7 @@ async def test_a_kubos_own_gateway_is_a_source(swarm: Swarm, bob: LegacyClient, 
     cid = (await bob.call("add", *ADD_OPTIONS, content=content))["Hash"]
     async with Gateway(swarm.b.gateway) as source:
         with Store(tmp_path / "store") as store:
-            path = await ContentSources(source).fetch(store, cid, size_limit=2**20, timeout=SECONDS, block_timeout=10.0)
+            path = await ContentSources(source).fetch(store, cid, size_limit=2**20, timeout=SECONDS)
             assert path.read_bytes() == content
 
 
@@ -270,7 +279,7 @@ async def test_a_corrupt_block_of_a_gateway_is_rejected(router: EmbeddedRouter, 
     async with gateway({cid: b"something else"}) as address, Gateway(address) as source:
         sources = ContentSources(source)
         with Store(tmp_path / "store") as store, pytest.raises(ContentUnavailable):
-            await sources.fetch(store, cid, size_limit=2**20, timeout=10.0, block_timeout=5.0)
+            await sources.fetch(store, cid, size_limit=2**20, timeout=10.0)
         assert sources.corrupt == {address: 1}
         with Store(tmp_path / "store") as store:
             assert not store.has(cid)
@@ -287,8 +296,6 @@ async def test_a_large_file_with_several_levels_of_links(router: EmbeddedRouter,
     content = content_of(CHUNK_SIZE * (MAX_LINKS + 1), str(tmp_path))
     async with gateway(blocks_of(tmp_path, content)) as address, Gateway(address) as source:
         with Store(tmp_path / "store") as store:
-            path = await ContentSources(source).fetch(
-                store, cid_of_bytes(content), size_limit=2**27, timeout=SECONDS, block_timeout=10.0
-            )
+            path = await ContentSources(source).fetch(store, cid_of_bytes(content), size_limit=2**27, timeout=SECONDS)
             assert path.stat().st_size == len(content)
             await asyncio.to_thread(store.verify, cid_of_bytes(content))

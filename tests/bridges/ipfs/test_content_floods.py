@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.ipfs.transfer_queue import URGENT
-from bridges.ipfs.transfers import Gateway
+from bridges.ipfs._content import URGENT, Gateway
+from mesh.base.flood import Drops
 from mesh.content import ContentUnavailable
-from mesh.flood import Drops
 from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
 from tests.bridges.ipfs.test_content import SECONDS, agent, blocks_of, bridged, content_of, gateway
 from tests.support.ports import free_port
@@ -36,12 +35,12 @@ async def test_demands_with_dead_cids_do_not_delay_a_result(
     ):
         for number in range(DEAD):
             dead = cid_of_bytes(f"{tmp_path} {number}".encode())
-            bridge.content.schedule_add(dead, f"fresh {number}")
-            bridge.content.schedule_fetch(dead, f"fresh {number}")
-            bridge.content.schedule_add(cid_of_bytes(dead.encode()), "one signer")
+            bridge.content.adds.add(dead, f"fresh {number}")
+            bridge.content.fetches.add(dead, f"fresh {number}")
+            bridge.content.adds.add(cid_of_bytes(dead.encode()), "one signer")
         cid = await asyncio.to_thread(robot.store.put_bytes, content)
 
-        bridge.content.schedule_add(cid, "robot", priority=URGENT)
+        bridge.content.adds.add(cid, "robot", priority=URGENT)
         await until(lambda: bridge.content.metrics().added == 1, what="the result on IPFS", seconds=SECONDS)
 
         counts = bridge.content.metrics()
@@ -60,7 +59,7 @@ async def test_a_file_that_many_demands_name_is_added_once(
     ):
         cid = await asyncio.to_thread(person.store.put_bytes, content_of(3 * CHUNK_SIZE, str(tmp_path)))
         for number in range(20):
-            bridge.content.schedule_add(cid, f"signer {number}")
+            bridge.content.adds.add(cid, f"signer {number}")
         await until(lambda: bridge.content.metrics().joined == 19, what="all of them", seconds=SECONDS)
         await until(lambda: bridge.content.metrics().added == 1, what="the file on IPFS", seconds=SECONDS)
         assert bridge.content.metrics().adds_queued == 0
@@ -86,5 +85,5 @@ async def test_leaves_of_a_fetched_file_are_no_files_of_their_own(router: Embedd
 
         content_bridge = bridge.content
         await until(lambda: not content_bridge._tasks and not content_bridge.metrics().fetches_queued, seconds=SECONDS)
-        await until(lambda: not content_bridge._prefetches._running, what="the end of all fetches", seconds=SECONDS)
+        await until(lambda: not content_bridge.fetches._running, what="the end of all fetches", seconds=SECONDS)
         assert not set(bridge.store.list()) - {cid}

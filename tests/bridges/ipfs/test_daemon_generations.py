@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 import aiohttp
 import pytest
 
-from bridges.ipfs import AccessDenied, Daemon, PublishedOutOfOrder, PubSubDisabled
-from bridges.ipfs.validation import legacy_json
+from bridges.ipfs import Daemon, IpfsError
+from bridges.ipfs._messages import legacy_json
 from schemas import encode
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
 from tests.bridges.ipfs.legacy import LegacyClient
 from tests.bridges.ipfs.replays import OldDaemon, RecentDaemon
 from tests.support.orders import demand, offer
+from tests.support.raising import raises_with
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -73,8 +74,9 @@ async def test_messages_pass_both_ways_in_the_old_dialect(
 async def test_an_old_daemon_without_pubsub(topic: str) -> None:
     async with OldDaemon(pubsub=False) as old, Daemon(old.api) as daemon:
         await daemon.detect_version()
-        with pytest.raises(PubSubDisabled) as refused:
+        with pytest.raises(IpfsError) as refused:
             await daemon.publish(topic, b"hello")
+        assert refused.value.code == "pubsub-disabled"
         assert "--enable-pubsub-experiment" in refused.value.hint
 
 
@@ -83,8 +85,9 @@ async def test_a_protected_old_daemon_requires_the_right_header() -> None:
         async with Daemon(old.api, authorization="Bearer right") as daemon:
             await daemon.detect_version()
         async with Daemon(old.api, authorization="Bearer wrong") as daemon:
-            with pytest.raises(AccessDenied) as denied:
+            with pytest.raises(IpfsError) as denied:
                 await daemon.detect_version()
+            assert denied.value.code == "access-denied"
             assert "wrong" not in str(denied.value)
 
 
@@ -179,9 +182,8 @@ async def test_a_message_published_out_of_order_is_published_again(
         await until(lambda: recent.numbered % 2, what="a number", seconds=SECONDS)
         await other.publish(topic, b"two")
         recent.validates.set()
-        with pytest.raises(PublishedOutOfOrder) as refused:
+        with raises_with(IpfsError, code="published-out-of-order"):
             await earlier
-        assert refused.value.status == 500
         async with (
             on_mesh(router.endpoint, topic) as mesh,
             LegacyClient(recent.api) as bob,
@@ -201,8 +203,9 @@ async def test_a_message_published_out_of_order_is_published_again(
 async def test_a_recent_daemon_without_pubsub(topic: str) -> None:
     async with RecentDaemon(pubsub=False) as recent, Daemon(recent.api) as daemon:
         await daemon.detect_version()
-        with pytest.raises(PubSubDisabled) as refused:
+        with pytest.raises(IpfsError) as refused:
             await daemon.publish(topic, b"hello")
+        assert refused.value.code == "pubsub-disabled"
         assert "Pubsub.Enabled true" in refused.value.hint
 
 
@@ -211,9 +214,10 @@ async def test_a_protected_recent_daemon_names_the_paths_it_must_allow() -> None
         async with Daemon(recent.api, authorization="Bearer right") as daemon:
             await daemon.detect_version()
         async with Daemon(recent.api, authorization="Bearer wrong") as daemon:
-            with pytest.raises(AccessDenied) as denied:
+            with pytest.raises(IpfsError) as denied:
                 await daemon.detect_version()
             assert "pubsub" in denied.value.hint
+            assert denied.value.code == "access-denied"
             assert "wrong" not in str(denied.value)
 
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from bridges.ipfs.check import checks
-from mesh.doctor import CheckStatus, DoctorContext
+from mesh.ops.doctor import CheckStatus, DoctorContext
 from mesh.settings import Settings
 from tests.bridges.ipfs.replays import RecentDaemon
-from tests.mesh.doctor.examining import Found, examined, made
+from tests.mesh.ops.doctor.examining import Found, examined, made
 from tests.support.ipfs import JsIpfs
 from tests.support.ports import free_port
 

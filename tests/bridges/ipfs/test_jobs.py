@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from bridges.ipfs.service import IpfsBridge
-from mesh.background import Background
-from mesh.devchain.development import ROLES
+from mesh.base.background import Background
+from mesh.dev.development import ROLES
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, Result, decode
 from tests.bridges.ipfs.legacy import LegacyTrader
@@ -23,8 +23,8 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-    from mesh.agent import Agent
-    from mesh.work.job import Job
+    from mesh.agent.agent import Agent
+    from mesh.agent.handlers import Job
     from schemas import Liability
     from tests.bridges.ipfs.conftest import Swarm
 

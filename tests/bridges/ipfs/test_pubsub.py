@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.ipfs.pubsub import DaemonVersion, MultibaseDialect, PlainDialect, PubsubMessage, dialect_of, lines_of
+from bridges.ipfs.daemon import DaemonVersion, MultibaseDialect, PubsubDialect, PubsubMessage, dialect_of, lines_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -53,29 +53,29 @@ def test_multibase_writes_topics_as_base64url_without_padding() -> None:
 
 
 def test_plain_writes_topics_and_data_as_they_are() -> None:
-    assert PlainDialect().topic("a.lighthouse") == "a.lighthouse"
-    assert PlainDialect().publication(b'{"tx":"\xc3\xa4"}') == ([("arg", '{"tx":"ä"}')], None)
+    assert PubsubDialect().topic("a.lighthouse") == "a.lighthouse"
+    assert PubsubDialect().publication(b'{"tx":"\xc3\xa4"}') == ([("arg", '{"tx":"ä"}')], None)
 
 
 def test_each_dialect_reads_its_own_lines() -> None:
     assert MultibaseDialect().message(
         b'{"from":"12D3","data":"uAP8gYmlu","seqno":"uAQ","topicIDs":["udA"]}'
     ) == PubsubMessage("12D3", b"\x00\xff bin")
-    assert PlainDialect().message(
+    assert PubsubDialect().message(
         b'{"from":"EiA=","data":"AP8gYmlu","seqno":"AQ==","topicIDs":["t"]}'
     ) == PubsubMessage("EiA=", b"\x00\xff bin")
 
 
-@pytest.mark.parametrize("dialect", [MultibaseDialect(), PlainDialect()])
-def test_a_line_without_data_is_neither_message_nor_error(dialect: MultibaseDialect | PlainDialect) -> None:
+@pytest.mark.parametrize("dialect", [MultibaseDialect(), PubsubDialect()])
+def test_a_line_without_data_is_neither_message_nor_error(dialect: PubsubDialect) -> None:
     assert dialect.message(b"{}") is None
 
 
-@pytest.mark.parametrize("dialect", [MultibaseDialect(), PlainDialect()])
+@pytest.mark.parametrize("dialect", [MultibaseDialect(), PubsubDialect()])
 @pytest.mark.parametrize(
     "line", [b"", b"[]", b"{", b'{"data":7}', b'{"data":"*"}', b'{"data":"u*"}', b'{"data":"\xff"}', b'{"data":"uA"}x']
 )
-def test_an_unreadable_line_is_an_error(dialect: MultibaseDialect | PlainDialect, line: bytes) -> None:
+def test_an_unreadable_line_is_an_error(dialect: PubsubDialect, line: bytes) -> None:
     with pytest.raises(ValueError, match="not"):
         dialect.message(line)
 

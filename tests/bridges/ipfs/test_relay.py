@@ -7,25 +7,28 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ipfs.journal import (
+from bridges.ipfs._messages import RelayMessage
+from bridges.ipfs._relay import (
     DEDUPLICATION_LIMIT,
     DEDUPLICATION_WINDOW,
-    RelayedMessages,
+    MessageRelay,
     RelayJournal,
     SeenMessages,
     Side,
+    rank_for,
+    rank_of,
 )
-from bridges.ipfs.publish_queue import TAKEOVER_AFTER, QueuedMessage, Rank, active_bridge, rank_of
-from bridges.ipfs.relay import MessageRelay, RelayOutcome
-from bridges.ipfs.validation import RelayMessage
 from schemas import PresenceKey
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from bridges.ipfs._relay import Rank
+
 ONE, TWO = f"0x{'1' * 40}", f"0x{'2' * 40}"
-SENIOR, JUNIOR = Rank(False, 1, ONE), Rank(False, 2, TWO)
+SENIOR, JUNIOR = rank_for(isolated=False, since_ns=1, bridge=ONE), rank_for(isolated=False, since_ns=2, bridge=TWO)
+ISOLATED = rank_for(isolated=True, since_ns=1, bridge=ONE)
 LIGHTHOUSE = "airalab.lighthouse.3.robonomics.eth"
 _numbers = count()
 
@@ -38,7 +41,7 @@ class Time:
 
 
 def waiting(journal: RelayJournal) -> set[bytes]:
-    return {queued.message.fingerprint for _, queued in journal.waiting()}
+    return {message.fingerprint for _, message in journal.waiting()}
 
 
 def relayed(journal: RelayJournal) -> list[bytes]:
@@ -58,9 +61,8 @@ def journal(tmp_path: Path) -> Iterator[RelayJournal]:
 
 def bridge(time: Time, journal: RelayJournal, own: Rank | None = None, *others: Rank, **options: Any) -> MessageRelay:
     relay = MessageRelay(time, journal, **options)
-    for other in others:
-        relay.bridge_joined(other)
-    relay.set_rank(own)
+    relay.own = own
+    relay.others.update(others)
     return relay
 
 
@@ -71,7 +73,7 @@ def message() -> RelayMessage:
 def send_all(relay: MessageRelay, side: Side, *, heard: bool = True) -> list[bytes]:
     """Send everything that this bridge should send."""
     sent = []
-    while (queued := relay.queues[side].next()) is not None:
+    while (queued := relay.next(side)) is not None:
         relay.sent(queued, side, heard=heard)
         sent.append(queued.message.fingerprint)
     return sent
@@ -80,12 +82,12 @@ def send_all(relay: MessageRelay, side: Side, *, heard: bool = True) -> list[byt
 @pytest.mark.parametrize("side", Side)
 def test_a_message_is_relayed_once_and_its_echo_is_not_sent_back(time: Time, journal: RelayJournal, side: Side) -> None:
     relay, one = bridge(time, journal, SENIOR), message()
-    assert relay.receive(one, side) is RelayOutcome.ACCEPTED
-    assert relay.receive(one, side) is RelayOutcome.KNOWN
+    assert relay.receive(one, side)
+    assert not relay.receive(one, side)
     assert waiting(journal) == {one.fingerprint}
     assert send_all(relay, side.other) == [one.fingerprint]
-    assert relay.receive(one, side.other) is RelayOutcome.KNOWN
-    assert relay.receive(one, side) is RelayOutcome.KNOWN
+    assert not relay.receive(one, side.other)
+    assert not relay.receive(one, side)
     assert (waiting(journal), relayed(journal)) == (set(), [one.fingerprint])
     assert send_all(relay, side) == send_all(relay, side.other) == []
 
@@ -93,8 +95,8 @@ def test_a_message_is_relayed_once_and_its_echo_is_not_sent_back(time: Time, jou
 def test_an_echo_before_the_daemons_answer_does_not_send_it_again(time: Time, journal: RelayJournal) -> None:
     relay, one = bridge(time, journal, SENIOR), message()
     relay.receive(one, Side.MESH)
-    assert relay.queues[Side.IPFS].next() is not None
-    assert relay.receive(one, Side.IPFS, echo=True) is RelayOutcome.KNOWN
+    assert relay.next(Side.IPFS) is not None
+    assert not relay.receive(one, Side.IPFS, echo=True)
     assert send_all(relay, Side.IPFS) == []
     assert relay.status(Side.IPFS, per_second=0).left == 0, "no other bridge sent it"
 
@@ -105,16 +107,16 @@ def test_a_message_that_its_sender_repeats_is_relayed_again_and_its_echo_is_not(
 ) -> None:
     relay, one = bridge(time, journal, SENIOR if by_this_bridge else JUNIOR), message()
     if not by_this_bridge:
-        relay.bridge_joined(SENIOR)
+        relay.others.add(SENIOR)
     relayed_at = []
     for _ in range(1500):
         relay.receive(one, Side.MESH)
-        if relay.queues[Side.IPFS].left:
+        if relay.status(Side.IPFS, per_second=0).left_waiting:
             relay.receive(one, Side.IPFS)
             relayed_at.append(time.now)
         elif send_all(relay, Side.IPFS):
             relayed_at.append(time.now)
-        assert relay.receive(one, Side.IPFS) is RelayOutcome.KNOWN
+        assert not relay.receive(one, Side.IPFS)
         assert waiting(journal) == set()
         time.now += 1
     assert relayed_at == [1000, 1060, 1180, 1420, 1900]
@@ -125,13 +127,13 @@ def test_a_message_whose_sender_repeats_it_is_relayed_again_after_the_window(tim
     relay.receive(one, Side.IPFS)
     relay.receive(one, Side.MESH)  # known on both sides without having been relayed
     time.now += DEDUPLICATION_WINDOW - 1
-    assert relay.receive(one, Side.MESH) is RelayOutcome.KNOWN
+    assert not relay.receive(one, Side.MESH)
     time.now += 2
-    assert relay.receive(one, Side.MESH) is RelayOutcome.ACCEPTED
+    assert relay.receive(one, Side.MESH)
 
 
 def test_unheard_messages_survive_a_restart(time: Time, journal: RelayJournal) -> None:
-    relay, one, two, three = bridge(time, journal, Rank(True, 1, ONE), limit=2), message(), message(), message()
+    relay, one, two, three = bridge(time, journal, ISOLATED, limit=2), message(), message(), message()
     for each in (one, two, three):
         relay.receive(each, Side.MESH)
         send_all(relay, Side.IPFS, heard=False)
@@ -146,10 +148,10 @@ def test_unheard_messages_survive_a_restart(time: Time, journal: RelayJournal) -
 
 def test_messages_of_another_bridge_are_not_sent_back(time: Time, journal: RelayJournal) -> None:
     relay, one = bridge(time, journal, SENIOR), message()
-    assert relay.receive(one, Side.MESH, by_bridge=True) is RelayOutcome.KNOWN
+    assert not relay.receive(one, Side.MESH, by_bridge=True)
     assert send_all(relay, Side.IPFS) == []
     # The same message from its own sender is relayed.
-    assert relay.receive(one, Side.MESH) is RelayOutcome.ACCEPTED
+    assert relay.receive(one, Side.MESH)
 
 
 def test_the_longest_running_bridge_is_active_and_the_other_sees_messages_arrive(
@@ -162,7 +164,7 @@ def test_the_longest_running_bridge_is_active_and_the_other_sees_messages_arrive
     assert send_all(second, Side.IPFS) == []
     assert send_all(first, Side.IPFS) == [one.fingerprint]
     second.receive(one, Side.IPFS)
-    second.bridge_left(SENIOR)
+    second.others.discard(SENIOR)
     assert send_all(second, Side.IPFS) == []
     assert second.status(Side.IPFS, per_second=0).left == 1
 
@@ -170,73 +172,69 @@ def test_the_longest_running_bridge_is_active_and_the_other_sees_messages_arrive
 def test_messages_left_to_a_bridge_that_stops_are_sent_by_the_next(time: Time, journal: RelayJournal) -> None:
     relay, one = bridge(time, journal, JUNIOR, SENIOR), message()
     relay.receive(one, Side.MESH)
-    relay.bridge_left(SENIOR)
+    relay.others.discard(SENIOR)
     assert send_all(relay, Side.IPFS) == [one.fingerprint]
 
 
-def test_overdue_messages_are_taken_back(time: Time, journal: RelayJournal) -> None:
-    relay, one, two, late = bridge(time, journal, JUNIOR, SENIOR), message(), message(), message()
+def test_what_the_active_bridge_has_not_sent_for_long_is_given_up(time: Time, journal: RelayJournal) -> None:
+    relay, one, two = bridge(time, journal, JUNIOR, SENIOR), message(), message()
     relay.receive(one, Side.MESH)
+    time.now += DEDUPLICATION_WINDOW - 1
     relay.receive(two, Side.MESH)
-    time.now += TAKEOVER_AFTER - 1
-    relay.receive(two, Side.IPFS)  # the other bridge is sending
+    relay.expire()
+    assert relay.status(Side.IPFS, per_second=0).left_waiting == 2
     time.now += 2
-    assert relay.take_overdue() == 0
-    time.now += TAKEOVER_AFTER - 3
-    relay.receive(late, Side.MESH)
-    time.now += 2
-    assert relay.take_overdue() == 1
-    assert send_all(relay, Side.IPFS) == [one.fingerprint]
+    relay.expire()
+    assert waiting(journal) == {two.fingerprint}
+    relay.others.discard(SENIOR)
+    assert send_all(relay, Side.IPFS) == [two.fingerprint]
 
 
-def test_a_bridge_without_its_daemon_hands_over_what_the_other_holds_too(time: Time, journal: RelayJournal) -> None:
-    relay = bridge(time, journal, SENIOR)
-    alone, shared = message(), message()
-    relay.receive(alone, Side.MESH)
-    relay.bridge_joined(JUNIOR)
-    relay.receive(shared, Side.MESH)
-    relay.set_rank(None)
-    relay.set_rank(Rank(False, 3, ONE))
-    assert send_all(relay, Side.IPFS) == [alone.fingerprint]
+def test_a_bridge_without_its_daemon_holds_what_waits_until_another_has_sent_it(
+    time: Time, journal: RelayJournal
+) -> None:
+    relay, one = bridge(time, journal, SENIOR), message()
+    relay.receive(one, Side.MESH)
+    relay.others.add(JUNIOR)
+    relay.own = None
+    assert not relay.is_active
+    assert send_all(relay, Side.IPFS) == []
+    relay.own = rank_for(isolated=False, since_ns=3, bridge=ONE)
+    assert not relay.is_active
+    relay.receive(one, Side.IPFS)
     assert waiting(journal) == set()
 
 
 def test_a_bridge_without_peers_ranks_behind_one_with_peers(time: Time, journal: RelayJournal) -> None:
-    isolated, connected = Rank(True, 1, ONE), Rank(False, 2, TWO)
-    assert active_bridge(isolated, [connected]) == connected
-    assert active_bridge(connected, [isolated]) is None
-    assert active_bridge(None, [isolated]) == isolated
-    assert active_bridge(None, []) is None
+    isolated, connected = ISOLATED, JUNIOR
+    assert not bridge(time, journal, isolated, connected).is_active
+    assert bridge(time, journal, connected, isolated).is_active
+    assert not bridge(time, journal, None, isolated).is_active
+    assert bridge(time, journal, isolated).is_active
     relay, one = bridge(time, journal, isolated, connected), message()
     relay.receive(one, Side.MESH)
-    time.now += 2 * TAKEOVER_AFTER
-    assert relay.take_overdue() == 0  # it can't see whether it arrived
     assert send_all(relay, Side.IPFS) == []
 
 
 def test_unheard_messages_are_sent_again_first_unless_another_node_sent_them(time: Time, journal: RelayJournal) -> None:
-    relay, one, two, three = bridge(time, journal, Rank(True, 1, ONE)), message(), message(), message()
+    relay, one, two, three = bridge(time, journal, ISOLATED), message(), message(), message()
     for each in (one, two):
         relay.receive(each, Side.MESH)
     send_all(relay, Side.IPFS, heard=False)
     relay.receive(one, Side.IPFS, echo=True)  # echo of our own daemon
     relay.receive(two, Side.IPFS)  # from another node
     relay.receive(three, Side.MESH)
-    assert relay.queues[Side.IPFS].unheard == 1
-    assert relay.queues[Side.IPFS].requeue_unheard() == 1
+    assert relay.status(Side.IPFS, per_second=0).unheard == 1
+    relay.requeue_unheard()
     assert send_all(relay, Side.IPFS) == [one.fingerprint, three.fingerprint]
 
 
 def test_a_full_queue_rejects_messages_and_loses_none(time: Time, journal: RelayJournal) -> None:
     relay, messages = bridge(time, journal, SENIOR, limit=2), [message() for _ in range(3)]
-    assert [relay.receive(one, Side.MESH) for one in messages] == [
-        RelayOutcome.ACCEPTED,
-        RelayOutcome.ACCEPTED,
-        RelayOutcome.QUEUE_FULL,
-    ]
+    assert [relay.receive(one, Side.MESH) for one in messages] == [True, True, False]
     assert relay.status(Side.IPFS, per_second=0).dropped == {"no-room": 1}
     assert send_all(relay, Side.IPFS) == [one.fingerprint for one in messages[:2]]
-    assert relay.receive(messages[2], Side.MESH) is RelayOutcome.ACCEPTED
+    assert relay.receive(messages[2], Side.MESH)
 
 
 def test_a_flood_of_orders_delays_no_result_and_takes_no_room_from_it(time: Time, journal: RelayJournal) -> None:
@@ -244,8 +242,8 @@ def test_a_flood_of_orders_delays_no_result_and_takes_no_room_from_it(time: Time
     results = [message()._replace(key="aira/market/result") for _ in range(2)]
     for order in orders:
         relay.receive(order, Side.MESH)
-    outcomes = [relay.receive(result, Side.MESH) for result in results]
-    assert set(outcomes) == {RelayOutcome.ACCEPTED}
+    for result in results:
+        assert relay.receive(result, Side.MESH)
     first, second = (result.fingerprint for result in results)
     queued = [order.fingerprint for order in orders[:4]]
     assert send_all(relay, Side.IPFS) == [first, queued[0], second, *queued[1:]]
@@ -254,21 +252,21 @@ def test_a_flood_of_orders_delays_no_result_and_takes_no_room_from_it(time: Time
 def test_a_refused_message_is_dropped_and_counted(time: Time, journal: RelayJournal) -> None:
     relay, one = bridge(time, journal, SENIOR), message()
     relay.receive(one, Side.MESH)
-    queued = relay.queues[Side.IPFS].next()
+    queued = relay.next(Side.IPFS)
     assert queued is not None
     relay.refused(queued, Side.IPFS)
     assert relay.status(Side.IPFS, per_second=0).dropped == {"refused": 1}
     assert waiting(journal) == set()
 
 
-def test_restored_messages_are_left_to_a_bridge_that_held_them_too(time: Time, journal: RelayJournal) -> None:
+def test_a_restored_bridge_holds_what_waited_while_another_is_active(time: Time, journal: RelayJournal) -> None:
+    one = message()
+    journal.add_waiting(Side.IPFS, one)
     relay = bridge(time, journal, JUNIOR, SENIOR)
-    journal.add_waiting(Side.IPFS, QueuedMessage(message(), True, None, 0.0))
-    journal.add_waiting(Side.IPFS, QueuedMessage(own := message(), False, None, 0.0))
     relay.restore()
-    assert waiting(journal) == {own.fingerprint}
-    relay.bridge_left(SENIOR)
-    assert send_all(relay, Side.IPFS) == [own.fingerprint]
+    assert send_all(relay, Side.IPFS) == []
+    relay.others.discard(SENIOR)
+    assert send_all(relay, Side.IPFS) == [one.fingerprint]
 
 
 def test_the_deduplication_memory_is_bounded(time: Time) -> None:
@@ -277,17 +275,17 @@ def test_the_deduplication_memory_is_bounded(time: Time) -> None:
         seen.add(number.to_bytes(16, "big"), Side.MESH)
     assert len(seen) == DEDUPLICATION_LIMIT
     assert not seen.contains((0).to_bytes(16, "big"), Side.MESH)
-    relayed = RelayedMessages(time)
+    relayed = SeenMessages(time)
     for number in range(DEDUPLICATION_LIMIT + 1):
-        relayed.add(number.to_bytes(16, "big"))
+        relayed.add_relayed(number.to_bytes(16, "big"), Side.MESH)
     assert len(relayed) == DEDUPLICATION_LIMIT
 
 
-@pytest.mark.parametrize("rank", [SENIOR, Rank(True, 2**63, TWO)])
+@pytest.mark.parametrize("rank", [SENIOR, ISOLATED])
 def test_a_rank_is_read_as_it_was_announced(rank: Rank) -> None:
-    assert rank_of(PresenceKey(LIGHTHOUSE, rank.role, rank.bridge)) == rank
+    assert rank_of(PresenceKey(LIGHTHOUSE, *rank)) == rank
 
 
-@pytest.mark.parametrize("role", ["bridge", "provider", "bridge-turn-2-0000000000000001", "bridge-turn-0-1"])
+@pytest.mark.parametrize("role", ["bridge", "provider"])
 def test_other_tokens_are_not_ranks(role: str) -> None:
     assert rank_of(PresenceKey(LIGHTHOUSE, role, ONE)) is None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bridges.ipfs.service import IpfsBridge
-from mesh.background import Background
+from mesh.base.background import Background
 from mesh.errors import ConfigurationError
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings, load

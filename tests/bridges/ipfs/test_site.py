@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bridges.ipfs import ChannelBridge, Daemon, RelayJournal, RelayValidator
-from bridges.ipfs.validation import legacy_json
-from mesh.background import Background
-from mesh.identity.roster import Member
-from mesh.network import Channel, Network
+from bridges.ipfs import BridgeParts, ChannelBridge, Daemon, RelayJournal, RelayValidator
+from bridges.ipfs._messages import legacy_json
+from mesh.base.background import Background
+from mesh.network import Channel, MarketRules, Network
+from mesh.ops.identity.roster import Member
 from schemas import Offer, verify_message
 from tests.bridges.ipfs.replays import OldDaemon
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, demand, offer
@@ -36,11 +36,12 @@ async def test_a_bridge_relays_both_ways_on_a_locked_site(tmp_path: Path) -> Non
                 channel.subscribe(Offer) as offers,
                 Daemon(here.api) as daemon,
                 ChannelBridge(
-                    network,
-                    daemon,
-                    RelayValidator(MARKET, address=lambda: LIGHTHOUSE),
-                    journal,
-                    lighthouse=MARKET,
+                    BridgeParts(
+                        network=network,
+                        daemon=daemon,
+                        validator=RelayValidator(MarketRules(MARKET, address=LIGHTHOUSE)),
+                        journal=journal,
+                    ),
                     address=BRIDGE,
                 ) as bridge,
                 Background() as tasks,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from bridges.ipfs.transfer_queue import PER_SIGNER, TOTAL, URGENT, WORKERS, TransferQueue
+from bridges.ipfs._content import PER_SIGNER, TOTAL, URGENT, WORKERS, TransferQueue
+from mesh.base.flood import Drops
+from mesh.base.retry import RetryPolicy
 from mesh.content import ContentUnavailable
-from mesh.flood import Drops
-from mesh.retry import RetryPolicy
 from tests.support.clocks import SECOND, SetClock
 from tests.support.waiting import until
 

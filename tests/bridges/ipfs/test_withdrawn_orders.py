@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.ipfs.validation import legacy_json
+from bridges.ipfs._messages import legacy_json
 from mesh.market import OrderBook
-from mesh.market.services import OrderBookService
+from mesh.market._services import OrderBookService
+from mesh.market.store import MarketStore
 from mesh.market.withdrawals import Withdrawals
 from schemas import encode, verify_message
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
@@ -95,10 +96,10 @@ async def test_a_bridge_keeps_withdrawals_across_restarts(
 ) -> None:
     nowhere, path = f"http://127.0.0.1:{free_port()}", tmp_path / "withdrawals"
     withdrawal = verify_message(orders.withdrawal(demand()))
-    with Withdrawals(path) as known:
+    with Withdrawals(MarketStore(path)) as known:
         async with bridging(router.endpoint, nowhere, topic, tmp_path / "journal", withdrawals=known) as bridge:
             await until_seen(mesh, bridge.address)
             mesh.channel.publish(withdrawal.message)
             await until(lambda: withdrawal in set(bridge.withdrawals), seconds=SECONDS)
-    with Withdrawals(path) as known:
+    with Withdrawals(MarketStore(path)) as known:
         assert set(known) == {withdrawal}

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.ros import RosTypes
+    from mesh.recording.ros import RosTypes
     from tests.support.routers import EmbeddedRouter
 
 DOMAINS: Final = itertools.count(1)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from bridges.ros2.definitions import add_definitions
-from mesh.ros import RosTypes
+from bridges.ros2._services import add_definitions
+from mesh.recording.ros import RosTypes
 
 ADD_TWO_INTS: Final = "example_interfaces/srv/AddTwoInts"
 FIBONACCI: Final = "action_tutorials_interfaces/action/Fibonacci"

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ros2 import RosGoalFailed, RosUnavailable
+from bridges.ros2 import RosError, RosGoalFailed
 from tests.bridges.ros2.definitions import FIBONACCI, ros_types
 from tests.bridges.ros2.peers import hiroz
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -136,5 +137,5 @@ async def test_goals_of_several_peers_are_kept_apart(router: EmbeddedRouter, our
 
 async def test_an_action_that_nothing_serves_is_unavailable(our_robot: OurRobot) -> None:
     async with our_robot() as robot:
-        with pytest.raises(RosUnavailable):
+        with raises_with(RosError, code="ros-unavailable"):
             await robot.action("/fibonacci", FIBONACCI, {"order": 1}, timeout=0.2)

@@ -8,33 +8,34 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 import pytest_asyncio
+import zenoh
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from bridges.devices import said_by
 from bridges.ros2 import Robot, RosAllowed
-from bridges.ros2.bridge import RosBridge
-from bridges.ros2.process import RosNothingAllowed, RosRouterShared, check_apart
+from bridges.ros2._bridge import RosBridge, check_apart
 from mesh import RosTypes
-from mesh.background import Background
+from mesh.base.background import Background
+from mesh.errors import ConfigurationError, InputError
 from mesh.network import Endpoints, Network
 from mesh.recording import Played, open_objective, pack
 from schemas import payloads
-from schemas.definitions import defined_by
-from schemas.selectors import topic_selector
+from schemas.keys import topic_selector
+from schemas.payloads import defined_by
+from schemas.status import ALIVE
 from tests.support.commands import AIRA, Serving, aira, refused
 from tests.support.market import founded, offering, place
+from tests.support.raising import raises_with
 from tests.support.routers import EmbeddedRouter
-from tests.support.waiting import until
+from tests.support.waiting import until, until_answered, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    import zenoh
-
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
     from tests.support.market import Place
 
 __all__ = ["founded", "place"]
@@ -124,7 +125,7 @@ async def test_in_a_job_they_are_those_of_the_job(mesh: zenoh.Session, field: Em
         publisher = rover.advertise("/odom", "geometry_msgs/Twist")
         await until(lambda: publisher.is_heard, what="the bridge")
         mesh.put(f"aira/agent/{AGENT}/liability/{JOB}/ready", b"{}")
-        await until(lambda: bridge.current_job == JOB, what="the job")
+        await until(lambda: bridge.jobs.current == JOB, what="the job")
         publisher.put(twist(1))
         await until(lambda: heard.on(f"aira/agent/{AGENT}/liability/{JOB}/topic/odom"), what="the message")
         assert not heard.on(f"aira/agent/{AGENT}/device/robot/odom")
@@ -140,11 +141,11 @@ async def test_the_presence_of_the_robot_is_known_and_recorded(mesh: zenoh.Sessi
     ):
         tasks.start(bridge.run(), "bridge of the test")
         mesh.put(f"aira/agent/{AGENT}/liability/{JOB}/ready", b"{}")
-        await until(lambda: bridge.current_job == JOB, what="the job")
-        assert not bridge.is_present
+        await until(lambda: bridge.jobs.current == JOB, what="the job")
+        assert bridge.parts()["robot"] != ALIVE
         async with Robot(there, types(), node="rover"):
-            await until(lambda: bridge.is_present, what="the robot")
-        await until(lambda: not bridge.is_present, what="its end")
+            await until(lambda: bridge.parts()["robot"] == ALIVE, what="the robot")
+        await until(lambda: bridge.parts()["robot"] != ALIVE, what="its end")
     said = heard.on(f"aira/agent/{AGENT}/liability/{JOB}/topic/aira/device/robot")
     decoded: list[Any] = [types().decode("std_msgs/String", sample.payload.to_bytes()) for sample in said]
     assert [message.data for message in decoded] == ["present", "absent"]
@@ -165,6 +166,24 @@ async def test_what_the_mesh_says_is_published_to_the_robot(
             await asyncio.wait([first], timeout=0.1)
         assert (await first).payload == twist(0.25)
         assert bridge.published >= 1
+
+
+async def test_a_query_is_answered_when_all_commands_before_it_are_published(
+    mesh: zenoh.Session, field: EmbeddedRouter
+) -> None:
+    keys = ["device/robot/cmd_vel", f"liability/{JOB}/topic/cmd_vel", f"liability/{JOB}/objective/cmd_vel"]
+    idle = f"aira/agent/{AGENT}/device/robot/aira/idle"
+    async with bridged(mesh, field) as (bridge, _):
+        for key in keys:
+            await until_heard(mesh, f"aira/agent/{AGENT}/{key}")
+        await until_answered(mesh, idle)
+        command, encoding, block = twist(1).data, twist(1).type.zenoh_encoding, zenoh.CongestionControl.BLOCK
+        for times in range(1, 4):
+            for key in 200 * keys:
+                mesh.put(f"aira/agent/{AGENT}/{key}", command, encoding=encoding, congestion_control=block)
+            replies = await asyncio.to_thread(lambda: list(mesh.get(idle, timeout=60)))
+            assert [reply.ok is not None for reply in replies] == [True]
+            assert bridge.published == times * 200 * len(keys)
 
 
 async def test_nothing_is_carried_that_is_not_allowed(mesh: zenoh.Session, field: EmbeddedRouter) -> None:
@@ -207,14 +226,19 @@ async def test_a_malformed_command_is_counted_and_never_reaches_the_robot(
 
 async def test_two_sessions_on_one_router_are_refused(mesh: zenoh.Session, router: EmbeddedRouter) -> None:
     async with session_on(router) as other:
-        with pytest.raises(RosRouterShared):
+        with raises_with(ConfigurationError, code="ros-router-shared"):
             check_apart(mesh, other)
 
 
 def test_the_command_needs_something_allowed_and_another_router() -> None:
     words = ("bridge", "ros2", "--agent", AGENT, "--connect", "tcp/127.0.0.1:1", "--ros2-connect")
-    refused(aira(*words, "tcp/127.0.0.1:2"), RosNothingAllowed, "no topic")
-    refused(aira(*words, "tcp/127.0.0.1:1", "--publish", "/cmd_vel"), RosRouterShared, "127.0.0.1:1")
+    refused(aira(*words, "tcp/127.0.0.1:2"), InputError, "no topic", code="ros-nothing-allowed")
+    refused(
+        aira(*words, "tcp/127.0.0.1:1", "--publish", "/cmd_vel"),
+        ConfigurationError,
+        "127.0.0.1:1",
+        code="ros-router-shared",
+    )
 
 
 async def test_a_paid_job_drives_the_robot_and_others_open_its_recording(

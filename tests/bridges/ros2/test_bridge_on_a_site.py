@@ -7,12 +7,12 @@ from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING
 
 from bridges.ros2 import Robot, RosAllowed
-from bridges.ros2.bridge import RosBridge
+from bridges.ros2._bridge import RosBridge
 from mesh import RosTypes
-from mesh.background import Background
-from mesh.identity.roster import Member
+from mesh.base.background import Background
 from mesh.network import Endpoints, Network
-from schemas.agent_keys import DeviceTopicKey, EventKey, LiabilityTopicKey, ObjectiveTopicKey
+from mesh.ops.identity.roster import Member
+from schemas.keys import DeviceTopicKey, EventKey, LiabilityTopicKey, ObjectiveTopicKey
 from tests.support.routers import EmbeddedRouter
 from tests.support.sites import Site
 from tests.support.waiting import until

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from schemas.agent_keys import DeviceTopicKey
+from schemas.keys import DeviceTopicKey
 from tests.bridges.ros2.definitions import ros_types
 from tests.bridges.ros2.peers import RosPeer, hiroz, sdk
 from tests.support.commands import AIRA, Serving

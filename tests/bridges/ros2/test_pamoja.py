@@ -10,9 +10,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bridges.ros2 import InvalidRosName, RosEntity
-from bridges.ros2.names import check_name, to_dds_type, topic_key
-from bridges.ros2.tokens import RmwZenoh
+from bridges.ros2 import RosEntity
+from bridges.ros2._wire import RmwZenoh, check_name, to_dds_type
+from schemas.errors import InputError
 from tests.bridges.ros2.definitions import ADD_TWO_INTS, FIBONACCI, ros_types
 from tests.bridges.ros2.peers import HERE
 from tests.support.peers import require
@@ -51,7 +51,7 @@ def test_keys_and_tokens_have_the_same_parts(name: str) -> None:
     kind = "std_msgs/msg/String"
     type_hash = ros_types().type_hash(kind)
     key, mangled = pamoja(["entity_key", 7, name, kind, type_hash], ["percent_mangle", name])
-    assert key == topic_key(7, name, kind, type_hash)
+    assert key == RmwZenoh(7).key(name, kind, type_hash)
     publisher = RosEntity("publisher", 7, "ab", 0, 1, "node", name=name, type=kind, type_hash=type_hash)
     assert RmwZenoh(7).token(publisher).split("/")[9] == mangled
 
@@ -71,7 +71,7 @@ def test_names_are_valid_for_both_or_for_none() -> None:
     for name, is_valid in zip(checked, pamoja(*[["is_fully_qualified", name] for name in checked]), strict=True):
         try:
             check_name(name)
-        except InvalidRosName:
+        except InputError:
             # Substitutions are resolved before a name gets into a system: here they never are.
             assert not is_valid or set(name) & set("~{}"), name
         else:

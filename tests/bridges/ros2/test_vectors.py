@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ros2 import InvalidRosToken, RosEntity
-from bridges.ros2.attachment import parse_attachment
-from bridges.ros2.names import parse_topic_key, topic_key
-from bridges.ros2.qos import RosQos, parse_qos
-from bridges.ros2.tokens import RmwZenoh
+from bridges.ros2._wire import RmwZenoh, RosQos, from_dds_type, parse_attachment, parse_qos
+from schemas.errors import InputError
 from tests.bridges.ros2.definitions import ros_types
 from tests.bridges.ros2.peers import VECTORS
+
+if TYPE_CHECKING:
+    from bridges.ros2 import RosEntity
 
 RECORDED = {file.stem: json.loads(file.read_text()) for file in sorted(VECTORS.glob("*-*.json"))}
 DISTRIBUTIONS = {name: "humble" if "humble" in name else "jazzy" for name in RECORDED}
@@ -33,8 +33,10 @@ types_of = cache(ros_types)
 
 @pytest.mark.parametrize(("name", "what", "sent"), SENT)
 def test_keys_attachments_and_payloads_are_read_and_written_alike(name: str, what: str, sent: dict[str, Any]) -> None:
-    domain, topic, kind, type_hash = parse_topic_key(sent["key"])
-    assert topic_key(domain, topic, kind, type_hash) == sent["key"]
+    domain, _, rest = sent["key"].partition("/")
+    topic, dds_type, type_hash = rest.rsplit("/", 2)
+    kind = from_dds_type(dds_type)
+    assert RmwZenoh(int(domain)).key(f"/{topic}", kind, type_hash) == sent["key"]
     data = bytes.fromhex(sent["attachment"])
     attached = parse_attachment(data)
     assert attached is not None
@@ -104,7 +106,7 @@ def test_what_rmw_zenoh_writes_of_a_profile_is_read(file: str) -> None:
 def test_what_rmw_zenoh_reads_is_read_and_what_it_refuses_is_refused() -> None:
     for text, numbers in _profiles("qos_decode.tsv"):
         if numbers == "NULL":
-            with pytest.raises(InvalidRosToken):
+            with pytest.raises(InputError):
                 parse_qos(text)
         else:
             assert parse_qos(text) == _profile(numbers), text

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from bridges.serial.boards import BoardFailed, InvalidFirmware, SimulatedBoard, simulator
-from bridges.serial.firmware import CompilationFailed, compile_sketch
-from mesh.errors import ConfigurationError, InputError
+from bridges.serial.boards import SimulatedBoard, simulator
+from bridges.serial.firmware import compile_sketch
+from mesh.errors import ConfigurationError, InputError, RemoteError
 from tests.support.boards import COUNTER, board, firmware
 from tests.support.commands import AIRA, aira, environment
+from tests.support.raising import raises_with
 
 SECONDS = 60
 
@@ -71,7 +72,7 @@ def test_a_missing_file_is_not_firmware(tmp_path: Path) -> None:
     done = aira("board", "run", tmp_path / "none.elf")
     assert done.returncode == 2
     assert "does not exist" in done.stderr
-    with pytest.raises(InvalidFirmware), SimulatedBoard(tmp_path):
+    with raises_with(InputError, code="invalid-firmware"), SimulatedBoard(tmp_path):
         pass
 
 
@@ -97,7 +98,7 @@ def test_the_port_keeps_its_name_when_the_cable_is_pulled() -> None:
 
 def test_a_board_that_is_not_running_can_not_be_used() -> None:
     uno = board(COUNTER)
-    with pytest.raises(BoardFailed):
+    with raises_with(RemoteError, code="board-failed"):
         uno.reset()
 
 
@@ -106,7 +107,7 @@ def test_a_compilation_error_has_file_and_line(tmp_path: Path) -> None:
     sketch = tmp_path / "broken"
     sketch.mkdir()
     (sketch / "broken.ino").write_text("void setup() {\n  int x = ;\n}\nvoid loop() {}\n")
-    with pytest.raises(CompilationFailed, match=r"broken\.ino.*2:"):
+    with raises_with(InputError, match=r"broken\.ino.*2:", code="compilation-failed"):
         compile_sketch(sketch, tmp_path / "broken.elf")
     with pytest.raises(InputError):
         compile_sketch(tmp_path, tmp_path / "none.elf")

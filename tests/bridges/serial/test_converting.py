@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from bridges.serial.calls import convert
+from bridges.serial._edge import convert
 from schemas import EMPTY, JSON, RAW, STRING, Empty, PayloadType, payload_type
 from schemas.payloads import encode_value
 

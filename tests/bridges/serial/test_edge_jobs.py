@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-import pytest
+import zenoh
 
-from bridges.serial.device import Device
-from bridges.serial.errors import NoSuchTopic
-from mesh.agent import Agent
+from bridges.serial._device import Device
+from bridges.serial.dialect import CallFailed
+from mesh.agent.agent import Agent
+from mesh.agent.jobs import QUIET_SECONDS
 from mesh.chain import Account, Chain
 from mesh.recording import open_objective
-from schemas import Empty, String, cid_of_bytes
+from schemas import Empty, String, cid_of_bytes, topic_selector
+from schemas.keys import PRESENT, DeviceTopicKey
 from schemas.payloads import decode_value
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
 from tests.support.market import QUICK, founded, offering, place
 from tests.support.objectives import objective
-from tests.support.waiting import until
+from tests.support.raising import raises_with
+from tests.support.routers import client_config
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
     from bridges.serial.boards import SimulatedBoard
+    from mesh.agent.handlers import Job
     from mesh.network import Pump
-    from mesh.work.job import Job
     from tests.support.market import Place
 
 __all__ = ["founded", "place"]
@@ -161,10 +166,11 @@ async def test_a_call_of_a_topic_that_the_board_lacks_names_those_that_it_has(pl
         device = Device(robot, patience=LONG, in_doubt="again")
         with board(COUNTER) as uno, edge(uno.port, robot.address, place.endpoint):
             for topic in ("/nosuch", "/added"):
-                with pytest.raises(NoSuchTopic) as caught:
+                with raises_with(CallFailed, code="no-such-topic") as caught:
                     await device.call(topic)
-                assert {"/add", "/sum", "/slow"} <= set(caught.value.topics)
-                assert "/added" not in caught.value.topics
+                has = str(caught.value).partition(" has ")[2].split(", ")
+                assert {"/add", "/sum", "/slow"} <= set(has)
+                assert "/added" not in has
                 assert (caught.value.reason, caught.value.topic) == ("no-such-topic", topic)
                 assert "no-such-topic" not in str(caught.value)  # it is the code, which is shown anyway
 
@@ -240,7 +246,7 @@ async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -
         await talking_began.wait()
         await counter.call("/slow", 1, job=job)
 
-    account = Account.from_key(place.node.funded_keys[4])
+    account = Account(place.node.funded_keys[4])
     async with second_robot(place, account, OTHER_MODEL) as second:
         talker = Device(second, patience=LONG)
 
@@ -269,3 +275,50 @@ async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -
     assert (recorded(counted, "/slow"), recorded(counted, "/hear")) == ([1, 1], [])
     assert recorded(heard, "/hear") == recorded(heard, "/said") == [String("hello"), String("world")]
     assert recorded(heard, "/slow") == recorded(heard, "/added") == []
+
+
+async def test_the_answers_to_commands_that_nobody_waits_for_are_recorded(place: Place) -> None:
+    """The handler only publishes; a rosserial board acknowledges nothing, and the job ends after the last message."""
+    robot = offering(place.agent("robot"))
+
+    @robot.on("/say", String)
+    async def say(job: Job, text: String) -> None:
+        job.publish("/hear", text)
+
+    words = [String(f"word {number}") for number in range(8)]
+    source = place.save(objective(*(("/say", word) for word in words)))
+    address = place.address("robot")
+    with board(ROSSERIAL_ECHO) as uno, edge(uno.port, address, place.endpoint, "--protocol", "rosserial"):
+        async with place.at_work(robot) as person:
+            await Device(robot, patience=LONG).call("/hear", "are you there?")
+            for _ in range(3):
+                contract = await person.demand(source, cost=1)
+                assert (await contract.outcome()).success
+                assert recorded(await contract.recording(), "/said") == words
+
+
+async def test_what_a_board_says_soon_after_its_work_is_recorded(place: Place) -> None:
+    """It confirms the command, and answers by itself a moment later, as a measurement does."""
+    robot, board_session = offering(place.agent("robot")), zenoh.open(client_config(place.endpoint))
+    address, later = place.address("robot"), threading.Timer
+
+    def answer(sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr).removesuffix("/measure") + "/measured"
+        later(QUIET_SECONDS / 2, board_session.put, (key, "7"), {"encoding": "application/json"}).start()
+
+    @robot.on("/work")
+    async def work(job: Job, message: object) -> None:
+        job.publish("/measure", None)
+
+    source = place.save(objective(("/work", Empty())))
+    with board_session:
+        declared: list[Any] = [
+            board_session.liveliness().declare_token(str(DeviceTopicKey(address, "probe", PRESENT))),
+            board_session.declare_subscriber(topic_selector(address, topic="/measure"), answer),
+        ]
+        async with place.at_work(robot) as person:
+            await until_heard(robot.network.session, topic_selector(address, address, "/measure"))
+            contract = await person.demand(source, cost=1)
+            assert (await contract.outcome()).success
+            assert recorded(await contract.recording(), "/measured") == [7]
+        assert len(declared) == 2

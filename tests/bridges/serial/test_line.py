@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.serial.errors import InvalidPort, LineError, PortBusy, PortMissing
+from bridges.serial.dialect import LineError
 from bridges.serial.line import PortName, SerialPort
 from mesh.errors import InputError
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def test_a_port_is_found_by_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "tty"
-    with pytest.raises(PortMissing):
+    with raises_with(LineError, code="port-missing"):
         PortName(str(path)).find()
     path.touch()
     assert PortName(str(path)).find() == path
@@ -26,9 +27,9 @@ def test_a_port_is_found_by_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_usb_device_that_is_not_plugged_in_is_missing() -> None:
-    with pytest.raises(PortMissing) as caught:
+    with raises_with(LineError, code="port-missing") as caught:
         PortName("usb:dead:beef").find()
-    assert caught.value.port == "usb:dead:beef"
+    assert "usb:dead:beef" in str(caught.value)
 
 
 @pytest.mark.parametrize("text", ["", "ttyUSB0", "usb:2341", "usb:23410043", "COM3"])
@@ -41,7 +42,7 @@ def test_a_file_that_is_not_a_terminal_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.touch()
     for each in (path, tmp_path):
-        with pytest.raises(InvalidPort):
+        with raises_with(LineError, code="invalid-port"):
             SerialPort(each, baud=57_600)
 
 
@@ -50,7 +51,7 @@ def test_a_port_is_locked_and_reports_when_it_is_unplugged(tmp_path: Path) -> No
     path = PortName(os.ttyname(slave)).find()
     os.close(slave)
     port = SerialPort(path, baud=57_600)
-    with pytest.raises(PortBusy):
+    with raises_with(LineError, code="port-busy"):
         SerialPort(path, baud=57_600)
     assert port.write(b"abc") == 3
     assert os.read(master, 10) == b"abc"

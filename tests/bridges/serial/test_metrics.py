@@ -5,15 +5,14 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-import pytest
-
-from bridges.serial.device import Device
-from bridges.serial.errors import CallRefused
+from bridges.serial._device import Device
+from bridges.serial.dialect import CallFailed
 from schemas.status import ALIVE
 from tests.support.boards import COUNTER, board, edge
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.market import founded, place
 from tests.support.ports import free_port
+from tests.support.raising import raises_with
 from tests.support.scraping import health, scraped
 from tests.support.waiting import until_found
 
@@ -43,7 +42,7 @@ async def test_calls_are_counted_by_their_outcome(place: Place) -> None:
         async with place.agent("robot") as robot:
             before = await scraped(url)
             assert (await Device(robot).call("/add", 5)).value == 5
-            with pytest.raises(CallRefused):
+            with raises_with(CallFailed, code="call-refused"):
                 await Device(robot).call("/add", "five")
             after = await scraped(url)
         changes = after.changes(before)

@@ -7,7 +7,7 @@ import re
 import runpy
 from typing import TYPE_CHECKING, Any
 
-from bridges.serial.device import Device
+from bridges.serial._device import Device
 from bridges.serial.firmware import compile_sketch, size_of
 from mesh.recording import open_objective
 from schemas.payloads import decode_value
@@ -18,7 +18,7 @@ from tests.support.objectives import objective
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
     from tests.support.market import Place
 
 __all__ = ["founded", "place"]

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bridges.serial.boards import SimulatedBoard
-from bridges.serial.dialect import BoardReady, MessageReceived
-from bridges.serial.errors import InvalidPort
-from bridges.serial.frames_dialect import FramesDialect
+from bridges.serial.dialect import BoardReady, LineError, MessageReceived
+from bridges.serial.frames import FramesDialect
 from bridges.serial.line import SerialPort
 from tests.support.boards import COUNTER, DIMMER, TALKER, board, firmware
 from tests.support.commands import AIRA, aira, environment
 from tests.support.lines import LineClient
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -110,13 +110,13 @@ def run_board(*options: str | Path) -> Iterator[subprocess.Popen[str]]:
 def test_a_port_of_ones_own_choice_lasts_as_long_as_the_board(tmp_path: Path) -> None:
     port = tmp_path / "uno"
     for _ in range(2):
-        with run_board(firmware(COUNTER), "--port", port) as process:
+        with run_board(firmware(COUNTER), "--tty", port) as process:
             assert process.stdout is not None
             while not process.stdout.readline().startswith(f"connect it with: aira edge {port}"):
                 pass
             assert port.is_symlink()
             assert port.is_char_device()
-            second = aira("board", "run", firmware(COUNTER), "--port", port)
+            second = aira("board", "run", firmware(COUNTER), "--tty", port)
             assert second.returncode == 1
             assert "[port-busy]" in second.stderr
             process.communicate("quit\n", timeout=SECONDS)
@@ -126,7 +126,7 @@ def test_a_port_of_ones_own_choice_lasts_as_long_as_the_board(tmp_path: Path) ->
 def test_a_file_in_place_of_the_port_is_kept(tmp_path: Path) -> None:
     port = tmp_path / "notes"
     port.write_text("mine")
-    with pytest.raises(InvalidPort), SimulatedBoard(firmware(COUNTER), port=port):
+    with raises_with(LineError, code="invalid-port"), SimulatedBoard(firmware(COUNTER), port=port):
         pass
     assert port.read_text() == "mine"
 

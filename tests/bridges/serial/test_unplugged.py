@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
-from bridges.serial.device import Device
+from bridges.serial._device import Device
 from bridges.serial.dialect import BoardLost, CallStatus, CommandFinished
-from bridges.serial.rosserial_dialect import RosserialDialect
+from bridges.serial.rosserial import RosserialDialect
 from mesh.recording import open_objective
 from schemas import Empty, String
 from schemas.payloads import decode_value
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bridges.serial.boards import SimulatedBoard
-    from mesh.agent import Agent
-    from mesh.work.job import Job
+    from mesh.agent.agent import Agent
+    from mesh.agent.handlers import Job
     from tests.support.market import Place
 
 __all__ = ["founded", "place"]

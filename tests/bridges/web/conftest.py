@@ -10,8 +10,8 @@ import msgspec
 import pytest
 from aiohttp import ClientSession
 
+from bridges.web.access import WebOptions
 from bridges.web.components import opened
-from bridges.web.options import WebOptions
 from bridges.web.server import PageServer
 from tests.bridges.web.openapi import check, check_answer
 from tests.support.market import founded, place

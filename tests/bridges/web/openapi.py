@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any, Final
 
-from bridges.web.reference import OPENAPI
+from bridges.web._api import OPENAPI
 
 DOCUMENT: Final[dict[str, Any]] = json.loads(OPENAPI.read_text())
 TYPES: Final = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None)}

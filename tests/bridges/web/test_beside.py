@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.devchain.errors import PortUnavailable
-from mesh.extras import PackageMissing
-from mesh.page import free_page_port, page_server
+from mesh.base.extras import PackageMissing
+from mesh.dev.page import free_page_port, page_server
+from mesh.errors import PortUnavailable
 from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.ports import free_port
 from tests.support.waiting import wait_until
@@ -67,7 +67,7 @@ def test_what_the_page_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(PackageMissing) as caught:
         page_server()
     assert caught.value.extra == "web"
-    monkeypatch.setattr("mesh.page.entry_points", lambda group: {})
+    monkeypatch.setattr("mesh.dev.page.entry_points", lambda group: {})
     with pytest.raises(PackageMissing):
         page_server()
 

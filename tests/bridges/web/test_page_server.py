@@ -8,14 +8,17 @@ import secrets
 from typing import TYPE_CHECKING, Any
 
 from mesh import Job, String  # noqa: TC001  handlers are read at run time
-from schemas import ZERO_ADDRESS, Demand, Withdrawal, cid_of_bytes, encode
-from schemas.model import ModelDescription, ModelTopic
-from schemas.value_schema import ValueSchema
-from tests.support.market import MODEL, offering
+from schemas import ZERO_ADDRESS, Demand, Result, Withdrawal, cid_of_bytes, encode
+from schemas.keys import event_selector
+from schemas.model import ModelDescription, ModelTopic, ValueSchema
+from tests.mesh.evidence.test_legacy import DUE, bag, below
+from tests.support.market import MODEL, offering, offering_unseen
 from tests.support.objectives import objective
-from tests.support.waiting import until_found
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.chain import Account
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
@@ -76,6 +79,63 @@ async def test_a_wallet_orders_and_follows_its_job_to_the_payment(place: Place, 
         assert job["resultMessage"]["signer"] == place.address("robot")
         verdict = await browser.get(f"liabilities/{address}/verification")
         assert verdict["holds"], verdict
+
+
+async def test_the_result_of_a_legacy_robot_is_verified_as_by_the_command(
+    place: Place, serve: Any, tmp_path: Path
+) -> None:
+    """Such a robot hands in a bag with all topics below its contract's address."""
+    robot = offering_unseen(place.agent("robot", enable_executor=False))
+    async with place.provider(), robot, serve("person") as browser:
+        cid = await robot.add(bag(tmp_path / "objective.bag", DUE))
+        posted = await browser.post("local/orders", {"model": MODEL, "objective": cid, "cost": str(COST)}, status=202)
+
+        async def matched() -> Any:
+            return (await browser.get(f"orders/{posted['order']['hash']}"))["liability"]
+
+        address = await until_found(matched, what="a contract")
+        result = await robot.add(bag(tmp_path / "result.bag", below(DUE, address)))
+        await robot.parts.outbox.post(robot.parts.signer.sign(Result(liability=address, result=result, success=True)))
+
+        async def verified() -> Any:
+            state = (await browser.get(f"liabilities/{address}"))["liability"]["state"]
+            return await browser.get(f"liabilities/{address}/verification") if state == "paid" else None
+
+        verdict = await until_found(verified, what="a payment")
+        assert verdict["holds"], verdict
+        assert {"name": "played", "holds": True} in [
+            {"name": one["name"], "holds": one["holds"]} for one in verdict["findings"]
+        ]
+
+
+async def test_a_page_that_comes_late_shows_how_far_a_job_is(place: Place, serve: Any) -> None:
+    robot, may_end = offering(place.agent("robot")), asyncio.Event()
+    told: list[bytes] = []
+
+    @robot.on("/blink")
+    async def blink(job: Job, message: String) -> None:
+        if message.data == "off":
+            await may_end.wait()
+
+    source = place.save(objective(("/blink", "on"), ("/blink", "off")))
+    async with place.at_work(robot) as person:
+        heard: Any = person.network.session.declare_subscriber(
+            event_selector(place.address("robot")), lambda sample: told.append(sample.payload.to_bytes())
+        )
+        contract = await person.demand(source, cost=COST)
+        await until(lambda: b'{"position":1,"total":2}' in told, what="the position")
+        heard.undeclare()
+        async with serve() as browser:
+
+            async def running() -> bool:
+                return bool((await browser.get(f"liabilities/{contract.address}"))["phase"] == "running")
+
+            await until_found(running, what="the phase")
+            job = await browser.get(f"liabilities/{contract.address}")
+            assert [step["kind"] for step in job["timeline"]] == ["created", "ready", "playing"]
+            assert job["playback"] == {"position": 1, "total": 2}
+            may_end.set()
+            assert (await contract.outcome()).success
 
 
 DATA = {"X-Aira-Request": "1", "Content-Type": "application/octet-stream"}

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp import ClientConnectionError, ClientSession, CookieJar, TCPConnector, WSServerHandshakeError
 
+from bridges.web.access import WebOptions
 from bridges.web.components import opened
-from bridges.web.errors import NotOpenToOthers
-from bridges.web.options import WebOptions
 from bridges.web.server import PageServer
-from mesh.background import Background
-from mesh.fresh_file import CHECK_INTERVAL
-from mesh.identity import Member
+from mesh.base.background import Background
+from mesh.base.fresh_file import CHECK_INTERVAL
+from mesh.errors import ConfigurationError
 from mesh.market.provider import Provider
 from mesh.network import Network
+from mesh.ops.identity import Member
 from tests.bridges.web.conftest import Browser
 from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import objective
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from mesh.identity.folders import MemberFolder
+    from mesh.ops.identity.certificates import MemberFolder
     from tests.support.market import Founded
 
 TOKEN, OPERATOR = "a token of people 123", "a token of operators 456"
@@ -127,9 +127,9 @@ async def test_members_log_in_by_their_certificates(serve: Any, site: Site, tmp_
 
 
 def test_a_roster_without_tls_is_refused() -> None:
-    with pytest.raises(NotOpenToOthers):
+    with pytest.raises(ConfigurationError):
         WebOptions(roster="roster.toml").check()
-    with pytest.raises(NotOpenToOthers):
+    with pytest.raises(ConfigurationError):
         WebOptions(host="0.0.0.0", roster="roster.toml", certificate="c", key="k").check()
     WebOptions(host="0.0.0.0", roster="roster.toml", certificate="c", key="k", ca="ca").check()
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import pytest
 from aiohttp import ClientSession
 
+from bridges.web.access import WebOptions
 from bridges.web.components import opened
-from bridges.web.options import WebOptions
 from bridges.web.server import PageServer
 from mesh.chain import DeploymentPlan
-from mesh.devchain import EmbeddedChain
-from mesh.devchain.development import deploy_market
+from mesh.dev import EmbeddedChain
+from mesh.dev.development import deploy_market
 from tests.bridges.web.conftest import Browser
 from tests.support.market import MODEL, Founded, Place, offering
 from tests.support.objectives import objective
+from tests.support.tokens import block, deploy_blocking_token
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
@@ -26,7 +28,10 @@ COST, DELAY = 5_000, 30
 DATA = {"X-Aira-Request": "1", "Content-Type": "application/octet-stream"}
 
 
-async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(router: EmbeddedRouter, tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_refused", [False, True], ids=["paid", "owed"])
+async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(
+    router: EmbeddedRouter, tmp_path: Path, is_refused: bool
+) -> None:
     async with EmbeddedChain() as node:
         plan = DeploymentPlan(refund_delay=DELAY, timeout_blocks=100)
         market = await deploy_market(node.provider, node.funded_keys, plan=plan)
@@ -43,6 +48,11 @@ async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(router: Embedde
             browser, before = Browser(session, server), await place.balance("person")
             made = await browser.post("objectives", objective(("/blink", "on")), headers=DATA)
             wanted = {"model": MODEL, "objective": made["cid"], "cost": str(COST)}
+            cost = COST
+            if is_refused:
+                wanted["token"] = token = await deploy_blocking_token(place.chains["person"], COST)
+                await block(place.chains["person"], token, market.accounts["person"].address)
+                cost = 0  # of XRT
             order = (await browser.post("local/orders", wanted, status=202))["order"]["hash"]
 
             async def matched() -> Any:
@@ -50,7 +60,7 @@ async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(router: Embedde
 
             await until_found(matched, what="a contract")
             address = await matched()
-            assert await place.balance("person") == before - COST
+            assert await place.balance("person") == before - cost
             early = await browser.post("local/refunds", {"liability": address}, status=502)
             assert early["error"]["code"] == "not-refundable"
             await node.mine(DELAY + 1)
@@ -68,3 +78,4 @@ async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(router: Embedde
                 return (await browser.get(f"liabilities/{address}"))["timeline"][-1]["kind"] == "refunded"
 
             await until_found(ended, what="the refund on the page")
+            assert (await browser.get(f"liabilities/{address}"))["owed"] == (str(COST) if is_refused else "0")

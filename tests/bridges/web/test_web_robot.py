@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.web.cli import robot_of
-from mesh.cli.errors import InvalidOptions
+from bridges.web.cli import files_of, priced, robot_of
+from mesh.amounts import XRT
 from mesh.errors import InputError
+from schemas import cid_of_file
 from tests.support.market import MODEL
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,6 +36,20 @@ def test_a_toml_file_describes_a_robots_page_and_options_change_it(tmp_path: Pat
     assert robot_of(options()) is None
     alone = {"model": MODEL, "objective": None, "cost": None, "title": "", "text": ""}
     assert robot_of(options(model=MODEL)) == alone
+    file = written(tmp_path, "a lamp that blinks")
+    assert robot_of(options(model=str(file))) == alone | {"model": cid_of_file(file)}
+    named = options(model=MODEL, objective=str(file))
+    assert robot_of(named) == alone | {"objective": cid_of_file(file)}
+    assert files_of(named) == [file]
+
+
+@pytest.mark.parametrize(
+    ("cost", "wn"), [("1", "1000000000"), ("1.5", "1500000000"), ("7wn", "7"), ("2 XRT", "2000000000"), ("", None)]
+)
+def test_a_robots_price_has_the_units_of_other_commands(cost: str, wn: str | None) -> None:
+    robot = robot_of(options(model=MODEL, cost=cost))
+    assert robot is not None
+    assert priced(robot, XRT)["cost"] == wn
 
 
 @pytest.mark.parametrize(
@@ -42,7 +58,7 @@ def test_a_toml_file_describes_a_robots_page_and_options_change_it(tmp_path: Pat
         "model = ",
         'title = "no model"',
         f'model = "{MODEL}"\ncolour = "red"',
-        f'model = "{MODEL}"\ncost = "1.5"',
+        f'model = "{MODEL}"\ncost = "much"',
         f'model = "{MODEL}"\ncost = -1',
         f'model = "{MODEL}"\ncost = "²"',
         f'model = "{MODEL}"\nobjective = "nothing"',
@@ -55,7 +71,7 @@ def test_what_describes_no_page_is_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_unknown_words_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InvalidOptions, match="colour"):
+    with raises_with(InputError, code="invalid-options", match="colour"):
         robot_of(options(written(tmp_path, FULL + 'colour = "red"')))
 
 

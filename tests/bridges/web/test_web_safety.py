@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from yarl import URL
 
-from bridges.web.api import Api
-from bridges.web.errors import NotOpenToOthers
-from bridges.web.options import WebOptions
-from bridges.web.reference import reference
+from bridges.web.access import WebOptions
+from mesh.errors import ConfigurationError
 from schemas import RpcKey
 from tests.bridges.web.conftest import OWN
 from tests.bridges.web.openapi import DOCUMENT
+from tests.bridges.web.reference import reference
 from tests.support.objectives import objective
 from tests.support.waiting import until_answered
 
@@ -89,7 +88,7 @@ async def test_only_operators_drive_jobs(place: Place, serve: Any) -> None:
 
 async def test_bodies_are_bounded(place: Place, serve: Any) -> None:
     async with serve() as browser:
-        browser.server.files.upload_limit = 1000
+        browser.server.api.files.upload_limit = 1000
         data = {"X-Aira-Request": "1", "Content-Type": "application/octet-stream"}
         refused = await browser.post("objectives", bytes(1001), headers=data, status=413)
         assert refused["error"]["code"] == "upload-too-large"
@@ -124,9 +123,9 @@ async def test_names_and_images_of_strangers_are_never_html(serve: Any) -> None:
 
 
 def test_other_machines_reach_only_a_server_with_tls_and_a_login() -> None:
-    with pytest.raises(NotOpenToOthers):
+    with pytest.raises(ConfigurationError):
         WebOptions(host="0.0.0.0", token=TOKEN).check()
-    with pytest.raises(NotOpenToOthers):
+    with pytest.raises(ConfigurationError):
         WebOptions(host="192.0.2.1", certificate="c", key="k").check()
     WebOptions(host="0.0.0.0", token=TOKEN, certificate="c", key="k").check()
 
@@ -143,7 +142,7 @@ async def test_files_outside_the_page_are_not_served(serve: Any, tmp_path: Path)
 
 async def test_every_route_is_documented(serve: Any) -> None:
     async with serve() as browser:
-        routes = {(route.method.lower(), route.path) for route in Api(browser.server).routes()}
+        routes = {(route.method.lower(), route.path) for route in browser.server.api.routes()}
     documented = {(method, path) for path, methods in DOCUMENT["paths"].items() for method in methods}
     assert documented - routes == {("post", "/api/v1/session")}
     assert routes <= documented

@@ -6,7 +6,7 @@ import asyncio
 import json
 from typing import TYPE_CHECKING, Any
 
-from bridges.web.stream import KEPT, WAITING, Stream, StreamConnection
+from bridges.web._stream import KEPT, WAITING, Stream, StreamConnection
 from schemas import Demand, encode, verify
 from tests.support.market import MODEL
 from tests.support.waiting import until
@@ -50,7 +50,7 @@ async def test_an_order_on_the_mesh_reaches_the_page(place: Place, serve: Any) -
 
 async def test_a_broken_connection_goes_on_where_it_was(serve: Any) -> None:
     async with serve() as browser:
-        stream, url = browser.server.stream, f"{browser.server.url}/api/v1/stream"
+        stream, url = browser.server.api.stream, f"{browser.server.url}/api/v1/stream"
         async with browser.session.ws_connect(url) as socket:
             await socket.send_json({"subscribe": ["a"]})
             await received(socket, "hello")
@@ -107,3 +107,11 @@ async def test_what_is_no_subscription_ends_the_connection(serve: Any) -> None:
         await socket.send_str("[1]")
         async with asyncio.timeout(60):
             assert (await socket.receive()).type.name in ("CLOSE", "CLOSED")
+
+
+async def test_a_connection_that_is_made_while_the_server_stops_is_ended(serve: Any) -> None:
+    async with serve() as browser:
+        await browser.server.api.stream.close()
+        async with browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket, asyncio.timeout(60):
+            assert (await socket.receive()).type.name == "CLOSE"
+            assert socket.close_code == 1001

@@ -82,6 +82,7 @@ async def test_the_page_says_how_a_validator_judges_before_a_demand_is_signed(pl
 async def test_the_local_account_orders_from_no_doubtful_validator(place: Place, serve: Any, doubt: str) -> None:
     async with juror_of(place) as juror, serve("person") as browser:
         await once_online(browser, juror)
+        await place.chains["robot"].validators.introduce()  # an account that could still become a contract is refused
         validator = juror.signer.address if doubt == "low-fee" else place.market.accounts["robot"].signer.address
         wanted = {"model": MODEL, "objective": MODEL, "cost": "5", "validator": validator, "validatorFee": "1"}
         refused = await browser.post("local/orders", wanted, status=400)

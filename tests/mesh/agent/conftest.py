@@ -15,7 +15,7 @@ from tests.support.market import founded, place
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from schemas import Record
     from tests.support.market import Place
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import Phase
+from mesh.agent.ledger import Phase
 from mesh.network import Endpoints, Network, call
 from schemas import String
-from schemas.agent_keys import LiabilityTopicKey
-from schemas.rpc import Done, FinishLiability, LiabilityRead, Nothing, ReadLiability, StartLiability
+from schemas.keys import LiabilityTopicKey
+from schemas.rpc import Done, FinishLiability, LiabilityRead, LiabilityRequest, Nothing
 from tests.support.market import in_phase, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_heard
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.agent import Agent, Contract
+    from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Contract
     from schemas import Record
     from tests.support.market import Place
 
@@ -40,14 +41,14 @@ class Control:
         return await call(self.session, self.robot.address, service, request)
 
     async def start(self, address: str) -> Done:
-        done: Done = await self.ask("start", StartLiability(address))
+        done: Done = await self.ask("start", LiabilityRequest(address))
         return done
 
     async def finish(self, address: str, *, success: bool = True) -> None:
         assert await self.ask("finish", FinishLiability(address, success)) == Nothing()
 
     async def read(self, address: str) -> LiabilityRead:
-        read: LiabilityRead = await self.ask("read", ReadLiability(address))
+        read: LiabilityRead = await self.ask("read", LiabilityRequest(address))
         return read
 
     async def say(self, address: str, topic: str, word: str) -> None:
@@ -64,7 +65,7 @@ class Control:
         """Wait until the robot has played that many messages of the objective."""
 
         def reached() -> bool:
-            run = self.robot.runtime.playbacks.run(address)
+            run = self.robot.runtime.executor.runs.get(address)
             return run is not None and run.position == count
 
         await until(reached)

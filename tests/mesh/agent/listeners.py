@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.agent._runtime import AgentRuntime, TokenEvents
 from mesh.agent.components import working
 from mesh.agent.handlers import Handlers
-from mesh.agent.listener import ChainListener
-from mesh.agent.runtime import AgentRuntime
-from mesh.agent.token_events import TokenEvents
-from mesh.background import Background
-from mesh.flood import Drops
-from mesh.work import Ledger
-from mesh.work.models import Models
+from mesh.agent.ledger import Ledger
+from mesh.base.background import Background
+from mesh.base.flood import Drops
+from mesh.role.models import Models
 from schemas import Demand, Offer, Result
 from tests.support.orders import RECORDING, terms
 from tests.support.waiting import until_found
@@ -28,13 +26,8 @@ if TYPE_CHECKING:
 
     from mesh.agent.components import AgentComponents
     from mesh.chain import Approval, Chain, Transfer
-    from mesh.work.phases import Phase
     from schemas import Liability
     from tests.support.market import Place
-
-
-async def ignore(_phase: Phase, _liability: Liability) -> None:
-    pass
 
 
 class RecordedTokenEvents(TokenEvents):
@@ -52,13 +45,12 @@ class RecordedTokenEvents(TokenEvents):
         self.reverted.append(event)
 
 
-class RecordingListener(ChainListener):
+class RecordingListener(AgentRuntime):
     """A listener that writes down what happens on the chain, and does no more about it than to add jobs."""
 
     def __init__(self, parts: AgentComponents) -> None:
-        runtime = AgentRuntime(parts, Handlers(), Models(parts.store, parts.exchange))
-        super().__init__(parts, runtime.trader, runtime.executor, on_phase=ignore)
-        self.watched = runtime.trader.contracts
+        super().__init__(parts, Handlers(), Models(parts.store, parts.exchange))
+        self.watched = self.trader.contracts
         self.liabilities: list[tuple[Liability, bytes, bytes]] = []
         self.ends: list[tuple[str, bool, str]] = []
         self.reverted_ends: list[str] = []
@@ -66,9 +58,12 @@ class RecordingListener(ChainListener):
         self.token_events: RecordedTokenEvents = RecordedTokenEvents()
         self.head = 0
 
+    async def run(self) -> None:
+        await self._follow_chain()
+
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         self.liabilities.append((liability, demand_hash, offer_hash))
-        await self._ledger.add_job(liability)
+        await self.parts.ledger.add_job(liability)
 
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         self.ends.append((address, success, result))
@@ -79,7 +74,7 @@ class RecordingListener(ChainListener):
     async def liability_reverted(self, address: str) -> None:
         self.reverted_contracts.append(address)
 
-    async def new_head(self, block: int) -> None:
+    async def on_head(self, block: int) -> None:
         self.head = block
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import Agent, Settings
-from mesh.agent import Phase
+from mesh.agent.ledger import Phase
 from mesh.errors import ClosedError, NetworkUnavailable
 from mesh.network import Endpoints, Network
 from tests.mesh.agent.agents import SOON, OpenChannel, channel, heard_on, settings
@@ -20,7 +20,7 @@ from tests.support.ports import free_endpoint
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
     from schemas import Demand, Verified
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter

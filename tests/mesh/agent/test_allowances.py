@@ -15,7 +15,7 @@ from tests.support.orders import terms
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
-    from mesh.chain.transports import Transport
+    from mesh.chain.rpc import Transport
     from tests.support.market import Place
 
 

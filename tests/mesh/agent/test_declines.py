@@ -12,8 +12,8 @@ import pytest
 from msgspec.structs import replace
 
 from mesh import Declined, InputError, Progress
-from mesh.agent.declines import PER_MAKER, DeclinePublisher, Grounds
-from mesh.flood import Drops
+from mesh.agent.demands import PER_MAKER, DeclinePublisher, Grounds
+from mesh.base.flood import Drops
 from mesh.network import Endpoints, Network
 from schemas import DeclineKey, Demand, Empty, RejectKey, Signer, Verified, cid_of_bytes
 from schemas.signing import Decline
@@ -27,8 +27,9 @@ from tests.support.waiting import until, until_heard
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from mesh.agent import Agent, Order
-    from mesh.work.job import Job
+    from mesh.agent.agent import Agent
+    from mesh.agent.handlers import Job
+    from mesh.agent.trade import Order
 
 
 def taking_speeds(robot: Agent) -> Agent:

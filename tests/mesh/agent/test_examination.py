@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec import Struct
 
+from mesh.agent.objectives import ObjectiveUnfit
 from mesh.content import ContentUnavailable
-from mesh.work.objectives import ObjectiveUnfit
 from schemas import Empty, cid_of_bytes, cid_of_file
 from tests.support.market import Place, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent
-    from mesh.work.job import Job
+    from mesh.agent.agent import Agent
+    from mesh.agent.handlers import Job
 
 
 MISSING = cid_of_bytes(b"nobody has this objective")

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.agent import Phase
-from mesh.agent.components import ChainHead
-from mesh.agent.late_results import SOON
+from mesh.agent._runtime import SOON
+from mesh.agent.ledger import Phase
 from mesh.chain import DeploymentPlan, Reverted
 from mesh.chain.liabilities import Liabilities
-from mesh.devchain.development import deploy_market
-from mesh.devchain.embedded import EmbeddedChain
+from mesh.dev._embedded import EmbeddedChain
+from mesh.dev.development import deploy_market
+from mesh.role.following import ChainHead
 from tests.mesh.work.restarts import COST, made_by_a_provider_that_leaves, speaking, words
 from tests.support.log_events import logged_facts
 from tests.support.market import Founded, Place, in_phase, offering
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from mesh.chain import Settled
     from schemas import Result
     from tests.support.routers import EmbeddedRouter

@@ -12,8 +12,7 @@ import pytest
 from mesh.chain import XRT
 from schemas import ZERO_ADDRESS, Demand, Offer, Result, Verified, cid_of_bytes, message_hash
 from schemas.keys import market_key
-from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
-from schemas.rpc import Approve
+from schemas.rpc import Approve, Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from tests.mesh.agent.conftest import Asker, asking
 from tests.mesh.agent.trades import all_posted, unsettled
 from tests.support.market import MODEL, offering
@@ -23,7 +22,7 @@ from tests.support.waiting import until_found, until_heard
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from mesh.network import Subscription
     from schemas import SignedMessage
     from tests.support.market import Place

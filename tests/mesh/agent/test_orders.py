@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import OrderClosed, OrderState
-from mesh.agent.listener import ChainListener
-from mesh.agent.terms import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, default_lifetime
+from mesh.agent._runtime import AgentRuntime
+from mesh.agent.errors import OrderClosed
+from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, OrderState, lifetime_of
 from mesh.chain import BlockHeader, InsufficientTokens
+from mesh.chain._node import Heads
 from mesh.chain.answers import Count, Word
-from mesh.chain.heads import Heads
-from mesh.work.database import LedgerUnusable
+from mesh.role.database import LedgerUnusable
 from schemas import Demand, Offer, Withdrawal, cid_of_bytes, decode, message_hash
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, unsettled, waiting, working
 from tests.support.log_events import logged_facts
@@ -23,7 +23,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from tests.support.market import Place
 
 
@@ -45,14 +45,14 @@ async def test_open_orders_are_taken_up_again_with_their_allowance(
     chain = place.chains["person"]
     async with place.agent("person", enable_executor=False) as person:
         demand = await person.order(cid_of_bytes(b"dear work"), cost=7000)
-        offer = await person.offer(objective=cid_of_bytes(b"work by a person"), lighthouse_fee=11)
+        other = await person.order(cid_of_bytes(b"cheap work"), validator_fee=11)
     async with place.agent("person", enable_executor=False) as person:
         assert [(order.hash, order.kind, order.state) for order in person.orders()] == [
             (demand.hash, "demand", OrderState.OPEN),
-            (offer, "offer", OrderState.OPEN),
+            (other.hash, "demand", OrderState.OPEN),
         ]
         resumed = {facts["order"]: facts["kind"] for facts in logged_facts(caplog, "order-resumed")}
-        assert resumed == {demand.hash: "demand", offer: "offer"}
+        assert resumed == {demand.hash: "demand", other.hash: "demand"}
         assert person.orders()[0].message == demand.message
         await chain.tokens.approve(chain.factory, 0)
         await person.order(OBJECTIVE, cost=500)
@@ -296,7 +296,7 @@ class Clock:
 )
 async def test_orders_are_valid_for_minutes(times: Any, blocks: float) -> None:
     chain: Any = Clock(times)
-    assert await default_lifetime(chain) == pytest.approx(blocks, rel=0.02)
+    assert await lifetime_of(chain) == pytest.approx(blocks, rel=0.02)
 
 
 async def test_an_order_that_became_a_contract_and_expired_while_its_program_was_away_is_not_forgotten(
@@ -304,7 +304,7 @@ async def test_an_order_that_became_a_contract_and_expired_while_its_program_was
 ) -> None:
     """Its program had not begun to read the chain."""
     with monkeypatch.context() as patch:
-        patch.setattr(ChainListener, "run", lambda listener: asyncio.Event().wait())
+        patch.setattr(AgentRuntime, "_follow_chain", lambda listener: asyncio.Event().wait())
         async with place.agent("person") as person:
             order = await person.order(OBJECTIVE, cost=5, lifetime=4)
     made = await created(place, order.message)

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import pytest
 
-from mesh import Agent, ModelDescription, ModelLimits, ModelUnfit, ObjectiveUnfit, Settings
-from mesh.agent.own_model import ModelUnreadable
+from mesh import Agent, ConfigurationError, ModelDescription, ModelLimits, ModelUnfit, ObjectiveUnfit, Settings
 from schemas import Empty, String, cid_of_file
-from schemas.model import InvalidDescription, ModelTopic
-from schemas.value_schema import ValueSchema
+from schemas.model import InvalidDescription, ModelTopic, ValueSchema
 from tests.support.market import offering
 from tests.support.objectives import objective
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
     from tests.support.market import Place
 
 
@@ -157,9 +157,8 @@ async def test_a_description_that_is_not_valid_ends_the_start(place: Place) -> N
 
 async def test_a_file_that_is_missing_ends_the_start(place: Place) -> None:
     missing = place.folder / "model.json"
-    with pytest.raises(ModelUnreadable) as caught:
+    with raises_with(ConfigurationError, code="model-unreadable", match=re.escape(str(missing))):
         await robot_with(place, missing).__aenter__()
-    assert caught.value.path == missing
 
 
 async def test_a_robot_finds_the_description_of_its_model_in_its_store(place: Place) -> None:

@@ -5,21 +5,22 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from mesh import JobFailed, Progress
+from mesh import JobFailed, Phase, Progress
+from mesh.agent import jobs
+from mesh.agent.contracts import _report_presence
 from mesh.network import Endpoints, Network
-from mesh.work import playbacks
 from schemas import EventKey, PlaybackPosition, ProgressKey
 from tests.mesh.agent.trades import job, working
 from tests.support.log_events import logged_facts
-from tests.support.market import Place, offering
+from tests.support.market import Place, in_phase, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     import pytest
 
-    from mesh.agent import Agent
-    from mesh.work.job import Job
+    from mesh.agent.agent import Agent
+    from mesh.agent.handlers import Job
 
 
 def kinds(heard: list[Progress]) -> list[str]:
@@ -94,7 +95,7 @@ async def test_the_position_of_a_playback_is_published_while_it_changes(place: P
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
-        await asyncio.sleep(playbacks.PUBLISH_INTERVAL)
+        await asyncio.sleep(jobs.PUBLISH_INTERVAL)
 
     async with place.at_work(robot) as person:
         selector = f"aira/agent/{robot.address.lower()}/liability/*/progress"
@@ -167,6 +168,16 @@ async def test_a_person_sees_that_the_robot_is_gone(place: Place) -> None:
             assert (await outcome).success
 
 
+async def test_an_agent_that_was_never_present_is_not_said_to_be_gone(place: Place) -> None:
+    """As one of the legacy network, which works there."""
+    heard: list[Progress] = []
+    async with place.agent("person") as person:
+        watch = asyncio.create_task(_report_presence(person.parts, place.address("robot"), heard.append))
+        await until(lambda: kinds(heard) == ["gone"], seconds=30)
+        watch.cancel()
+    assert [one.code for one in heard] == ["unseen"]
+
+
 async def test_a_callback_that_fails_ends_nothing(place: Place, caplog: pytest.LogCaptureFixture) -> None:
     def fail(progress: Progress) -> None:
         raise RuntimeError("broken")
@@ -175,3 +186,20 @@ async def test_a_callback_that_fails_ends_nothing(place: Place, caplog: pytest.L
         contract = await person.demand(job(place), on_progress=fail)
         assert (await contract.outcome(on_progress=fail)).success
     assert {facts["kind"] for facts in logged_facts(caplog, "progress-not-reported")} >= {"contract", "paid"}
+
+
+async def test_who_comes_late_is_told_the_present_phase(place: Place) -> None:
+    """The job has been ready, and then played for a while, before anybody listens."""
+    robot, heard = offering(place.agent("robot")), dict[str, list[Progress]](ready=[], playing=[])
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(("/go", "on"))))
+        await in_phase(robot, contract, Phase.READY)
+        waiting = [asyncio.create_task(contract.outcome(on_progress=heard["ready"].append))]
+        await until(lambda: kinds(heard["ready"]) == ["ready"])
+        await robot.runtime.executor.start(contract.address)
+        await until(lambda: heard["ready"][-1].position == 1)
+        waiting.append(asyncio.create_task(contract.outcome(on_progress=heard["playing"].append)))
+        await until(lambda: kinds(heard["playing"]) == ["ready", "playing"])
+        assert (heard["playing"][-1].position, heard["playing"][-1].total) == (1, 1)
+        await robot.finish(contract.address, success=True)
+        assert all(outcome.success for outcome in await asyncio.gather(*waiting))

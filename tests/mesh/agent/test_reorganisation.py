@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.background import Background
-from mesh.chain import Approval, Chain, ChainWentBack, History, NewLiability, Timing, Transfer
+from mesh.base.background import Background
+from mesh.chain import Approval, Chain, ChainWentBack, History, Timing, Transfer
 from tests.mesh.agent.listeners import contract, finalize, ledger, listening, opened, started
 from tests.support.market import QUICK
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from mesh.work import Ledger
+    from mesh.agent.ledger import Ledger
     from tests.support.market import Place
 
 __all__ = ["ledger"]
@@ -120,13 +120,6 @@ async def test_the_history_has_the_depth_of_the_settings_after_they_change(place
                 await until(lambda listener=listener, head=head: listener.head >= head)  # type: ignore[misc]
         history = History.decode((await ledger.cursor())[1])
         assert (history.depth, len(history.blocks)) == (depth, depth + 1)
-
-
-async def test_a_contract_reverted_before_it_was_read_is_ignored(place: Place, ledger: Ledger) -> None:
-    """The chain says of a contract, and when the listener reads it, there is none."""
-    async with opened(place, ledger) as listener:
-        await listener.handle(NewLiability(place.address("robot"), "0x"))
-        assert listener.liabilities == []
 
 
 class Behind:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from mesh.agent import Phase
+from mesh.agent.ledger import Phase
 from mesh.recording import open_objective
 from schemas import Liability, String
-from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey
-from schemas.rpc import Done, LiabilityRead, RestartLiability, ResumeLiability
+from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
+from schemas.rpc import Done, LiabilityRead, LiabilityRequest
 from tests.mesh.agent.controls import WORDS, Control, control, controlled, person, ready
 from tests.support.market import in_phase, offering
 from tests.support.waiting import until, until_heard
@@ -17,7 +17,8 @@ from tests.support.waiting import until, until_heard
 if TYPE_CHECKING:
     import zenoh
 
-    from mesh.agent import Agent, Contract
+    from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Contract
     from tests.support.market import Place
 
 __all__ = ["control", "person"]
@@ -84,7 +85,7 @@ async def test_restart_begins_a_fresh_recording(place: Place, control: Control, 
     await control.start(contract.address)
     await control.played(contract.address)
     await control.say(contract.address, "/state", "first try")
-    assert await control.ask("restart", RestartLiability(contract.address)) == Done(True)
+    assert await control.ask("restart", LiabilityRequest(contract.address)) == Done(True)
     await control.played(contract.address)
     await control.say(contract.address, "/state", "second try")
     await control.finish(contract.address)
@@ -94,7 +95,7 @@ async def test_restart_begins_a_fresh_recording(place: Place, control: Control, 
 
 async def test_a_ready_job_may_be_restarted_too(place: Place, control: Control, person: Agent) -> None:
     contract = await ready(control, person, place)
-    assert await control.ask("restart", RestartLiability(contract.address)) == Done(True)
+    assert await control.ask("restart", LiabilityRequest(contract.address)) == Done(True)
     await control.played(contract.address)
     await control.finish(contract.address)
     assert (await contract.outcome()).success
@@ -108,7 +109,7 @@ async def test_resume_continues_a_job_after_a_restart_of_the_agent(place: Place)
             await control.played(contract.address)
             await control.say(contract.address, "/state", "before")
         async with controlled(place, place.agent("robot")) as control:
-            assert await control.ask("resume", ResumeLiability(contract.address)) == Done(True)
+            assert await control.ask("resume", LiabilityRequest(contract.address)) == Done(True)
             await control.say(contract.address, "/state", "after")
             await control.finish(contract.address)
             assert (await contract.outcome()).success

@@ -6,24 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.agent import Phase
+from mesh.agent.ledger import Phase, WrongPhase
 from mesh.network import ServiceFailed
-from mesh.work import WrongPhase
 from schemas import ZERO_ADDRESS, cid_of_bytes
-from schemas.rpc import (
-    Done,
-    FinishLiability,
-    LiabilityRead,
-    ReadLiability,
-    RestartLiability,
-    ResumeLiability,
-    StartLiability,
-)
+from schemas.rpc import Done, FinishLiability, LiabilityRead, LiabilityRequest
 from tests.mesh.agent.controls import Control, control, controlled, person, ready
 from tests.support.market import in_phase, offering_unseen
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from tests.support.market import Place
 
 __all__ = ["control", "person"]
@@ -41,13 +32,13 @@ async def test_a_request_that_the_phase_does_not_allow_is_answered_with_the_reas
     address = contract.address
     await control.start(address)
     assert await control.start(address) == not_done(address, "start", Phase.RUNNING)
-    resumed = await control.ask("resume", ResumeLiability(address))
+    resumed = await control.ask("resume", LiabilityRequest(address))
     assert resumed == not_done(address, "resume", Phase.RUNNING)
     await control.finish(address)
     with pytest.raises(ServiceFailed) as caught:
         await control.finish(address)
     assert (caught.value.service, caught.value.reason) == ("finish", "agent-error")
-    for service, request in (("start", StartLiability), ("restart", RestartLiability), ("resume", ResumeLiability)):
+    for service, request in (("start", LiabilityRequest), ("restart", LiabilityRequest), ("resume", LiabilityRequest)):
         done = await control.ask(service, request(address))
         assert not done.success
         assert done.msg.startswith(f"can't {service} {address}: it is ")
@@ -76,9 +67,9 @@ async def test_an_unknown_liability_is_not_a_job(control: Control) -> None:
 
 @pytest.mark.parametrize("service", ["start", "restart", "resume", "finish", "read"])
 async def test_an_invalid_address_is_an_error_reply(control: Control, service: str) -> None:
-    requests = {"finish": FinishLiability("the kitchen", True), "read": ReadLiability("the kitchen")}
+    requests = {"finish": FinishLiability("the kitchen", True), "read": LiabilityRequest("the kitchen")}
     with pytest.raises(ServiceFailed) as caught:
-        await control.ask(service, requests.get(service, StartLiability("the kitchen")))
+        await control.ask(service, requests.get(service, LiabilityRequest("the kitchen")))
     assert (caught.value.service, caught.value.reason) == (service, "agent-error")
     assert "'the kitchen' is not an address" in str(caught.value), "the caller gets only the sentence"
 

@@ -10,7 +10,7 @@ import pytest
 import pytest_asyncio
 
 from mesh.chain import Chain, Finalized, NewLiability
-from mesh.devchain.development import deploy_market
+from mesh.dev.development import deploy_market
 from schemas import Empty
 from tests.mesh.chain.conftest import events_of, read_to
 from tests.support.market import QUICK, Founded, Place, offering
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh import Agent
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
     from tests.support.routers import EmbeddedRouter
 
 COST = 1_000

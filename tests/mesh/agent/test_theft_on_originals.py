@@ -8,10 +8,10 @@ import pytest
 from msgspec.structs import force_setattr
 from web3 import Web3
 
-from mesh.agent import Agent
+from mesh.agent.agent import Agent
 from mesh.chain import XRT, Account, Chain, UnsafeValidator
-from mesh.chain.node import Node
-from mesh.chain.validators import Validators
+from mesh.chain._node import Node
+from mesh.chain._validators import Validators
 from mesh.settings import Settings
 from schemas import Demand, Offer, Result, Verified, keccak256, message_hash, order_abi, parse_cid
 from tests.support.market import QUICK
@@ -37,7 +37,7 @@ class Theft:
 
     def __init__(self, node: Node, keys: tuple[bytes, ...]) -> None:
         self.node = node
-        self.owner, self.robot, self.stranger = (Account.from_key(key) for key in keys[:3])
+        self.owner, self.robot, self.stranger = (Account(key) for key in keys[:3])
         self.originals = Originals(node, self.owner, 3)
 
     async def prepare(self) -> None:

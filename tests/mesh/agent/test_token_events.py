@@ -6,10 +6,10 @@ import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-from mesh.agent.token_events import TokenEvents
+from mesh.agent._runtime import TokenEvents
 from mesh.chain import Account, Approval, Transfer, new_private_key
 from mesh.network import Endpoints, Network
-from schemas.agent_keys import EthEventKey
+from schemas.keys import EthEventKey
 from schemas.rpc import ApprovalEvent, TransferEvent
 from tests.mesh.agent.conftest import other_token
 from tests.support.waiting import until, until_heard
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from tests.support.market import Place
 
 ME, YOU, OTHERS = ("0x" + f"{number:02x}" * 20 for number in (1, 2, 3))
@@ -114,7 +114,7 @@ async def test_events_during_downtime_are_published_after_the_restart_and_none_t
 
 async def test_a_transfer_in_another_block_after_a_reorganisation_is_published_once(place: Place) -> None:
     chain, person = place.chains["person"], place.address("person")
-    friend = Account.from_key(new_private_key()).address
+    friend = Account(new_private_key()).address
     async with place.agent("robot") as agent, heard(place, agent) as events:
         await chain.tokens.transfer(friend, 1)  # what goes before, so that there is a block to go back to
         tx = await chain.tokens.transfer(agent.address, 7)

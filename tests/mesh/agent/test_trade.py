@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import Outcome
+from mesh.agent.contracts import Outcome
 from mesh.chain import InsufficientTokens, NotALiability
 from mesh.content import ContentUnavailable
 from mesh.errors import ClosedError
@@ -17,7 +17,7 @@ from tests.support.market import MODEL, Place, offering
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
     from schemas import Verified
 
 GENERATIONS = pytest.mark.parametrize("generation", [3, 5])

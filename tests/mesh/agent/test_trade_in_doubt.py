@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from msgspec.structs import replace
 
-from mesh.agent import Agent, LiabilityReverted, OrderExpired, Progress
-from mesh.agent.orders import OrderState
-from mesh.agent.terms import REPEATED
+from mesh.agent.agent import Agent
+from mesh.agent.errors import LiabilityReverted, OrderExpired
+from mesh.agent.orders import REPEATED, OrderState
 from mesh.chain import Chain, Timing
+from mesh.chain._validators import Validators
 from mesh.chain.liabilities import Liabilities
-from mesh.chain.validators import Validators
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
 from schemas.signing import Rejection
@@ -21,6 +21,9 @@ from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, known, posted, w
 from tests.support.log_events import logged_facts
 from tests.support.market import MODEL, Place
 from tests.support.waiting import until, until_found, until_heard
+
+if TYPE_CHECKING:
+    from mesh.agent.contracts import Progress
 
 
 async def test_a_demand_without_a_match_expires_at_its_deadline(place: Place) -> None:

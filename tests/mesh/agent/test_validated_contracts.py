@@ -21,14 +21,16 @@ from mesh import (
     ValidatorSilent,
     Verified,
 )
-from mesh.agent import Phase
+from mesh.agent.ledger import Phase
 from mesh.agent.validators import OLDEST
-from mesh.chain import UnsafeValidator, ValidatorWithoutCode
+from mesh.chain import UnsafeValidator
+from mesh.errors import InputError
 from schemas import Demand, ReportKey, Result, Signer, decode
 from tests.mesh.agent.trades import OBJECTIVE, job, working
 from tests.support.jurors import COMPLETE, MISSING, Juror
 from tests.support.log_events import logged_facts
 from tests.support.market import Place, in_phase
+from tests.support.raising import raises_with
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -161,9 +163,10 @@ async def test_those_who_wait_are_told_that_the_validator_is_silent(place: Place
         assert (unjudged.position, unjudged.total) == (0, 1)
         assert f"from block {refundable:,}" in unjudged.detail
         again: list[Progress] = []
-        late = asyncio.create_task(contract.outcome(on_progress=again.append))  # the robot has said all that it says
-        await until(lambda: any(one.kind == "unjudged" for one in again))
-        assert "result" not in [one.kind for one in again]
+        late = asyncio.create_task(
+            contract.outcome(on_progress=again.append)
+        )  # who comes late is told what has happened
+        await until(lambda: {"result", "unjudged"} <= {one.kind for one in again})
         await judge(place, juror, robot, contract, success=True)
         assert (await ending).success
         assert (await late).success
@@ -312,6 +315,6 @@ async def test_a_report_of_a_stranger_to_the_jury_does_not_count(place: Place) -
 
 async def test_a_validator_without_code_is_refused_before_anything_is_signed(place: Place) -> None:
     async with place.agent("person", generation=5) as person:
-        with pytest.raises(ValidatorWithoutCode):
+        with raises_with(InputError, code="validator-without-code"):
             await person.order(OBJECTIVE, cost=5, validator=STRANGER.address)
         assert person.orders() == []

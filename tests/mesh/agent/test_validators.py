@@ -7,15 +7,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.agent import Agent
-from mesh.chain import XRT, Chain, UnsafeValidator
+from mesh.agent.agent import Agent
+from mesh.chain import XRT, Chain, UnsafeValidator, deploy
 from schemas import Demand, InvalidMessage, Offer
 from tests.mesh.agent.trades import OBJECTIVE, waiting
 from tests.support.market import MODEL, QUICK, QUICK_RESEND, Place
 from tests.support.orders import terms
 
 if TYPE_CHECKING:
-    from mesh.chain.contracts import ContractKind
+    from collections.abc import Awaitable, Callable
+
+    from mesh.chain._contracts import ContractKind
 
 KINDS = pytest.mark.parametrize(
     ("contracts", "generation"), [("mesh", 3), ("mesh", 5), ("original", 3), ("original", 5)]
@@ -41,12 +43,19 @@ def chain_with(place: Place, role: str, contracts: ContractKind, generation: int
     )
 
 
+async def foreign_trap(place: Place) -> str:
+    """A lighthouse of another deployment on the same chain."""
+    made = await deploy(place.chains["provider"].node, place.market.accounts["provider"])
+    return made.lighthouse
+
+
+@pytest.mark.parametrize("make_trap", [trap, foreign_trap])
 @KINDS
 async def test_a_robot_does_not_offer_where_its_offer_would_be_a_demand(
-    place: Place, contracts: ContractKind, generation: int
+    place: Place, contracts: ContractKind, generation: int, make_trap: Callable[[Place], Awaitable[str]]
 ) -> None:
     """The stranger's demand, and the offer that it waits for."""
-    lighthouse = await trap(place)
+    lighthouse = await make_trap(place)
     settings = place.settings("robot", contracts=contracts, generation=generation)
     async with chain_with(place, "robot", contracts, generation) as chain:
         robot = Agent(
@@ -75,8 +84,9 @@ async def test_a_robot_does_not_offer_where_its_offer_would_be_a_demand(
 
 
 async def test_an_order_is_published_only_with_a_validator_that_was_checked(place: Place) -> None:
-    lighthouse, contract = await trap(place), place.market.deployment.xrt
+    lighthouse = await trap(place)
     async with place.agent("robot") as robot:
+        contract = (await place.chains["provider"].validators.deploy([robot.address], 1)).address
         for validator in (lighthouse, contract):
             with pytest.raises(UnsafeValidator):
                 robot.send(Offer(**terms(validator=validator), lighthouse_fee=0))

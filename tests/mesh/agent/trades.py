@@ -12,9 +12,9 @@ from tests.support.waiting import until_found
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.agent import Agent
-    from mesh.work import Outgoing
-    from mesh.work.job import Job
+    from mesh.agent.agent import Agent
+    from mesh.agent.handlers import Job
+    from mesh.agent.ledger import Outgoing
 
 OBJECTIVE = cid_of_bytes(b"something to be done")
 

@@ -27,8 +27,8 @@ from mesh.chain import (
     Timing,
     deploy,
 )
-from mesh.devchain import EmbeddedChain
-from mesh.devchain.embedded import EmbeddedProvider
+from mesh.dev import EmbeddedChain
+from mesh.dev._embedded import EmbeddedProvider
 from schemas import keccak256
 from schemas.address import ZERO_ADDRESS
 from schemas.cid import cid_of_digest
@@ -36,10 +36,10 @@ from schemas.messages import Demand, Offer, Result
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable, Iterator
+    from collections.abc import AsyncIterator, Iterator
 
     from mesh.chain import BlockEvents, ChainEvent
-    from mesh.chain.transports import Transport
+    from mesh.chain.rpc import Transport
 
 E = TypeVar("E", bound=Exception)
 
@@ -110,7 +110,7 @@ def next_nonce() -> str:
 
 async def prepare(endpoint: str | Transport, keys: tuple[bytes, ...]) -> DeployedMarket:
     """Deploy everything; stake the provider; give promisee and promisor XRT, and let the factory take it."""
-    deployer, provider, promisee, promisor, stranger = (Account.from_key(key) for key in keys[:5])
+    deployer, provider, promisee, promisor, stranger = (Account(key) for key in keys[:5])
     async with Node(endpoint, timing=QUICK) as node:
         market = DeployedMarket(
             endpoint, await deploy(node, deployer, plan=PLAN), deployer, provider, promisee, promisor, stranger
@@ -126,10 +126,10 @@ async def prepare(endpoint: str | Transport, keys: tuple[bytes, ...]) -> Deploye
     return market
 
 
-async def read_to(chain: Chain, first: int, last: int, *, lighthouses: Iterable[str] = ()) -> list[BlockEvents]:
+async def read_to(chain: Chain, first: int, last: int) -> list[BlockEvents]:
     """The events of the blocks from `first` to `last`."""
     blocks: list[BlockEvents] = []
-    async with asyncio.timeout(60), aclosing(chain.follow(first, lighthouses=lighthouses)) as events:
+    async with asyncio.timeout(60), aclosing(chain.follow(first)) as events:
         async for block in events:
             blocks.append(block)
             if block.block_number >= last:
@@ -139,14 +139,6 @@ async def read_to(chain: Chain, first: int, last: int, *, lighthouses: Iterable[
 
 def events_of(blocks: list[BlockEvents]) -> list[ChainEvent]:
     return [event for block in blocks for event in block.events]
-
-
-@contextmanager
-def raises_with(kind: type[E], **fields: object) -> Iterator[pytest.ExceptionInfo[E]]:
-    """Expect an error of a class whose fields have these values."""
-    with pytest.raises(kind) as caught:
-        yield caught
-    assert {name: getattr(caught.value, name) for name in fields} == fields
 
 
 @contextmanager
@@ -184,6 +176,26 @@ class Flaky(EmbeddedProvider):
         if self.is_lost:
             raise ConnectionError("the wire is cut")
         return await super().make_request(method, params)
+
+
+class OneAtATime:
+    """A node that takes one transaction, and refuses the next ones as geth does above its cap, until `allow`."""
+
+    def __init__(self, upstream: Any) -> None:
+        self._upstream = upstream
+        self.taken = 0
+        self._allowed = 0
+
+    def allow(self) -> None:
+        self._allowed = self.taken + 1
+
+    async def make_request(self, method: str, params: Any) -> Any:
+        if method == "eth_sendRawTransaction":
+            if self.taken == self._allowed:
+                refusal = {"code": -32000, "message": "tx fee (1.21 ether) exceeds the configured cap (1.00 ether)"}
+                return {"jsonrpc": "2.0", "id": 1, "error": refusal}
+            self.taken += 1
+        return await self._upstream.make_request(method, params)
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module", params=["embedded", "anvil"])

@@ -35,12 +35,12 @@ async def open_sender(
 ) -> AsyncIterator[tuple[Node, TransactionSender]]:
     """A node connection, and a sender for anvil's first account."""
     async with Node(anvil.url, timing=timing, **options) as node:
-        yield node, TransactionSender(node, Account.from_key(anvil.private_keys[0]))
+        yield node, TransactionSender(node, Account(anvil.private_keys[0]))
 
 
 def unused_address() -> str:
     """An address that nothing was sent to."""
-    return Account.from_key(new_private_key()).address
+    return Account(new_private_key()).address
 
 
 async def pending_transactions(node: Node) -> dict[int, Any]:

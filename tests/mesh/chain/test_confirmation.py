@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import GWEI, Account, FeePolicy, Node, NodeUnreachable, TransactionSender, TransactionTimeout
-from mesh.chain.transports import HttpTransport
+from mesh.chain.rpc import HttpTransport
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.senders import SHORT, anvil, make_too_cheap, open_sender, until_pending, unused_address
 
@@ -59,7 +59,7 @@ async def test_the_replaced_version_may_be_the_one_that_is_mined(anvil: Anvil) -
     wire, friend = _Swallowing(anvil.url), unused_address()
     async with Node(wire, timing=replace(QUICK, replace_after=0.05)) as node:
         sending = asyncio.create_task(
-            TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
+            TransactionSender(node, Account(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
         )
         first = (await until_pending(node, 1))[0]
         async with asyncio.timeout(60):
@@ -133,7 +133,7 @@ async def test_a_confirmed_transaction_that_a_reorganisation_left_in_the_pool_is
     wire, friends = _Recording(anvil.url), (unused_address(), unused_address())
     timing = replace(QUICK, replace_after=0.1)
     async with Node(wire, timing=timing, transactions=tmp_path if kept else None) as node:
-        sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
+        sender = TransactionSender(node, Account(anvil.private_keys[0]))
         before = await node.request("evm_snapshot")
         sending = asyncio.create_task(sender.send(to=friends[0], data=b"", value=5))
         await until_pending(node, 1)
@@ -157,7 +157,7 @@ async def test_a_confirmed_transaction_that_a_reorganisation_left_in_the_pool_is
 async def test_a_nonce_that_a_reorganisation_freed_and_nobody_remembers_is_filled(anvil: Anvil) -> None:
     """As when a process ends once its transaction is mined, and a reorganisation takes that one."""
     friends, timing = (unused_address(), unused_address()), replace(QUICK, replace_after=0.1)
-    account = Account.from_key(anvil.private_keys[0])
+    account = Account(anvil.private_keys[0])
     async with Node(anvil.url, timing=timing) as node, Node(anvil.url, timing=timing) as restarted:
         before = await node.request("evm_snapshot")
         first = asyncio.create_task(TransactionSender(node, account).send(to=friends[0], data=b"", value=5))
@@ -178,7 +178,7 @@ async def test_a_nonce_that_a_reorganisation_freed_and_nobody_remembers_is_fille
 
 async def test_all_nonces_that_a_reorganisation_freed_are_filled_together(anvil: Anvil) -> None:
     wire, others, count = _Recording(anvil.url), [unused_address() for _ in range(3)], 3
-    account, timing = Account.from_key(anvil.private_keys[0]), replace(QUICK, replace_after=0.5)
+    account, timing = Account(anvil.private_keys[0]), replace(QUICK, replace_after=0.5)
     async with Node(anvil.url, timing=timing) as node, Node(wire, timing=timing) as restarted:
         before = await node.request("evm_snapshot")
         forgotten = TransactionSender(node, account)
@@ -219,7 +219,7 @@ async def test_a_node_that_is_still_indexing_is_asked_for_the_receipt_again(anvi
     wire, friend = _Indexing(anvil.url), unused_address()
     async with Node(wire, timing=QUICK) as node:
         await node.request("evm_setAutomine", True)
-        await TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
+        await TransactionSender(node, Account(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
         assert await node.eth_balance(friend) == 5
         assert wire.asked == 5
     await wire.close()
@@ -229,7 +229,7 @@ async def test_sending_again_after_a_lost_answer_continues_the_first_transaction
     """The node takes the transaction and is gone before it says so; the caller tries again when it is back."""
     wire, friend = _AnswerLosingTransport(anvil.url), unused_address()
     async with Node(wire, timing=QUICK) as node:
-        sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
+        sender = TransactionSender(node, Account(anvil.private_keys[0]))
         wire.loses = True
         with pytest.raises(NodeUnreachable):
             await sender.send(to=friend, data=b"", value=5)

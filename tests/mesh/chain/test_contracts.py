@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import XRT, Finalized, NotALiability, NotOffered
-from mesh.chain.errors import UnknownContracts
-from mesh.errors import InvalidMessage
-from tests.mesh.chain.conftest import cid, events_of, raises_with, read_to
+from mesh.errors import ConfigurationError, InvalidMessage
+from tests.mesh.chain.conftest import cid, events_of, read_to
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from tests.mesh.chain.conftest import DeployedMarket
@@ -112,6 +112,6 @@ async def test_functions_that_the_originals_lack_raise_not_offered(market: Deplo
 
 async def test_unknown_contract_versions_are_refused(market: DeployedMarket) -> None:
     for options in ({"contracts": "original", "generation": 4}, {"contracts": "other"}):
-        with raises_with(UnknownContracts, code="unknown-contracts"):
+        with raises_with(ConfigurationError, code="unknown-contracts"):
             async with market.chain(factory=market.deployment.factory, xrt=market.deployment.xrt, **options):
                 pass

@@ -6,7 +6,7 @@ import pytest
 
 from mesh.chain import NewLighthouse
 from mesh.chain.answers import Address, Count, Data, Log, Word
-from mesh.chain.events import decode_log
+from mesh.chain.following import decode_log
 from schemas import keccak256
 from schemas.address import address_bytes
 

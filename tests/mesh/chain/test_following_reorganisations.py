@@ -18,15 +18,15 @@ from mesh.chain import (
     History,
     Node,
     Reorganisation,
-    ReorganisedTooDeep,
     deploy,
 )
-from mesh.chain.reader import SeenBlock
-from mesh.devchain import EmbeddedChain
+from mesh.chain.following import SeenBlock
+from mesh.dev import EmbeddedChain
 from mesh.errors import ConfigurationError, InputError
 from tests.mesh.chain.conftest import QUICK
 from tests.support.log_events import logged_events
 from tests.support.nodes import Anvil, written_state
+from tests.support.raising import raises_with
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -70,13 +70,13 @@ class Fork:
 async def fork(request: pytest.FixtureRequest) -> AsyncIterator[Fork]:
     if request.param == "embedded":
         async with EmbeddedChain() as node:
-            account, friend = (Account.from_key(key) for key in node.funded_keys[:2])
+            account, friend = (Account(key) for key in node.funded_keys[:2])
             await deploy(node.provider, account)
             async with Chain(node.provider, account=account, timing=QUICK) as chain:
                 yield Fork(chain, friend.address)
     else:
         async with Anvil() as anvil:
-            account, friend = (Account.from_key(key) for key in anvil.private_keys[:2])
+            account, friend = (Account(key) for key in anvil.private_keys[:2])
             await deploy(anvil.url, account)
             async with Chain(anvil.url, account=account, timing=QUICK) as chain:
                 yield Fork(chain, friend.address)
@@ -193,9 +193,8 @@ async def test_a_reorganisation_of_the_whole_depth_is_reverted_and_a_deeper_one_
             head = await fork.approve(value)
             await _until(events, _reaches(head))
         await fork.replace_last(4)
-        with pytest.raises(ReorganisedTooDeep) as caught:
+        with raises_with(ChainWentBack, code="reorganised-too-deep") as caught:
             await _until(events, _reaches(head + 10))
-    assert isinstance(caught.value, ChainWentBack)
     assert (caught.value.cursor, caught.value.head) == (head - 3, head + 1)
 
 
@@ -211,18 +210,18 @@ async def test_no_event_is_lost_if_blocks_are_replaced_while_several_are_read(
         await fork.request("evm_mine")
         await _until(events, _reaches(start + 1))
         await fork.request("evm_mine", 2)
-        original, replaced = node.logs, list[int]()
+        original, replaced = node.header, list[int]()
 
-        async def logs(first: int, last: int, **options: Any) -> Any:
-            if first < last and not replaced:
-                replaced.append(first)
+        async def header(block: int | str) -> Any:
+            if block == start + 2 and not replaced:
+                replaced.append(start + 2)
                 await fork.request("evm_revert", hex(start))
                 await fork.approve(8)
                 await fork.approve(9)
                 await fork.request("evm_mine", 2)
-            return await original(first, last, **options)
+            return await original(block)
 
-        monkeypatch.setattr(node, "logs", logs)
+        monkeypatch.setattr(node, "header", header)
         blocks = await _until(events, _reaches(start + 4))
     assert replaced == [start + 2]
     assert [value for block in blocks for value in _values(block.events)] == [8, 9]
@@ -231,20 +230,21 @@ async def test_no_event_is_lost_if_blocks_are_replaced_while_several_are_read(
 async def test_a_list_is_read_again_if_blocks_are_replaced_meanwhile(
     fork: Fork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node, asked = fork.chain.node, list[int]()
-    before = await fork.chain.lighthouses.list()
+    node, asked, replace_at = fork.chain.node, list[int](), 0
     await fork.approve(1)
-    original = node.logs
+    original = node.block_logs
 
-    async def logs(first: int, last: int, **options: Any) -> Any:
-        asked.append(first)
-        if len(asked) == 1:
+    async def block_logs(block: Any, **options: Any) -> Any:
+        asked.append(block.number)
+        if len(asked) == replace_at:
             await fork.replace_last(1)
-        return await original(first, last, **options)
+        return await original(block, **options)
 
-    monkeypatch.setattr(node, "logs", logs)
+    monkeypatch.setattr(node, "block_logs", block_logs)
+    before = await fork.chain.lighthouses.list()
+    once, replace_at = asked.copy(), len(asked) + 1
     assert await fork.chain.lighthouses.list() == before
-    assert len(asked) == 2
+    assert asked == 3 * once
 
 
 async def test_a_block_that_was_not_handled_completely_is_yielded_again_or_reverted(fork: Fork) -> None:
@@ -293,7 +293,7 @@ async def _anvil_with_state(folder: Path) -> AsyncIterator[Anvil]:
 async def test_events_that_a_killed_node_lost_are_reverted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     state = tmp_path / "state.json"
     async with _anvil_with_state(tmp_path) as anvil:
-        account, friend = (Account.from_key(key) for key in anvil.private_keys[:2])
+        account, friend = (Account(key) for key in anvil.private_keys[:2])
         await deploy(anvil.url, account)
         history = History()
         async with Chain(anvil.url, account=account, timing=replace(QUICK, attempts=1)) as chain:
@@ -320,7 +320,7 @@ async def test_events_that_a_killed_node_lost_are_reverted(tmp_path: Path, caplo
 async def test_a_chain_that_was_restarted_from_nothing_is_an_error() -> None:
     history = History()
     async with Anvil() as anvil, Node(anvil.url, timing=QUICK) as node:
-        account = Account.from_key(anvil.private_keys[0])
+        account = Account(anvil.private_keys[0])
         await deploy(node, account)
         async with Chain(node) as chain, aclosing(chain.follow(5, history=history)) as events:
             await _until(events, _reaches(await chain.block_number()))
@@ -331,7 +331,7 @@ async def test_a_chain_that_was_restarted_from_nothing_is_an_error() -> None:
         await node.request("evm_mine")
         await deploy(node, account)
         async with Chain(node) as chain:
-            with pytest.raises(ReorganisedTooDeep) as caught:
+            with raises_with(ChainWentBack, code="reorganised-too-deep") as caught:
                 await anext(chain.follow(head + 1, history=history))
     assert caught.value.cursor == 4
     assert "data_dir" in caught.value.hint

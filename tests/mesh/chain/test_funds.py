@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import RequestRefused, Timing
-from mesh.chain.funds import BATCH, NO_TOKEN, Funding, Holding
+from mesh.chain._tokens import BATCH, NO_TOKEN, Funding, Holding
 from schemas import Demand, Signer, Verified, verify_message
 from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with
 from tests.support import orders
@@ -31,7 +31,7 @@ def demand_of(market: DeployedMarket, signer: Signer, **changes: Any) -> Verifie
 
 async def can_be_paid(chain: Chain, *orders: Verified[Order], fresh: bool = False) -> bool:
     """Whether the makers of all these orders can pay."""
-    return not any(await chain.costs.shortages(orders, fresh=fresh))
+    return not any(await chain.funds.shortages(orders, fresh=fresh))
 
 
 async def test_an_order_is_covered_by_balance_and_allowance(market: DeployedMarket) -> None:
@@ -53,9 +53,9 @@ async def test_an_order_is_covered_by_balance_and_allowance(market: DeployedMark
 async def test_fresh_keys_cost_few_requests_and_a_second_look_none(market: DeployedMarket) -> None:
     made = [demand_of(market, Signer(secrets.token_bytes(32)), cost=1) for _ in range(300)]
     async with market.chain(timing=SLOW) as chain:
-        assert await chain.costs.shortages(made) == 300 * ["ERC20InsufficientAllowance"]
+        assert await chain.funds.shortages(made) == 300 * ["ERC20InsufficientAllowance"]
         assert chain.funds.requests == -(-300 // BATCH)
-        assert await chain.costs.shortages(made) == 300 * ["ERC20InsufficientAllowance"]
+        assert await chain.funds.shortages(made) == 300 * ["ERC20InsufficientAllowance"]
         assert chain.funds.requests == -(-300 // BATCH)
         assert await can_be_paid(chain, demand_of(market, market.stranger.signer, cost=0))
         assert chain.funds.requests == -(-300 // BATCH), "what costs nothing needs no question"
@@ -66,7 +66,7 @@ async def test_who_pays_in_can_pay_soon(market: DeployedMarket) -> None:
     async with market.chain(person) as chain:
         await chain.tokens.approve(chain.factory, 5)
         demands = [demand_of(market, person.signer, cost=cost) for cost in (5, 6)]
-        assert await chain.costs.shortages(demands) == ["", "ERC20InsufficientAllowance"]
+        assert await chain.funds.shortages(demands) == ["", "ERC20InsufficientAllowance"]
         await chain.tokens.approve(chain.factory, 6)
         await until_found(lambda: can_be_paid(chain, *demands))
 
@@ -83,7 +83,7 @@ async def test_what_tells_no_balances_is_no_token_and_spoils_no_other_answer(
         assert (read := known[readable]) is not None
         assert read.balance == await chain.tokens.balance(person.address)
         demand = demand_of(market, person.signer, token=strange, cost=1)
-        assert await chain.costs.shortages([demand]) == ["TokenUnreadable"]
+        assert await chain.funds.shortages([demand]) == ["TokenUnreadable"]
 
 
 async def test_tokens_that_use_up_the_gas_of_a_request_hide_nobodys_funds(market: DeployedMarket) -> None:

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import Node
+from mesh.chain._node import Heads, Pace, decode_calls, encode_calls
 from mesh.chain.answers import NO_TRANSACTIONS, BlockHeader
-from mesh.chain.events import topics_of
-from mesh.chain.heads import Heads, Pace
-from mesh.chain.multicall import decode_calls, encode_calls
-from mesh.chain.transports import HttpTransport
+from mesh.chain.following import topics_of
+from mesh.chain.rpc import HttpTransport
 from schemas import keccak256
 from schemas.address import address_bytes
 from tests.mesh.chain.conftest import QUICK
@@ -191,10 +190,13 @@ def test_a_header_excludes_logs_that_its_bloom_filter_excludes() -> None:
 async def test_the_bloom_filters_of_nodes_show_the_events_that_are_read(market: DeployedMarket) -> None:
     async with market.chain(market.provider) as chain:
         await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="bloom")
-        header = await chain.node.latest_header()
+        header = await chain.node.heads.look()
         topics = topics_of("Factory")
         (log, *_) = await chain.node.logs(header.number, header.number, addresses=[chain.factory], topics=topics)
         assert header.has_transactions
+        assert header.may_hold(["0x" + "11" * 32, "0x" + log.transaction_hash.hex()])
+        assert not header.may_hold(["0x" + "11" * 32])
+        assert block(1, 0).may_hold(["0x" + "11" * 32]), "a header that was pushed does not say"
         assert header.may_log((address_bytes(chain.factory), log.topics[0]))
         assert not header.may_log((address_bytes(chain.factory), bytes(32)))
 
@@ -218,5 +220,5 @@ async def test_many_functions_are_read_in_one_call(anvil: Anvil, market: Deploye
 
 def test_the_calls_in_a_multicall_can_be_read_back() -> None:
     calls = [("0x" + "11" * 20, b"\x01\x02"), ("0x" + "22" * 20, b"")]
-    assert decode_calls(encode_calls(calls)) == calls
+    assert decode_calls(encode_calls(calls, gas=9, most=9)) == calls
     assert decode_calls(b"\x60\x00") is None

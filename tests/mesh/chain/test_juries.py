@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
+from unittest.mock import AsyncMock
 
 import pytest
 from msgspec import structs
@@ -12,20 +13,16 @@ from mesh.chain import (
     XRT,
     Account,
     InsufficientTokens,
-    InvalidJury,
-    NoFees,
-    NotAJury,
     NotOffered,
     Timing,
     TransactionSender,
-    ValidatorWithoutCode,
-    juries,
     new_private_key,
 )
-from mesh.errors import InvalidMessage
+from mesh.errors import ChainError, InputError, InvalidMessage
 from schemas import ZERO_ADDRESS, address_bytes
 from tests.contracts.suite import artifact
-from tests.mesh.chain.conftest import cid, raises_with, reverted
+from tests.mesh.chain.conftest import cid, reverted
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from mesh.chain import Chain, DeployedJury
@@ -36,7 +33,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 def accounts(count: int) -> list[Account]:
     """New accounts, in ascending order of their addresses."""
-    found = [Account.from_key(new_private_key()) for _ in range(count)]
+    found = [Account(new_private_key()) for _ in range(count)]
     return sorted(found, key=lambda account: address_bytes(account.address))
 
 
@@ -98,7 +95,7 @@ async def test_what_is_no_jury_is_refused_before_anything_is_sent(
 ) -> None:
     async with market.chain(market.stranger) as chain:
         before = await chain.node.transaction_count(market.stranger.address)
-        with raises_with(InvalidJury, code="invalid-jury"):
+        with raises_with(InputError, code="invalid-jury"):
             await chain.validators.deploy(jurors, quorum)
         assert await chain.node.transaction_count(market.stranger.address) == before
 
@@ -112,8 +109,11 @@ async def test_other_contracts_are_no_juries(market: DeployedMarket) -> None:
         swapped = code.replace(first, marker).replace(second, first).replace(marker, second)
         assert swapped != code
         lookalike = code.replace(address_bytes(market.deployment.xrt), address_bytes(market.deployment.factory))
+        quorum = (2).to_bytes(32, "big")
+        assert code.count(quorum) > 1
         for address in [
             await place(market, swapped),
+            await place(market, code.replace(quorum, (1).to_bytes(32, "big"), 1)),
             await place(market, lookalike),
             await place(market, code + b"\0"),
             market.deployment.factory,
@@ -130,9 +130,20 @@ async def test_a_jury_that_a_node_did_not_know_is_asked_again(
     deployed, jurors = await some_jury(market)
     async with market.chain(timing=Timing(validator_recheck=0.0)) as chain:
         with monkeypatch.context() as behind:
-            behind.setattr(juries, "is_code_of", lambda name, code: False)
+            behind.setattr("mesh.chain._validators.is_code_of", lambda name, code: False)
             assert await chain.validators.jurors(deployed.address) is None
         assert await chain.validators.jurors(deployed.address) == tuple(juror.address for juror in jurors)
+
+
+async def test_a_jury_whose_code_a_node_did_not_know_is_asked_again(
+    market: DeployedMarket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployed, _ = await some_jury(market)
+    async with market.chain(timing=Timing(validator_recheck=0.0)) as chain:
+        with monkeypatch.context() as behind:
+            behind.setattr(chain.node, "code", AsyncMock(return_value=b""))
+            assert await chain.validators.quorum(deployed.address) == 0
+        assert await chain.validators.quorum(deployed.address) == deployed.quorum
 
 
 async def test_another_contract_is_asked_about_each_signer(market: DeployedMarket) -> None:
@@ -167,9 +178,9 @@ async def test_an_order_of_generation_5_with_an_account_as_validator_is_refused_
             with_jury = market.demand(cost=5, validator=deployed.address, **author)
             if generation == 5:
                 await chain.validators.is_safe(market.stranger.address)
-                with raises_with(ValidatorWithoutCode, code="validator-without-code", validator=order.validator):
+                with raises_with(InputError, code="validator-without-code", match=order.validator):
                     await chain.validators.check(order)
-                with pytest.raises(ValidatorWithoutCode):
+                with raises_with(InputError, code="validator-without-code"):
                     chain.validators.check_known(order)
             else:
                 await chain.validators.check(order)
@@ -241,7 +252,7 @@ async def test_an_order_on_the_originals_names_no_jury_that_needs_several(market
 async def test_the_keeper_collects_the_fees(market: DeployedMarket) -> None:
     deployed, jurors = await some_jury(market, quorum=1, size=1)
     async with market.chain(market.stranger) as keeper:
-        with raises_with(NoFees, code="no-fees"):
+        with raises_with(ChainError, code="no-fees"):
             await keeper.validators.collect(deployed.address)
         async with market.chain(market.provider, generation=5) as chain:
             liability = await create(market, chain, deployed.address, fee=2 * XRT)
@@ -261,5 +272,5 @@ async def test_the_keeper_collects_the_fees(market: DeployedMarket) -> None:
         jury = await keeper.validators.jury(deployed.address)
         assert jury is not None
         assert replace(jury, fees=0) == jury
-        with raises_with(NotAJury, code="not-a-jury"):
+        with raises_with(ChainError, code="not-a-jury"):
             await keeper.validators.collect(market.deployment.factory)

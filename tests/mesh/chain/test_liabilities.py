@@ -8,11 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, NotALiability, NotOffered, OrderAlreadyUsed, new_private_key
-from mesh.devchain import EmbeddedChain
+from mesh.chain import (
+    XRT,
+    Account,
+    Chain,
+    NotALiability,
+    NotOffered,
+    OrderAlreadyUsed,
+    Reverted,
+    new_private_key,
+)
+from mesh.dev import EmbeddedChain
 from mesh.errors import InvalidMessage
 from schemas import cancellation_hash, message_hash
-from tests.mesh.chain.conftest import QUICK, Flaky, cid, prepare, raises_with, reverted
+from tests.mesh.chain.conftest import QUICK, Flaky, cid, prepare, reverted
+from tests.support.raising import raises_with
+from tests.support.tokens import block, deploy_blocking_token
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -90,7 +101,7 @@ async def test_the_originals_need_a_turn_to_finalize(market: DeployedMarket) -> 
 
 
 async def test_only_liabilities_can_be_cancelled_and_watched(market: DeployedMarket) -> None:
-    unused = Account.from_key(new_private_key()).address
+    unused = Account(new_private_key()).address
     signature = _signed(market.promisee, unused)
     async with market.chain(market.stranger) as chain:
         with raises_with(NotALiability, address=unused):
@@ -266,3 +277,43 @@ async def test_the_originals_withdraw_no_order(market: DeployedMarket, generatio
     async with market.chain(market.promisee, contracts="original", generation=generation) as chain:
         with raises_with(NotOffered, what="withdrawal of orders", generation=generation):
             await chain.liabilities.withdraw(demand)
+
+
+async def test_a_payment_that_the_token_refuses_is_claimed_later(market: DeployedMarket) -> None:
+    promisee, stranger = market.promisee.address, market.stranger.address
+    async with market.chain(market.promisee) as chain:
+        token = await deploy_blocking_token(chain, 100)
+        await block(chain, token, promisee)
+    first, second = [await _made(market, token=token, cost=30) for _ in range(2)]
+    async with market.chain(market.provider) as chain:
+        await chain.liabilities.finalize("airalab", market.result(first, success=False))
+        record = await chain.liabilities.get(first)
+        assert (record.is_finalized, record.is_success) == (True, False)
+        assert (await chain.liabilities.owed(token, promisee), await chain.liabilities.owed(token)) == (30, 0)
+        assert await chain.liabilities.owed_after(record) == 30
+        assert await chain.liabilities.owed_after(await chain.liabilities.get(second)) == 0
+        with raises_with(Reverted, reason="NothingOwed"):
+            await chain.liabilities.claim(token)
+        with raises_with(Reverted, reason=""):
+            await chain.liabilities.claim(token, promisee)
+        with pytest.raises(ValueError, match="only an account itself"):
+            await chain.liabilities.claim(token, promisee, to=stranger)
+    async with market.chain(market.promisee) as chain:
+        await chain.liabilities.claim(token, to=stranger)
+        assert await chain.tokens.balance(stranger, token=token) == 30
+        assert await chain.liabilities.owed(token) == 0
+        await chain.liabilities.finalize_without_turn(market.result(second, success=False))
+        await block(chain, token, promisee, is_blocked=False)
+    async with market.chain(market.stranger) as chain:
+        await chain.liabilities.claim(token, promisee)
+        assert await chain.tokens.balance(promisee, token=token) == 70
+
+
+async def test_xrt_is_never_owed_and_the_originals_owe_nothing(market: DeployedMarket) -> None:
+    async with market.chain(market.promisee) as chain:
+        assert await chain.liabilities.owed(chain.xrt) == await chain.liabilities.owed("xrt.3.robonomics.eth") == 0
+    async with market.chain(market.promisee, contracts="original", generation=5) as chain:
+        assert await chain.liabilities.owed(market.stranger.address) == 0
+        for to in (None, market.stranger.address):
+            with raises_with(NotOffered, what="claims", generation=5):
+                await chain.liabilities.claim(market.stranger.address, to=to)

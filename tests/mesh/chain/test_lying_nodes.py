@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import Account, Chain, NewLighthouse, TransactionSender, deploy
-from mesh.chain.answers import Address, Count, Data, InvalidAnswer, Log, Word
-from mesh.chain.events import LONGEST_NAME, decode_log
-from mesh.chain.reverts import explain
-from mesh.devchain import EmbeddedChain
-from mesh.devchain.embedded import EmbeddedProvider
+from mesh.chain.answers import Address, Count, Data, InvalidAnswer, Log, Word, explain
+from mesh.chain.following import LONGEST_NAME, decode_log
+from mesh.dev import EmbeddedChain
+from mesh.dev._embedded import EmbeddedProvider
 from schemas import keccak256
 from tests.mesh.chain.conftest import QUICK, events_of, read_to
 from tests.support.log_events import logged_events
@@ -47,7 +46,7 @@ class _Lying(EmbeddedProvider):
 @pytest.fixture
 async def node() -> AsyncIterator[EmbeddedChain]:
     async with EmbeddedChain() as node:
-        await deploy(node.provider, Account.from_key(node.funded_keys[0]))
+        await deploy(node.provider, Account(node.funded_keys[0]))
         yield node
 
 
@@ -100,7 +99,7 @@ async def test_a_contract_that_logs_often_costs_one_question(node: EmbeddedChain
     runtime = ("7f" + topic + "60006000a1") * SPAM
     code = f"61{len(runtime) // 2:04x}80600c6000396000f3" + runtime
     async with Chain(wire, timing=QUICK) as chain:
-        sender = TransactionSender(chain.node, Account.from_key(node.funded_keys[1]))
+        sender = TransactionSender(chain.node, Account(node.funded_keys[1]))
         spammer = await sender.send(to=None, data=bytes.fromhex(code))
         spam = await sender.send(to=spammer.contract, data=b"")
         assert len(spam.logs) == SPAM
@@ -131,7 +130,7 @@ def test_a_contracts_reason_is_cut_off() -> None:
 
 
 async def test_a_node_can_not_name_another_contract_as_the_one_that_was_deployed(node: EmbeddedChain) -> None:
-    wire, account = _Lying(node), Account.from_key(node.funded_keys[0])
+    wire, account = _Lying(node), Account(node.funded_keys[0])
     async with Chain(wire, account=account, timing=QUICK) as chain:
         wire.lies["eth_getTransactionReceipt"] = lambda receipt: receipt | {"contractAddress": chain.factory}
         made = await chain.validators.deploy([account.address], 1)

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from mesh.chain import Account, Chain, InvalidName, TransactionSender, UnknownName, deploy, namehash
-from mesh.chain.names import parse_name, root_of
-from mesh.devchain import EmbeddedChain
+from mesh.chain import Account, Chain, TransactionSender, UnknownName, deploy, namehash
+from mesh.chain._names import root_of
+from mesh.dev import EmbeddedChain
 from schemas.cid import parse_cid
 from schemas.errors import InvalidCid
 from tests.mesh.chain.conftest import QUICK, cid
@@ -41,16 +41,6 @@ def test_names_of_the_network_are_resolved_at_their_root(name: str, root: str) -
     assert root_of(name) == root
 
 
-@pytest.mark.parametrize("text", ["", "eth", "a..eth", "ünï.eth", "a b.eth", "x.com", "0x12", "a" * 300 + ".eth"])
-def test_invalid_names_are_refused(text: str) -> None:
-    with pytest.raises(InvalidName):
-        parse_name(text)
-
-
-def test_names_ignore_case() -> None:
-    assert parse_name("AiraLab.Lighthouse.3.Robonomics.ETH") == "airalab.lighthouse.3.robonomics.eth"
-
-
 def _content_resolver(multihash: bytes) -> bytes:
     """Code that deploys a resolver that answers every call with one multihash."""
     words = (32, 34, int.from_bytes(multihash[:32], "big"), int.from_bytes(multihash[32:].ljust(32, b"\0"), "big"))
@@ -63,7 +53,7 @@ def _content_resolver(multihash: bytes) -> bytes:
 
 async def test_a_model_is_a_cid_or_a_name_of_one() -> None:
     async with EmbeddedChain() as node:
-        account = Account.from_key(node.funded_keys[0])
+        account = Account(node.funded_keys[0])
         deployment = await deploy(node.provider, account)
         places: dict[str, Any] = {"factory": deployment.factory, "xrt": deployment.xrt}
         async with Chain(node.provider, account=account, timing=QUICK, **places) as chain:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 import sys
+from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from mesh.chain import GWEI, Account, Node, TransactionSender, TransactionTimeout
-from mesh.chain.errors import TransactionsNotKept
-from tests.mesh.chain.conftest import QUICK, raises_with
+from mesh.chain._pending import FILE
+from mesh.errors import ConfigurationError
+from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.senders import NO_MINING, SHORT, anvil, open_sender, pending_hashes, until_pending, unused_address
 from tests.mesh.market.held_node import HeldNode
 from tests.support.nodes import Anvil
+from tests.support.raising import raises_with
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -24,8 +28,13 @@ if TYPE_CHECKING:
 __all__ = ["anvil"]
 
 
-def _files(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob("*") if path.is_file()]
+def _kept(folder: Path) -> list[int]:
+    """The nonces of the transactions in the tables in a folder."""
+    nonces = []
+    for path in folder.rglob(FILE):
+        with closing(sqlite3.connect(path)) as database:
+            nonces += [nonce for (nonce,) in database.execute("SELECT nonce FROM transactions")]
+    return nonces
 
 
 async def test_a_transaction_that_was_mined_long_ago_is_sent_as_a_new_one(anvil: Anvil) -> None:
@@ -71,7 +80,7 @@ async def test_a_restarted_process_sends_transactions_again_that_the_node_lost(a
         await node.request("evm_mine")
         assert (await sending).tx == forgotten
         assert await node.eth_balance(friend) == 5
-    assert _files(tmp_path) == [], "settled transactions are not kept"
+    assert _kept(tmp_path) == [], "settled transactions are not kept"
 
 
 async def test_a_restarted_process_continues_several_transactions_and_sends_none_twice(
@@ -93,7 +102,7 @@ async def test_a_restarted_process_continues_several_transactions_and_sends_none
         assert {receipt.tx for receipt in await asyncio.gather(*sending)} == set(before.values())
         assert await node.eth_balance(friend) == sum(values)
         assert await node.transaction_count(sender.account.address) == 5
-    assert _files(tmp_path) == []
+    assert _kept(tmp_path) == []
 
 
 async def test_of_several_stuck_transactions_the_first_is_replaced_and_all_are_mined_once(anvil: Anvil) -> None:
@@ -172,12 +181,12 @@ async def test_a_transaction_folder_belongs_to_one_chain(tmp_path: Path) -> None
             with pytest.raises(TransactionTimeout):
                 await sender.send(to=friend, data=b"", value=1)
             assert len(await pending_hashes(node)) == 1
-    assert [path.name for path in _files(tmp_path)] == ["000000000000.jsonl"] * 2
+    assert _kept(tmp_path) == [0, 0]
 
 
 async def test_a_transaction_that_lost_its_nonce_is_sent_with_the_next(anvil: Anvil) -> None:
     """Another client sends with the same key and nonce through another node, and is mined first."""
-    account, friend = Account.from_key(anvil.private_keys[0]), unused_address()
+    account, friend = Account(anvil.private_keys[0]), unused_address()
     async with Node(anvil.url, timing=QUICK) as node:
         sending = asyncio.create_task(TransactionSender(node, account).send(to=friend, data=b"", value=5))
         await until_pending(node, 1)
@@ -196,7 +205,7 @@ CHILD = """
 import asyncio, sys
 from pathlib import Path
 from mesh.chain import Account, Node, TransactionSender, Timing
-from mesh.chain.transports import HttpTransport
+from mesh.chain.rpc import HttpTransport
 
 class Forgetful(HttpTransport):
     async def make_request(self, method, params):
@@ -208,7 +217,7 @@ async def main(url, key, friend, folder, count):
     wire = Forgetful(url)
     timing = Timing(poll_interval=0.05, receipt_interval=0.01)
     async with Node(wire, timing=timing, transactions=Path(folder)) as node:
-        sender = TransactionSender(node, Account.from_key(bytes.fromhex(key)))
+        sender = TransactionSender(node, Account(bytes.fromhex(key)))
         await asyncio.gather(*(sender.send(to=friend, data=b"", value=1) for _ in range(int(count))))
     await wire.close()
 
@@ -237,5 +246,5 @@ async def test_processes_that_share_a_folder_never_use_the_same_nonce(tmp_path: 
 async def test_a_folder_that_can_not_be_written_is_an_error(anvil: Anvil, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     async with open_sender(anvil, transactions=tmp_path / "file") as (_, sender):
-        with raises_with(TransactionsNotKept, code="transactions-not-kept"):
+        with raises_with(ConfigurationError, code="transactions-not-kept"):
             await sender.send(to=unused_address(), data=b"", value=1)

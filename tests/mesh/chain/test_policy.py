@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSender
-from mesh.chain.policy import Fees
-from mesh.chain.transports import HttpTransport
+from mesh.chain._policy import Fees
+from mesh.chain.rpc import HttpTransport
 from mesh.errors import ConfigurationError
-from tests.mesh.chain.conftest import QUICK, raises_with
+from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.senders import unused_address
 from tests.support.nodes import Anvil
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -27,7 +28,7 @@ async def anvil() -> AsyncIterator[Anvil]:
 
 
 def _sender(node: Node, anvil: Anvil) -> TransactionSender:
-    return TransactionSender(node, Account.from_key(anvil.private_keys[0]))
+    return TransactionSender(node, Account(anvil.private_keys[0]))
 
 
 async def _next_base_fee(node: Node, wei: int) -> None:
@@ -91,7 +92,7 @@ class _Plain(HttpTransport):
 async def test_without_a_suggested_priority_fee_the_gas_price_is_used(anvil: Anvil) -> None:
     wire = _Plain(anvil.url)
     async with Node(wire, timing=QUICK) as node:
-        base = (await node.latest_header()).base_fee or 0
+        base = (await node.heads.look()).base_fee or 0
         price = await node.gas_price()
         receipt = await _sender(node, anvil).send(to=unused_address(), data=b"", value=1)
         sent = await node.request("eth_getTransactionByHash", receipt.tx)

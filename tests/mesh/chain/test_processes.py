@@ -7,8 +7,8 @@ import sys
 from typing import TYPE_CHECKING
 
 from mesh.chain import XRT, Account, Chain, deploy, new_private_key
-from mesh.devchain import serve_embedded
 from tests.mesh.chain.conftest import QUICK
+from tests.support.development import serve_embedded
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,7 +19,7 @@ from mesh.chain import Account, Chain, Timing
 
 async def main(url, key, friend, count):
     timing = Timing(poll_interval=0.05, receipt_interval=0.01)
-    async with Chain(url, account=Account.from_key(bytes.fromhex(key)), timing=timing) as chain:
+    async with Chain(url, account=Account(bytes.fromhex(key)), timing=timing) as chain:
         await asyncio.gather(*(chain.tokens.transfer(friend, 1) for _ in range(int(count))))
         print(await chain.block_number())
 
@@ -29,7 +29,7 @@ asyncio.run(main(*sys.argv[1:]))
 
 NESTING = """
 import asyncio, sys, threading, msgspec
-import mesh.chain, mesh.devchain
+import mesh.chain, mesh.dev
 
 def decode():
     try:
@@ -41,7 +41,7 @@ async def main():
     decode_in_small_thread()
     mesh.chain.write_keyfile(sys.argv[1], mesh.chain.new_private_key(), "password")
     decode_in_small_thread()
-    async with mesh.devchain.EmbeddedChain():
+    async with mesh.dev.EmbeddedChain():
         decode_in_small_thread()
 
 def decode_in_small_thread():
@@ -63,13 +63,13 @@ async def _child(program: str, *arguments: str) -> tuple[int | None, str]:
 
 
 async def test_processes_with_separate_and_shared_accounts_lose_no_transaction() -> None:
-    friend = Account.from_key(new_private_key()).address
-    async with serve_embedded(port=0) as served:
-        deployer = Account.from_key(served.node.funded_keys[0])
+    friend = Account(new_private_key()).address
+    async with serve_embedded() as served:
+        deployer = Account(served.node.funded_keys[0])
         await deploy(served.node.provider, deployer)
         async with Chain(served.url, account=deployer, timing=QUICK) as chain:
             other = served.node.funded_keys[1]
-            await chain.tokens.transfer(Account.from_key(other).address, XRT)
+            await chain.tokens.transfer(Account(other).address, XRT)
             keys = (served.node.funded_keys[0], other, other)
             ended = await asyncio.gather(*(_child(CHILD, served.url, key.hex(), friend, "8") for key in keys))
             assert [code for code, _ in ended] == [0, 0, 0], ended

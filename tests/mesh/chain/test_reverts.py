@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 from eth_abi.abi import encode
 
-from mesh.chain.answers import RpcFailure
+from mesh.chain.answers import RpcFailure, custom_errors, decode_revert, explain
 from mesh.chain.errors import REVERT_HINTS
-from mesh.chain.reverts import custom_errors, decode_revert, explain
 from schemas import keccak256
 
 ADDRESS = "0x00000000219ab540356cBB839Cbe05303d7705Fa"
@@ -45,11 +44,37 @@ def test_every_hint_is_for_an_error_of_the_contracts() -> None:
         {"code": -32000, "message": "nonce too low"},
         {"code": -32000, "message": "insufficient funds for gas * price + value"},
         {"code": -32601, "message": "the method does not exist"},
+        {"code": -32000, "message": "this node has reverted to read-only mode"},
+        {"code": -32000, "message": "reverted to an earlier block, try again"},
+        {"code": -32000, "message": "the block was reverted by a reorganisation", "data": {"reverted": True}},
+        {"code": -32603, "message": "can't revert state snapshot"},
         {},
     ],
 )
 def test_other_errors_are_not_reverts(error: dict[str, Any]) -> None:
     assert decode_revert(RpcFailure(**error)) is None
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        {"code": 3, "message": "execution reverted"},
+        {"code": -32000, "message": "execution reverted"},
+        {"code": -32000, "message": "evm: execution reverted"},
+        {"code": -32000, "message": "Execution reverted"},
+        {"code": -32000, "message": "VM Exception while processing transaction: revert"},
+        {"code": -32603, "message": "Error: Transaction reverted without a reason string"},
+        {"code": -32603, "message": "Error: VM Exception while processing transaction: reverted with an unrecognized"},
+        {"code": -32008, "message": "CONTRACT_REVERT_EXECUTED"},
+        {"code": -32000, "message": "REVERT opcode executed"},
+        {"code": -32015, "message": "VM execution error.", "data": "Reverted 0x"},
+        {"code": -32015, "message": "VM execution error.", "data": "revert"},
+    ],
+)
+def test_reverts_without_data_are_known_by_the_words_of_nodes(error: dict[str, Any]) -> None:
+    reverted = decode_revert(RpcFailure(**error))
+    assert reverted is not None
+    assert reverted.reason == ""
 
 
 def test_a_plain_revert_gives_its_text() -> None:

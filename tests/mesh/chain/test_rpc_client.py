@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 from aiohttp import web
 
-from mesh.chain import Chain, Node, NodeUnreachable, RequestRefused, Timing, WrongChain
-from mesh.chain.errors import InvalidEndpoint
-from mesh.devchain import EmbeddedChain, JsonRpcServer
+from mesh.chain import Chain, Node, NodeUnreachable, RequestRefused, Timing
+from mesh.dev import EmbeddedChain, JsonRpcServer
 from mesh.errors import ClosedError, ConfigurationError, RemoteError
-from tests.mesh.chain.conftest import QUICK, raises_with, unreachable
+from tests.mesh.chain.conftest import QUICK, unreachable
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port
+from tests.support.raising import raises_with
 from tests.support.serving import serving
 
 
@@ -135,20 +135,21 @@ async def test_a_server_that_speaks_no_http_is_given_up_at_once_in_one_line() ->
 
 async def test_a_json_rpc_error_with_an_http_status_is_reported() -> None:
     async def rude(request: web.Request) -> web.Response:
-        error = {"code": -32005, "message": "limit exceeded"}
+        error = {"code": -32600, "message": "invalid request"}
         return web.json_response({"jsonrpc": "2.0", "id": 1, "error": error}, status=400)
 
     async with serving(rude) as url:
-        with raises_with(RequestRefused, rpc_code=-32005, detail="limit exceeded"):
+        with raises_with(RequestRefused, rpc_code=-32600, detail="invalid request"):
             async with Node(url, timing=QUICK):
                 pass
 
 
 @pytest.mark.parametrize("endpoint", ["", "127.0.0.1:8545", "ftp://127.0.0.1"])
 def test_invalid_endpoints_are_refused(endpoint: str) -> None:
-    with pytest.raises(InvalidEndpoint) as caught:
+    with pytest.raises(ConfigurationError) as caught:
         Node(endpoint)
-    assert caught.value.endpoint == endpoint
+    assert caught.value.code == "invalid-endpoint"
+    assert str(caught.value) == f"{endpoint!r} is not the address of a node"
 
 
 @pytest.mark.parametrize("scheme", ["http", "ws"])
@@ -250,10 +251,10 @@ async def test_a_node_that_is_missing_at_the_start_is_skipped() -> None:
 async def test_nodes_of_different_chains_are_refused(scheme: str) -> None:
     async with Anvil() as anvil, Anvil(arguments=("--chain-id", "4")) as other:
         urls = [one.url if scheme == "http" else one.ws_url for one in (anvil, other)]
-        with raises_with(WrongChain, endpoint=urls[1], found=4, expected=31337) as caught:
+        with raises_with(ConfigurationError, code="wrong-chain") as caught:
             async with Node(urls, timing=QUICK):
                 pass
-    assert isinstance(caught.value, ConfigurationError)
+    assert str(caught.value) == f"the node {urls[1]} is on the chain 4, the others are on the chain 31337"
     assert caught.value.hint
 
 
@@ -306,5 +307,5 @@ def test_invalid_timings_are_refused(wrong: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("endpoint", [(), "http://127.0.0.1:1,", ["http://127.0.0.1:1", "ftp://x"]])
 def test_each_of_several_endpoints_is_validated(endpoint: Any) -> None:
-    with pytest.raises(InvalidEndpoint):
+    with pytest.raises(ConfigurationError, match="is not the address of a node"):
         Node(endpoint)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 
 from schemas import RpcKey
-from schemas.logs import LogEvent, LogsRead
+from schemas.status import LogEvent, LogsRead
 from tests.support.commands import AIRA, SECONDS, environment
 from tests.support.orders import ROBOT
 from tests.support.routers import client_config, wait_until_declared

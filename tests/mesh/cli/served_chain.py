@@ -15,9 +15,9 @@ from eth_keyfile.keyfile import create_keyfile_json
 
 from mesh.chain import XRT, Account, Chain, DeploymentPlan, Timing, deploy
 from mesh.cli import main
-from mesh.devchain import serve_embedded
 from schemas import Demand, Offer, Result, cid_of_bytes
 from schemas.address import ZERO_ADDRESS
+from tests.support.development import serve_embedded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
@@ -178,7 +178,7 @@ class ServedChain:
         (self.folder / "password").write_text(PASSWORD + "\n")
         for role, key in zip(PEOPLE, self._served.node.funded_keys, strict=False):
             keyfile = await asyncio.to_thread(write_quick_keyfile, self.folder / f"{role}.json", key)
-            self.people[role] = Person(Account.from_key(key), keyfile)
+            self.people[role] = Person(Account(key), keyfile)
         if self._is_deployed:
             provider = self.people["provider"].account
             self.deployment = await deploy(self._served.node.provider, provider, plan=self._plan)

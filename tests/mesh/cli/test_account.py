@@ -15,20 +15,12 @@ from typing import TYPE_CHECKING
 import pytest
 from click.testing import CliRunner
 
-from mesh.chain import XRT, Account, WrongPassword
-from mesh.chain.accounts import KeyfileError
+from mesh.chain import XRT, Account
+from mesh.chain._accounts import KeyfileError
 from mesh.cli import main
-from mesh.cli.errors import (
-    AccountMissing,
-    FileExists,
-    FileUnwritable,
-    InvalidOptions,
-    InvalidPrivateKey,
-    PasswordFileUnusable,
-)
 from mesh.errors import AiraError, ConfigurationError, InputError
 from tests.mesh.cli.served_chain import PASSWORD, columns, write_quick_keyfile
-from tests.support.commands import AIRA, refused
+from tests.support.commands import AIRA, invoke, refused
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -77,7 +69,7 @@ def test_a_keyfile_is_never_overwritten(made: tuple[Path, Path, Result], tmp_pat
     keyfile, _, _ = made
     before = keyfile.read_bytes()
     done = account("new", keyfile, "--password-file", tmp_path / "password")
-    refused(done, FileExists, keyfile)
+    refused(done, "file-exists", keyfile)
     assert keyfile.read_bytes() == before
     assert not (tmp_path / "password").exists(), "no password without an account"
 
@@ -91,7 +83,7 @@ def test_the_first_line_of_an_existing_password_file_is_used(tmp_path: Path) -> 
     (tmp_path / "bare").write_text("open sesame")
     assert Account.from_keyfile(tmp_path / "key.json", tmp_path / "bare").address == done.stdout.strip()
     (tmp_path / "wrong").write_text("open barley")
-    with pytest.raises(WrongPassword):
+    with pytest.raises(KeyfileError, match="password"):
         Account.from_keyfile(tmp_path / "key.json", tmp_path / "wrong")
 
 
@@ -100,7 +92,7 @@ def test_an_empty_password_is_refused(tmp_path: Path, content: bytes) -> None:
     password = tmp_path / "password"
     password.write_bytes(content)
     done = account("new", tmp_path / "key.json", "--password-file", password)
-    refused(done, PasswordFileUnusable, password, "empty")
+    refused(done, "password-file-unusable", password, "empty")
     assert not (tmp_path / "key.json").exists()
 
 
@@ -108,30 +100,32 @@ def test_a_password_file_that_can_not_be_read_is_one_clear_line(tmp_path: Path) 
     password = tmp_path / "password"
     password.write_bytes(b"\xff\xfe")
     done = account("new", tmp_path / "key.json", "--password-file", password)
-    refused(done, PasswordFileUnusable, password)
+    refused(done, "password-file-unusable", password)
 
 
 def test_a_folder_that_can_not_be_created_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = account("new", tmp_path / "file" / "key.json", "--password-file", tmp_path / "password")
-    refused(done, FileUnwritable)
+    refused(done, "file-unwritable")
 
 
 @pytest.mark.parametrize(
-    ("content", "error"),
+    ("content", "error", "code"),
     [
-        (None, KeyfileError),
-        ("not json", KeyfileError),
-        ("[]", KeyfileError),
-        ("{}", AccountMissing),
+        (None, KeyfileError, "keyfile-error"),
+        ("not json", KeyfileError, "not-a-keyfile"),
+        ("[]", KeyfileError, "not-a-keyfile"),
+        ("{}", ConfigurationError, "account-missing"),
     ],
 )
-def test_an_invalid_keyfile_is_one_clear_line(tmp_path: Path, content: str | None, error: type[AiraError]) -> None:
+def test_an_invalid_keyfile_is_one_clear_line(
+    tmp_path: Path, content: str | None, error: type[AiraError], code: str
+) -> None:
     keyfile = tmp_path / "key.json"
     if content is not None:
         keyfile.write_text(content)
     done = account("show", keyfile)
-    refused(done, error, keyfile)
+    refused(done, error, keyfile, code=code)
 
 
 KEY = "4c0883a69102937d6231471b5dbb6204fe5129617082792ae468d01a3f362318"
@@ -163,7 +157,7 @@ def test_new_and_show_print_json(made: tuple[Path, Path, Result], tmp_path: Path
 def test_show_uses_the_settings_account_unless_a_keyfile_is_given(made: tuple[Path, Path, Result]) -> None:
     assert account("show", "--keyfile", made[0]).stdout == made[2].stdout
     done = account("show")
-    refused(done, AccountMissing)
+    refused(done, "account-missing")
 
 
 def test_show_reads_the_balances_from_the_chain(served: ServedChain) -> None:
@@ -205,7 +199,7 @@ def test_the_password_of_the_other_keyfile_may_come_from_the_standard_input(tmp_
     assert_imported(tmp_path, done)
     (tmp_path / "key.json").unlink()
     done = imported(tmp_path, "--from-keyfile", old, given="guessed\n")
-    refused(done, WrongPassword)
+    refused(done, "wrong-password")
     assert "guessed" not in done.output
 
 
@@ -220,7 +214,7 @@ def test_an_invalid_private_key_is_refused_without_printing_it(tmp_path: Path, g
 def test_a_key_is_not_accepted_as_an_argument(tmp_path: Path) -> None:
     for written in (KEY, "0x" + KEY):
         done = account("import", tmp_path / written, "--password-file", tmp_path / "password")
-        refused(done, InvalidPrivateKey)
+        refused(done, "invalid-private-key")
         assert KEY not in done.output
     assert list(tmp_path.iterdir()) == []
 
@@ -228,15 +222,15 @@ def test_a_key_is_not_accepted_as_an_argument(tmp_path: Path) -> None:
 def test_an_import_overwrites_nothing_and_does_not_prompt_first(tmp_path: Path) -> None:
     (tmp_path / "key.json").write_text("mine")
     done = imported(tmp_path)
-    refused(done, FileExists, tmp_path / "key.json")
+    refused(done, "file-exists", tmp_path / "key.json")
     assert (tmp_path / "key.json").read_text() == "mine"
 
 
 def test_a_key_has_one_source(tmp_path: Path) -> None:
     both = imported(tmp_path, "--private-key-file", tmp_path / "a", "--from-keyfile", tmp_path / "b")
-    refused(both, InvalidOptions, "--private-key-file", "--from-keyfile")
+    refused(both, "invalid-options", "--private-key-file", "--from-keyfile")
     lone = imported(tmp_path, "--from-password-file", tmp_path / "a", given=KEY)
-    refused(lone, InvalidOptions, "--from-password-file", "--from-keyfile")
+    refused(lone, "invalid-options", "--from-password-file", "--from-keyfile")
 
 
 def test_a_missing_source_is_one_clear_line(tmp_path: Path) -> None:
@@ -295,3 +289,45 @@ def test_ctrl_c_at_the_prompt_ends_the_command(tmp_path: Path) -> None:
     assert typing.end() == 130
     assert "Traceback" not in typing.shown
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def misleading(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A keyfile that states another address than that of its key, and the file of its password."""
+    folder = tmp_path_factory.mktemp("misleading")
+    keyfile, password = folder / "account.json", folder / "password"
+    invoke("account", "new", keyfile, "--password-file", password)
+    keyfile.write_text(json.dumps(json.loads(keyfile.read_text()) | {"address": "00" * 20}))
+    return keyfile, password
+
+
+def test_show_refuses_an_address_that_is_not_that_of_the_key(misleading: tuple[Path, Path]) -> None:
+    keyfile, password = misleading
+    refused(
+        invoke("account", "show", keyfile, "--password-file", password),
+        KeyfileError,
+        f"0x{'0' * 40}",
+        code="keyfile-address-wrong",
+    )
+    configured = {"AIRA_KEYFILE": str(keyfile), "AIRA_KEYFILE_PASSWORD_FILE": str(password)}
+    refused(invoke("account", "show", **configured), KeyfileError, f"0x{'0' * 40}", code="keyfile-address-wrong")
+    refused(
+        invoke("account", "show", keyfile, AIRA_KEYFILE_PASSWORD_FILE=str(password)),
+        KeyfileError,
+        code="keyfile-address-wrong",
+    )
+
+
+def test_show_takes_no_notice_of_the_password_of_another_keyfile(misleading: tuple[Path, Path], tmp_path: Path) -> None:
+    keyfile, _ = misleading
+    other = tmp_path / "password"
+    other.write_text("of another one")
+    assert invoke("account", "show", keyfile, AIRA_KEYFILE_PASSWORD_FILE=str(other)).stdout == f"0x{'0' * 40}\n"
+    refused(invoke("account", "show", keyfile, "--password-file", other), "wrong-password")
+
+
+def test_show_says_when_a_keyfile_has_no_address(misleading: tuple[Path, Path], tmp_path: Path) -> None:
+    keyfile, _ = misleading
+    empty = tmp_path / "empty.json"
+    empty.write_text(json.dumps(json.loads(keyfile.read_text()) | {"address": ""}))
+    refused(invoke("account", "show", empty), "account-missing", "does not contain its address")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -62,7 +64,7 @@ def test_an_invalid_amount_is_refused_with_an_example(unit: Unit, text: str, wor
     with pytest.raises(InputError) as refused:
         unit.parse(text)
     assert words in str(refused.value)
-    assert "1.5" in refused.value.hint
+    assert ("1.5" if unit.decimals else "2units") in refused.value.hint
 
 
 @pytest.mark.parametrize(
@@ -85,3 +87,15 @@ def test_an_amount_is_shown_with_all_its_digits(unit: Unit, amount: int, text: s
 def test_a_printed_amount_is_read_as_the_same_amount(amount: int, decimals: int) -> None:
     unit = Unit("TKN", decimals)
     assert unit.parse(unit.show(amount).replace(",", "")) == amount
+
+
+@pytest.mark.parametrize("unit", [XRT, ETH, Unit("USDT", 6), Unit("ONE", 1)])
+def test_the_hint_writes_one_amount_in_two_ways(unit: Unit) -> None:
+    found = re.fullmatch(r"one and a half \w+ is ([\d.]+), or (\w+)", unit.hint())
+    assert found
+    assert unit.parse(found[1]) == unit.parse(found[2]) == 15 * 10**unit.decimals // 10
+
+
+def test_the_hint_for_a_token_without_decimals_has_whole_numbers() -> None:
+    assert POINT.hint() == "two POINT are 2, or 2units"
+    assert POINT.parse("2") == POINT.parse("2units") == 2

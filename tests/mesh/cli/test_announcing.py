@@ -13,7 +13,7 @@ PROGRAM = """
 import logging
 from mesh.cli.output import announce
 from mesh.telemetry.logs import process_log, configure_logging
-from schemas.logs import ReadLogs
+from schemas.status import ReadLogs
 configure_logging(form={form!r}, role="up")
 words = "router      tcp/here 100%\\nchain       http://there"
 announce(logging.getLogger("a.server"), "server-started", words, chain="http://there", count=1)

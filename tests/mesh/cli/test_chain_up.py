@@ -16,8 +16,7 @@ from click.testing import CliRunner
 
 from mesh.chain import XRT, Chain
 from mesh.cli import main
-from mesh.cli.errors import AnvilMissing
-from mesh.devchain.development import serve_chain
+from mesh.dev.development import serve_chain
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from tests.mesh.cli.served_chain import columns
@@ -127,15 +126,15 @@ def test_the_embedded_chain_can_be_selected(tmp_path: Path, on_path: dict[str, s
 
 
 def test_a_missing_anvil_is_one_clear_line(tmp_path: Path) -> None:
-    hint = refused(failing("--engine", "anvil", PATH=str(tmp_path)), AnvilMissing)
+    hint = refused(failing("--engine", "anvil", PATH=str(tmp_path)), "anvil-missing")
     assert "--engine embedded" in hint
     refused(failing("--anvil", tmp_path / "anvil"), ConfigurationError, tmp_path / "anvil")
 
 
 def test_the_embedded_chain_has_no_state_file(tmp_path: Path) -> None:
     state = ("--state", tmp_path / "chain.json")
-    assert "--anvil FILE" in refused(failing(*state, PATH=str(tmp_path)), AnvilMissing, "--state")
-    refused(failing(*state, "--engine", "embedded"), AnvilMissing, "--engine embedded")
+    assert "--anvil FILE" in refused(failing(*state, PATH=str(tmp_path)), "anvil-missing", "--state")
+    refused(failing(*state, "--engine", "embedded"), "anvil-missing", "--engine embedded")
 
 
 @pytest.mark.parametrize("engine", ["anvil", "embedded"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,6 @@ import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
-from mesh.cli.errors import FileUnreadable, InvalidUsage
 from schemas import cid_of_bytes
 from tests.support.commands import aira, refused, run
 
@@ -37,6 +37,12 @@ def test_for_one_file_only_its_cid_is_printed(file: Path) -> None:
     assert (done.exit_code, done.stdout) == (0, f"{cid_of_bytes(CONTENT)}\n")
 
 
+def test_for_programs_an_object_each_is_printed(file: Path) -> None:
+    done = cid(file, file, "--json")
+    said = {"cid": cid_of_bytes(CONTENT), "file": str(file)}
+    assert [json.loads(line) for line in done.stdout.splitlines()] == [said, said]
+
+
 def test_for_several_files_a_line_each_is_printed(file: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.write_bytes(b"")
@@ -51,16 +57,16 @@ def test_a_dash_reads_the_standard_input() -> None:
 def test_a_missing_file_is_one_clear_line(tmp_path: Path) -> None:
     missing = tmp_path / "missing"
     done = cid(missing)
-    refused(done, FileUnreadable, missing, "No such file or directory")
+    refused(done, "file-unreadable", missing, "No such file or directory")
 
 
 def test_a_folder_is_one_clear_line(tmp_path: Path) -> None:
     done = cid(tmp_path)
-    refused(done, FileUnreadable, tmp_path, "Is a directory")
+    refused(done, "file-unreadable", tmp_path, "Is a directory")
 
 
 def test_without_files_the_missing_argument_is_named() -> None:
-    refused(cid(), InvalidUsage, "FILES")
+    refused(cid(), "invalid-usage", "FILES")
 
 
 def test_the_script_and_the_module_do_the_same(file: Path) -> None:

@@ -4,29 +4,37 @@ from __future__ import annotations
 
 import asyncio
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from mesh import Declined, JobFailed, Progress
+from mesh.agent.errors import OrderExpired
+from mesh.agent.objectives import ObjectiveUnfit
 from mesh.amounts import XRT
-from mesh.cli.demand import demand
-from mesh.cli.errors import JobNotDone
-from mesh.cli.waiting import JobPrinter
-from mesh.work.objectives import ObjectiveUnfit
-from schemas import cid_of_file
+from mesh.chain import Chain, Node
+from mesh.cli import demand as commands
+from mesh.cli.demand import JobPrinter, _who_is_here
+from mesh.errors import RemoteError
+from mesh.watching import present
+from schemas import cid_of_bytes, cid_of_file
 from tests.mesh.operations.site import MODEL, Site, settings_of
-from tests.support.commands import aira
+from tests.support.commands import aira, coroutine
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
-from tests.support.waiting import until
+from tests.support.raising import raises_with
+from tests.support.tokens import block, deploy_blocking_token
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    from mesh import Agent
     from schemas import Demand, Verified
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
+demand = coroutine(commands.demand)
 AGENT = "0x70997970C51812dc3A010C7d01b50e0d17dc79C8"
 TERMS: dict[str, Any] = {"model": MODEL, "cost": "7wn", "validator": "", "validator_fee": "0", "lifetime": 500}
 
@@ -73,6 +81,36 @@ async def test_an_objective_that_no_robot_takes_is_an_error_before_anything_is_s
         assert person.orders() == []
 
 
+async def test_an_interrupted_demand_does_not_wait_for_a_node_that_is_silent(
+    site: Site, output: Output, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before that, it says how far its agent has read the chain, as long as that is behind."""
+    monkeypatch.setattr("mesh.cli.demand.SILENCE", 0.05)
+    monkeypatch.setattr("mesh.cli.demand.BEHIND", -1)
+    waiting = asyncio.create_task(
+        demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=False, **TERMS)
+    )
+    await until(lambda: "reading the chain: block" in output.err, seconds=60)
+    monkeypatch.setattr(Node, "block_number", lambda _: asyncio.Event().wait())
+    waiting.cancel()
+    async with asyncio.timeout(20):
+        await asyncio.wait([waiting])
+    assert "the demand stays valid until block" in output.err
+
+
+async def test_a_model_may_be_given_as_a_file_which_robots_can_fetch_then(site: Site, tmp_path: Path) -> None:
+    path = tmp_path / "model.md"
+    path.write_bytes(b"what nobody here does")
+    terms = TERMS | {"model": str(path)}
+    async with site.provider(), site.agent("robot") as robot:
+        waiting = asyncio.create_task(
+            demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=False, **terms)
+        )
+        await until_found(lambda: robot.parts.exchange.is_held(cid_of_file(path), timeout=1), what="the model's file")
+        waiting.cancel()
+        await asyncio.wait([waiting])
+
+
 async def test_a_robot_that_declines_is_shown_with_its_reason(site: Site, output: Output) -> None:
     robot = site.agent("robot")
 
@@ -91,6 +129,49 @@ async def test_a_robot_that_declines_is_shown_with_its_reason(site: Site, output
     assert "the demand stays valid until block" in output.err
 
 
+async def _is_complete(robot: Agent) -> bool:
+    return {"agent", "provider"} <= {peer.role for peer in await present(robot.channel)}
+
+
+async def test_a_demand_that_no_robot_here_can_do_says_so(
+    site: Site, output: Output, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One agent is present, but of another model: at first, and when the demand has expired."""
+    monkeypatch.setattr("mesh.cli.demand.SILENCE", 0.1)
+    other = cid_of_bytes(b"what nobody here demands")
+    async with site.provider(), site.agent("robot") as robot, Chain(site.url) as chain:
+        await until_found(lambda: _is_complete(robot), what="provider and robot")
+        waiting = asyncio.create_task(
+            demand(
+                settings_of(site, "person"),
+                objective=str(site.job("word")),
+                out=None,
+                as_json=False,
+                **TERMS | {"model": other, "lifetime": 3},
+            )
+        )
+        who = "no robot of this model is here: 1 other agent"
+        await until(lambda: f"no robot has offered or declined yet; {who}" in output.err, seconds=60)
+        await chain.node.request("anvil_mine", "0x4")
+        with pytest.raises(OrderExpired):
+            await waiting
+        assert f"no robot offered or declined; {who}" in output.err
+        assert robot.model == MODEL
+
+        async def is_alone() -> bool:  # the person's token may still be there
+            counted = await _who_is_here(robot)
+            return counted.startswith("no robot of this model is here: 0 other agents, and 1 provider on")
+
+        await until_found(is_alone)
+        async with site.agent("person") as person:
+            expected = "1 robot of this model and 1 provider are present on"
+
+            async def is_counted() -> bool:
+                return (await _who_is_here(person)).startswith(expected)
+
+            await until_found(is_counted)
+
+
 async def test_a_failed_job_is_shown_with_its_reason_and_its_recording_is_kept(site: Site, output: Output) -> None:
     robot = site.agent("robot")
 
@@ -103,7 +184,7 @@ async def test_a_failed_job_is_shown_with_its_reason_and_its_recording_is_kept(s
         raise JobFailed("the lamp is broken")
 
     async with site.provider(), robot:
-        with pytest.raises(JobNotDone):
+        with raises_with(RemoteError, code="job-not-done"):
             await demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=True, **TERMS)
     checked, posted, *progress, end = map(json.loads, output.out.splitlines())
     assert (checked["kind"], checked["messages"]) == ("objective", 1)
@@ -129,6 +210,31 @@ async def test_a_failed_job_is_shown_with_its_reason_and_its_recording_is_kept(s
         **(variables | {"AIRA_DATA_DIR": str(site.folder / "no")}),
     )
     assert json.loads(unknown.stdout)["code"] == "recording-unavailable"
+
+
+async def test_a_cost_that_the_token_refuses_to_return_is_owed(site: Site, output: Output) -> None:
+    robot, person = site.agent("robot"), settings_of(site, "person")
+    async with site.chain("person") as chain:
+        token = await deploy_blocking_token(chain, 100)
+        await block(chain, token, site.address("person"))
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand)
+
+    @robot.on("/say")
+    async def say(job: object, message: object) -> None:
+        raise JobFailed("the lamp is broken")
+
+    terms = TERMS | {"cost": "7units"}
+    async with site.provider(), robot:
+        with raises_with(
+            RemoteError, code="job-not-done", match="the token refused to return the cost, `aira liability claim 0x"
+        ):
+            await demand(
+                replace(person, erc20_token=token), objective=str(site.job("word")), out=None, as_json=True, **terms
+            )
+    assert json.loads(output.out.splitlines()[-1])["owed"] == "7"
 
 
 async def test_an_interrupted_demand_is_withdrawn_if_asked_for(site: Site, output: Output) -> None:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import UnsafeValidator
-from mesh.cli.demand import demand
-from mesh.cli.errors import DoubtfulValidator, JobNotDone
+from mesh.cli import demand as commands
+from mesh.errors import AiraError
 from schemas import Demand, Result, Verified
 from tests.mesh.operations.site import GENERATION_5, MODEL, Site, settings_of
-from tests.support.commands import AIRA, Serving, aira
+from tests.support.commands import AIRA, Serving, aira, coroutine
 from tests.support.jurors import COMPLETE, MISSING, Juror
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
+demand = coroutine(commands.demand)
 TERMS: dict[str, Any] = {"model": MODEL, "cost": "7wn", "lifetime": 500, "out": None}
 
 
@@ -35,7 +36,9 @@ async def site(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path) -> Site:
 
 @pytest.fixture
 async def juror(site: Site) -> AsyncIterator[Juror]:
-    """A validator of generation 3, an account with ether."""
+    """A validator of generation 3, an account with ether that has sent a transaction, as `aira validator` does."""
+    async with site.chain("rival") as chain:
+        await chain.validators.introduce()
     signer = site.accounts["rival"].signer
     async with Juror(endpoint=site.endpoint, lighthouse=site.lighthouse, signer=signer) as juror:
         yield juror
@@ -85,7 +88,7 @@ async def test_a_refusal_is_told_with_its_reason_also_later(
 ) -> None:
     with pytest.raises(ExceptionGroup) as caught:
         await ordered(site, site.robot([]), juror, success=False, as_json=True)
-    assert [type(error) for error in caught.value.exceptions] == [JobNotDone]
+    assert [getattr(error, "code", "") for error in caught.value.exceptions] == ["job-not-done"]
     *progress, end = map(json.loads, capsys.readouterr().out.splitlines())
     meant = next(one for one in progress if one["kind"] == "validator")
     assert (meant["fee"], meant["announcedFee"], meant["online"]) == ("100", "100", [juror.signer.address])
@@ -107,12 +110,12 @@ async def test_a_doubtful_validator_is_named_before_anything_is_signed(
 ) -> None:
     async with site.chain("person") as chain:
         lighthouse = await chain.names.address(site.lighthouse)
-    validator = {"silent": site.address("poor"), "cheap": juror.signer.address, "lighthouse": lighthouse}[who]
+    validator = {"silent": site.address("provider"), "cheap": juror.signer.address, "lighthouse": lighthouse}[who]
     fee = "99wn" if who == "cheap" else None
     options: dict[str, Any] = {"objective": str(site.job("word")), "validator": validator, "validator_fee": fee}
     settings = settings_of(site, "person")
-    expected = UnsafeValidator if who == "lighthouse" else DoubtfulValidator
-    with pytest.raises(expected):
+    expected = "validator-unsafe" if who == "lighthouse" else "validator-doubtful"
+    with raises_with(AiraError, code=expected):
         async with asyncio.timeout(60):
             await demand(settings, as_json=True, **options, **TERMS)
     async with site.agent("person") as person:

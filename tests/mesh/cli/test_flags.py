@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+import click
 import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
-from mesh.settings import InvalidOption, UnknownOption
+from mesh.cli.options import PORT
+from mesh.settings import DEFAULTS, OPTIONS
 from tests.support.commands import refused
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from click.testing import Result
 
 CID = "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82"
@@ -53,7 +57,7 @@ def test_an_error_of_an_invalid_number_names_its_flag(arguments: tuple[str, ...]
 @pytest.mark.parametrize("value", ["inf", "nan"])
 def test_seconds_are_finite(option: str, value: str) -> None:
     done = aira("settings", option, value)
-    refused(done, InvalidOption, option[2:].replace("-", "_"))
+    refused(done, "invalid-option", option[2:].replace("-", "_"))
 
 
 def test_an_unknown_flag_suggests_similar_ones() -> None:
@@ -66,4 +70,57 @@ def test_an_unknown_flag_suggests_similar_ones() -> None:
 def test_an_invalid_variable_is_one_clear_line_in_every_command_with_settings(command: str) -> None:
     needed = ("--model", CID, "--objective", CID) if command == "demand" else ()
     done = aira(command, *needed, AIRA_KEYFILL="x")
-    refused(done, UnknownOption, "'keyfill'", "environment")
+    refused(done, "unknown-option", "'keyfill'", "environment")
+
+
+def commands(group: click.Command = main, *words: str) -> Iterator[tuple[str, click.Command]]:
+    """Every command of `aira`, with its words."""
+    if isinstance(group, click.Group):
+        context = click.Context(group)
+        for name in group.list_commands(context):
+            found = group.get_command(context, name)
+            assert found is not None
+            yield from commands(found, *words, name)
+    else:
+        yield " ".join(words), group
+
+
+def options(flag: str) -> dict[str, click.Option]:
+    """The option of each command that has it."""
+    found = ((words, one) for words, command in commands() for one in command.params if flag in one.opts)
+    return {words: one for words, one in found if isinstance(one, click.Option)}
+
+
+def test_a_port_is_the_number_of_a_tcp_port_in_every_command() -> None:
+    assert {words: one.type for words, one in options("--port").items()} == {"chain up": PORT, "up": PORT}
+    assert options("--tty").keys() == {"board run", "doctor"}  # a serial port
+
+
+def test_listen_is_an_address_in_every_command() -> None:
+    found = options("--listen")
+    routers = {words for words, one in found.items() if "endpoints" in (one.help or "")}
+    assert routers == {"doctor", "settings", "up"}
+    assert {found[words].metavar for words in found.keys() - routers} == {"HOST:PORT"}
+
+
+SERVERS = frozenset(
+    {
+        *("board run", "bridge ipfs", "bridge ros1", "bridge ros2", "edge", "provider", "web"),
+        *("foxglove agent", "foxglove job", "foxglove market"),
+    }
+)
+"""They serve until they are stopped; programs read their log in JSON (--log-format), or their metrics."""
+DOCUMENTS = frozenset({"completion", "foxglove layout", "model schema", "router config"})
+"""They print or write a file as it is."""
+
+
+def test_every_command_that_prints_facts_prints_them_as_json() -> None:
+    without = {words for words, command in commands() if not any("--json" in one.opts for one in command.params)}
+    assert without == SERVERS | DOCUMENTS
+
+
+@pytest.mark.parametrize("name", [name for name in OPTIONS if isinstance(getattr(DEFAULTS, name), tuple)])
+def test_the_flag_of_a_setting_with_several_values_may_be_repeated(name: str) -> None:
+    flag = f"--{name.replace('_', '-')}"
+    done = aira("settings", "--json", flag, "one", flag, "two")
+    assert json.loads(done.stdout)[name] == ["one", "two"]

@@ -14,11 +14,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.cli.errors import HealthUnavailable, InvalidServerAddress
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
-from mesh.telemetry.health import InvalidListenAddress
-from mesh.telemetry.server import MetricsNotServed
 from schemas.status import ALIVE
 from tests.mesh.cli.served_chain import columns
 from tests.support.commands import AIRA, Serving, invoke, refused
@@ -131,25 +128,25 @@ def test_a_taken_port_is_one_clear_line(command: tuple[str, ...], tmp_path: Path
             AIRA_DATA_DIR=str(tmp_path),
             AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}",
         )
-    assert refused(done, MetricsNotServed, place, os.strerror(errno.EADDRINUSE))
+    assert refused(done, "metrics-not-served", place, os.strerror(errno.EADDRINUSE))
 
 
 def test_an_invalid_listen_address_is_one_clear_line() -> None:
     done = invoke("router", "--metrics-listen", "9464", AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}")
 
-    refused(done, InvalidListenAddress, "'9464'")
+    refused(done, "invalid-listen-address", "'9464'")
 
 
 def test_a_closed_port_is_one_clear_line_and_code_1(listen: str) -> None:
     done = invoke("health", "--url", f"http://{listen}")
 
-    refused(done, HealthUnavailable, listen, "Connection refused")
+    refused(done, "health-unavailable", listen, "Connection refused")
 
 
 def test_an_impossible_host_is_one_clear_line_and_code_1() -> None:
     done = invoke("health", "--url", "http://no..host:9464")
 
-    refused(done, HealthUnavailable, "no..host:9464")
+    refused(done, "health-unavailable", "no..host:9464")
 
 
 def test_a_demand_does_not_serve_metrics(listen: str, tmp_path: Path) -> None:
@@ -166,7 +163,7 @@ def test_a_late_answer_is_one_clear_line_and_code_1() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = invoke("health", "--url", f"http://127.0.0.1:{silent.getsockname()[1]}", "--timeout", "0.2")
 
-    refused(done, HealthUnavailable, "127.0.0.1:", "timed out")
+    refused(done, "health-unavailable", "127.0.0.1:", "timed out")
 
 
 @pytest.mark.parametrize(
@@ -176,7 +173,7 @@ def test_another_http_server_is_one_clear_line_and_code_1(answer: bytes) -> None
     with answering(answer) as url:
         done = invoke("health", "--url", url)
 
-    refused(done, HealthUnavailable, url.removeprefix("http://"))
+    refused(done, "health-unavailable", url.removeprefix("http://"))
 
 
 def test_control_characters_of_an_answer_are_not_printed() -> None:
@@ -193,13 +190,13 @@ def test_control_characters_of_an_answer_are_not_printed() -> None:
 def test_an_invalid_address_is_one_clear_line_and_code_2(url: str) -> None:
     done = invoke("health", "--url", url)
 
-    refused(done, InvalidServerAddress, repr(url))
+    refused(done, "invalid-server-address", repr(url))
 
 
 def test_a_missing_address_is_an_error_with_a_hint() -> None:
     done = invoke("health")
 
-    assert "--url" in refused(done, InvalidServerAddress)
+    assert "--url" in refused(done, "invalid-server-address")
 
 
 def test_it_imports_no_heavy_modules() -> None:

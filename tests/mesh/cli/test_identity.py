@@ -9,12 +9,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import new_private_key, write_keyfile
-from mesh.cli.errors import IdentityMissing, InvalidOptions
 from mesh.errors import ConfigurationError, InputError
-from mesh.identity import Member, read_roster
-from mesh.identity.errors import IdentityError, RosterError
-from mesh.identity.routers import IdentityDenied
 from mesh.network import Endpoints, Tls
+from mesh.ops.identity import Member, read_roster
 from tests.support.commands import invoke, refused
 from tests.support.sites import Site
 
@@ -23,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.errors import AiraError
-    from mesh.identity.folders import MemberFolder
+    from mesh.ops.identity.certificates import MemberFolder
 
 ARM = "0x" + "0a" * 20
 OTHER = "0x" + "0b" * 20
@@ -36,6 +33,11 @@ def site(tmp_path: Path) -> Path:
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"certificate  {folder}/ca.pem\nkey          {folder}/ca.key\n"
     return folder
+
+
+def test_a_sites_files_are_named_for_programs(tmp_path: Path) -> None:
+    done = invoke("identity", "site", tmp_path / "site", "--json")
+    assert json.loads(done.stdout) == {"certificate": f"{tmp_path}/site/ca.pem", "key": f"{tmp_path}/site/ca.key"}
 
 
 def new(folder: Path, site: Path, *more: str | Path, name: str = "arm") -> subprocess.CompletedProcess[str]:
@@ -129,7 +131,7 @@ def test_a_member_that_the_roster_can_not_hold_gets_no_certificate(tmp_path: Pat
 
     twice = new(tmp_path / "again", site, "--address", ARM, "--role", "agent", "--roster", roster, name="again")
 
-    refused(twice, RosterError, roster, ARM)
+    refused(twice, "roster-unusable", roster, ARM)
     assert not (tmp_path / "again").exists()
 
 
@@ -171,15 +173,15 @@ def test_a_routers_identity_needs_a_host_and_no_account(tmp_path: Path, site: Pa
 
     assert found["hosts"] == ["127.0.0.1", "hub.example"] or found["hosts"] == ["hub.example", "127.0.0.1"]
     nowhere = new(tmp_path / "two", site, "--role", "router", name="two")
-    refused(nowhere, InvalidOptions, "--host")
+    refused(nowhere, "invalid-options", "--host")
 
 
 @pytest.mark.parametrize(
     ("more", "error", "value"),
     [
-        (("--role", "agent"), InvalidOptions, "address"),
-        (("--role", "agent", "--address", "0x12"), RosterError, "'0x12'"),
-        (("--role", "agent", "--address", ARM, "--agent", OTHER), RosterError, "device"),
+        (("--role", "agent"), "invalid-options", "address"),
+        (("--role", "agent", "--address", "0x12"), "roster-unusable", "'0x12'"),
+        (("--role", "agent", "--address", ARM, "--agent", OTHER), "roster-unusable", "device"),
         (("--role", "router", "--address", ARM, "--host", "a host"), InputError, "a host"),
     ],
 )
@@ -205,20 +207,22 @@ def test_errors_name_files_that_are_no_identity(tmp_path: Path, site: Path) -> N
     certificate, key = folder / "identity.pem", folder / "identity.key"
     good = certificate.read_bytes()
 
-    refused(invoke("identity", "show", tmp_path / "nobody"), IdentityError, "No such file or directory")
+    refused(invoke("identity", "show", tmp_path / "nobody"), "identity-unusable", "No such file or directory")
     key.write_bytes((tmp_path / "other" / "identity.key").read_bytes())
-    refused(invoke("identity", "show", folder), IdentityError, key, "belong")
+    refused(invoke("identity", "show", folder), "identity-unusable", key, "belong")
     key.write_text("rubbish")
-    refused(invoke("identity", "show", folder), IdentityError, key, "PEM")
+    refused(invoke("identity", "show", folder), "identity-unusable", key, "PEM")
     certificate.write_text("rubbish")
-    refused(invoke("identity", "show", folder), IdentityError, certificate, "PEM")
+    refused(invoke("identity", "show", folder), "identity-unusable", certificate, "PEM")
     key.unlink()
     certificate.write_bytes((site / "ca.pem").read_bytes())
-    refused(invoke("identity", "show", folder), IdentityError, certificate, "'AIRA mesh site'")
+    refused(invoke("identity", "show", folder), "identity-unusable", certificate, "'AIRA mesh site'")
     certificate.write_bytes(good)
     other_site = tmp_path / "elsewhere"
     invoke("identity", "site", other_site)
-    refused(invoke("identity", "renew", folder, "--site", other_site), IdentityError, f"{folder}/ca.pem", other_site)
+    refused(
+        invoke("identity", "renew", folder, "--site", other_site), "identity-unusable", f"{folder}/ca.pem", other_site
+    )
     assert certificate.read_bytes() == good
 
 
@@ -228,7 +232,7 @@ def test_an_expired_site_signs_nothing(tmp_path: Path) -> None:
 
     done = new(tmp_path / "arm", tmp_path / "site", "--address", ARM, "--role", "agent")
 
-    refused(done, IdentityError, f"{tmp_path}/site/ca.pem", "expired")
+    refused(done, "identity-unusable", f"{tmp_path}/site/ca.pem", "expired")
 
 
 def test_check_distinguishes_admitted_members_from_refused_ones(tmp_path: Path) -> None:
@@ -251,11 +255,11 @@ def test_check_distinguishes_admitted_members_from_refused_ones(tmp_path: Path) 
         edge = check(members[2], "--agent", ARM, "--device", "gripper")
         for folder, address in ((gone, "0x" + "0d" * 20), (stranger, "0x" + "0e" * 20)):
             done = check(folder)
-            refused(done, IdentityDenied, address)
+            refused(done, "identity-denied", address)
 
     assert (arm.returncode, arm.stdout) == (0, f"{site.endpoint} admits {ARM} and forwards its messages\n")
     assert (screen.returncode, edge.returncode) == (0, 0), (screen.stderr, edge.stderr)
 
 
 def test_check_without_an_identity_is_an_error_with_a_hint() -> None:
-    refused(invoke("identity", "check"), IdentityMissing)
+    refused(invoke("identity", "check"), "identity-missing")

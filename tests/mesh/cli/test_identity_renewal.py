@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from mesh.identity import read_roster
+from mesh.ops.identity import read_roster
 from tests.mesh.cli.test_identity import ARM, OTHER, made, site
 from tests.support.commands import invoke
 

@@ -10,11 +10,11 @@ import pytest
 
 from mesh.chain import XRT, TransactionSender
 from mesh.chain.errors import NotALiability
-from mesh.cli.errors import InvalidSignature, LiabilityEnded, NotAParty, NotRefundable, SignatureMissing
 from mesh.errors import InvalidAddress
 from schemas import Liability
 from tests.mesh.cli.served_chain import REFUND_DELAY, ServedChain, columns
 from tests.support.commands import AIRA, Interrupted, Serving, aira, refused
+from tests.support.tokens import block, deploy_blocking_token
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -145,28 +145,28 @@ def test_a_wrong_signature_is_one_clear_line(served: ServedChain) -> None:
     mine = signature_of(served, "person", address)
     wrong = signature_of(served, "robot", other)
     cancel = ("liability", "cancel", address, "--signature")
-    refused(served.aira(*cancel, mine), SignatureMissing, "promisor")
-    refused(served.aira(*cancel, wrong), InvalidSignature)
-    refused(served.aira(*cancel, "0x12"), InvalidSignature)
-    refused(served.aira(*cancel, "rubbish"), InvalidSignature)
+    refused(served.aira(*cancel, mine), "signature-missing", "promisor")
+    refused(served.aira(*cancel, wrong), "invalid-signature")
+    refused(served.aira(*cancel, "0x12"), "invalid-signature")
+    refused(served.aira(*cancel, "rubbish"), "invalid-signature")
     assert served.run_json("liability", "show", address)["state"] == "open"
 
 
 def test_only_a_party_can_cancel(served: ServedChain) -> None:
-    refused(served.aira("liability", "cancel", served.create_liability(), by="stranger"), NotAParty)
+    refused(served.aira("liability", "cancel", served.create_liability(), by="stranger"), "not-a-party")
 
 
 def test_a_finalized_liability_can_not_be_cancelled(served: ServedChain) -> None:
     address = served.create_liability()
     served.finalize(address)
-    refused(served.aira("liability", "cancel", address), LiabilityEnded, address, "paid")
-    refused(served.aira("liability", "cancel", address, "--refund"), LiabilityEnded, address, "paid")
+    refused(served.aira("liability", "cancel", address), "liability-ended", address, "paid")
+    refused(served.aira("liability", "cancel", address, "--refund"), "liability-ended", address, "paid")
 
 
 def test_the_cost_is_refunded_after_the_delay_when_the_promisor_disappeared(served: ServedChain) -> None:
     before = held(served, "person")
     address = served.create_liability(cost=COST)
-    hint = refused(served.aira("liability", "cancel", address, "--refund"), NotRefundable, address)
+    hint = refused(served.aira("liability", "cancel", address, "--refund"), "not-refundable", address)
     assert "both parties" in hint
     served.mine(REFUND_DELAY - 1)
     assert columns(served.aira("liability", "show", address).stdout)["refund"].startswith("possible now")
@@ -197,7 +197,65 @@ def test_an_amount_of_another_token_is_not_printed_as_xrt(served: ServedChain) -
     assert said["token"] == token
 
 
-@pytest.mark.parametrize("command", ["show", "watch", "cancel"])
+def blocking(served: ServedChain) -> str:
+    """A token of the person that refuses to pay the person."""
+
+    async def deployed() -> str:
+        async with served.chain("person") as chain:
+            token = await deploy_blocking_token(chain, 1000)
+            await block(chain, token, served.people["person"].address)
+            return token
+
+    return served.run(deployed())
+
+
+def test_what_the_token_refused_to_return_is_shown_and_claimed(served: ServedChain) -> None:
+    person, stranger = (served.people[role].address for role in ("person", "stranger"))
+    token = blocking(served)
+    address = served.create_liability(cost=7, token=token)
+    assert "owed" not in served.run_json("liability", "show", address)
+    refused(served.aira("liability", "claim", address), "nothing-owed", "has not ended")
+    served.finalize(address, success=False)
+
+    owed = columns(served.aira("liability", "show", address, by="stranger").stdout)["owed"]
+    unit = f"tokens ({token[:6]}…{token[-4:]})"
+    assert owed == f"7 {unit} to {person}, whom the token refused to pay: `aira liability claim {address}`"
+    assert "--to" in refused(served.aira("liability", "claim", address, by="stranger"), "claim-refused", person)
+    refused(served.aira("liability", "claim", address, "--to", stranger, by="stranger"), "not-a-party", person)
+
+    said = columns(served.aira("liability", "claim", address, "--to", stranger).stdout)
+    assert said["claimed"] == f"7 {unit}  to {stranger}"
+    assert served.ask("stranger", lambda chain: chain.tokens.balance(token=token)) == 7
+    refused(served.aira("liability", "claim", address), "nothing-owed", "was paid")
+
+
+def test_anybody_claims_for_an_account_that_the_token_pays_again(served: ServedChain) -> None:
+    token, person = blocking(served), served.people["person"].address
+    address = served.create_liability(cost=7, token=token)
+    served.mine(REFUND_DELAY)
+    cancelled = served.run_json("liability", "cancel", address, "--refund", by="stranger")
+    assert (cancelled["state"], cancelled["owed"]) == ("called-off", "7")
+    assert served.run_json("liability", "show", address)["owed"] == "7"
+    served.ask("person", lambda chain: block(chain, token, person, is_blocked=False))
+
+    claimed = served.run_json("liability", "claim", address, by="stranger")
+
+    assert claimed.pop("tx").startswith("0x")
+    assert claimed.pop("gasUsed") > 21_000
+    assert claimed == {"liability": address, "token": token, "account": person, "to": person, "claimed": "7"}
+    assert "owed" not in served.run_json("liability", "show", address)
+    assert served.ask("person", lambda chain: chain.tokens.balance(token=token)) == 1000
+
+
+def test_a_refund_that_the_token_refused_says_what_is_owed(served: ServedChain) -> None:
+    address = served.create_liability(cost=7, token=blocking(served))
+    served.mine(REFUND_DELAY)
+    said = columns(served.aira("liability", "cancel", address, "--refund", by="stranger").stdout)
+    assert "paid back" not in said
+    assert f"`aira liability claim {address}`" in said["owed"]
+
+
+@pytest.mark.parametrize("command", ["show", "watch", "cancel", "claim"])
 def test_an_address_without_a_liability_is_one_clear_line(served: ServedChain, command: str) -> None:
     refused(served.aira("liability", command, served.deployment.xrt), NotALiability, served.deployment.xrt)
     refused(served.aira("liability", command, "0x12"), InvalidAddress, "0x12")

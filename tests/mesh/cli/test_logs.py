@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import zenoh
 
-from mesh.cli.errors import NoAnswer
-from mesh.identity import Member
 from mesh.network import ServiceFailed
+from mesh.ops.identity import Member
 from schemas import RpcKey
-from schemas.logs import LogsRead
+from schemas.status import LogsRead
 from tests.mesh.cli.following import Follower, answer, event, pretender
 from tests.support.commands import AIRA, SECONDS, environment, invoke, refused
 from tests.support.orders import PERSON, ROBOT, STRANGER
@@ -25,7 +24,7 @@ from tests.support.waiting import wait_until
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.identity.roster import Role
+    from mesh.ops.identity.roster import Role
     from schemas import Signer
 
 
@@ -79,7 +78,8 @@ def test_an_unreadable_answer_is_one_clear_line(router: EmbeddedRouter) -> None:
 @pytest.mark.parametrize("options", [(), ("--follow",), ("--device", "board")])
 def test_a_missing_agent_is_one_clear_line(router: EmbeddedRouter, options: tuple[str, ...]) -> None:
     done = invoke("logs", ROBOT.address, *options, AIRA_CONNECT=router.endpoint)
-    assert refused(done, NoAnswer, "aira/agent/0x").startswith("check with `aira peers`")
+    who = f"the device board of {ROBOT.address}" if "--device" in options else ROBOT.address
+    assert refused(done, "no-answer", f"{who} does not answer").startswith("`aira peers` shows who is present")
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 SECONDS: Final = 20.0
 """What a mistake may take on a busy machine; alone it takes less than two."""
 CID: Final = cid_of_bytes(b"a model")
+LONG: Final = "x" * 5000
+DEEP: Final = "[" * 5000
 NODE: Final = "no-node"
 """Words of commands that stand for a port: nobody listens at one, somebody at the other."""
 TAKEN: Final = "taken"
@@ -64,11 +66,11 @@ MISTAKES: Final = (
     Mistake("order list", "account-missing", "--keyfile"),
     Mistake("replay objective.mcap --to lamp", "account-missing", "--keyfile"),
     # values that can't be right
-    Mistake("demand --model model.md --objective objective.mcap", "not-a-model", "aira cid model.md"),
-    Mistake("demand --model lamp --objective objective.mcap", "not-a-model", "aira cid"),
+    Mistake("demand --model lamp --objective objective.mcap", "not-a-model", "file"),
     Mistake(f"demand --model {CID} --objective objective.mcap --cost much", "invalid-amount", "--cost"),
     Mistake(f"demand --model {CID} --objective objective.mcap --validator me", "invalid-address", "'me'"),
-    Mistake("watch --model lamp", "invalid-cid", "'lamp'"),
+    Mistake(f"demand --model {'x' * 300} --objective objective.mcap", "not-a-model", "file"),
+    Mistake("watch --model lamp", "not-a-model", "'lamp'"),
     Mistake("status 0x12", "invalid-address", "'0x12'"),
     Mistake("logs nobody", "invalid-address", "'nobody'"),
     Mistake(f"logs {LIGHTHOUSE} --level loud", "invalid-usage", "'warning'"),
@@ -107,6 +109,27 @@ MISTAKES: Final = (
     Mistake("chain status --config not.toml", "settings-not-toml", "not.toml"),
     Mistake("chain status --config unknown.toml", "unknown-option", "zebra"),
     Mistake("chain deploy", "account-not-set", "aira account new"),
+    *(
+        Mistake(words, "file-unusable", "name too long")
+        for words in (
+            f"objective show {LONG}",
+            f"objective check {LONG}",
+            f"objective convert {LONG} {LONG}",
+            f"objective pack lines.jsonl --out {LONG}",
+            f"model check {LONG}",
+            f"replay {LONG}",
+            f"state show --data-dir {LONG}",
+        )
+    ),
+    *(
+        Mistake(words, code, "nested more than")
+        for words, code in (
+            ("settings --config deep.toml", "settings-not-toml"),
+            ("model check deep.json", "invalid-description"),
+            ("objective pack deep.jsonl --out new.mcap", "invalid-line"),
+            (f'rpc {LIGHTHOUSE} status {{"a":{DEEP}', "invalid-argument"),
+        )
+    ),
     # other machines and programs
     Mistake(f"chain status --web3-http-provider http://127.0.0.1:{NODE}", "node-unreachable", "aira chain up", 1),
     Mistake(f"chain up --engine embedded --port {TAKEN}", "port-unavailable", "--port"),
@@ -135,6 +158,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "keyfile.json").write_text(f'{{"version": 3, "address": "{LIGHTHOUSE[2:].lower()}", "crypto": {{}}}}')
     (tmp_path / "unversioned.json").write_text('{"crypto": {}}')
     (tmp_path / "not.toml").write_text("keyfile =\n")
+    (tmp_path / "deep.toml").write_text(f"keyfile = {DEEP}\n")
+    (tmp_path / "deep.json").write_text(DEEP)
+    (tmp_path / "deep.jsonl").write_text(f'{{"topic":"/a","value":{DEEP}\n')
+    (tmp_path / "lines.jsonl").write_text('{"topic":"/a","value":1}\n')
     (tmp_path / "unknown.toml").write_text("zebra = 1\n")
     return tmp_path
 

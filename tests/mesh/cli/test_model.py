@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from mesh.cli.errors import FileExists, ProgramUnusable
 from schemas import cid_of_file
 from schemas.model import InvalidDescription, ModelDescription, read_description
 from tests.support.commands import aira, invoke, refused
@@ -68,7 +67,7 @@ def test_new_writes_the_only_form_and_prints_the_model(draft: Path) -> None:
 
 
 def test_new_replaces_a_file_only_if_asked_or_if_it_is_the_source(draft: Path, described: Path) -> None:
-    refused(model("new", draft, folder=draft.parent), FileExists, described)
+    refused(model("new", draft, folder=draft.parent), "file-exists", described)
     described.write_text(json.dumps(DRAFT | {"title": "Other"}))
     assert model("new", described, folder=draft.parent).returncode == 0
     assert read_description(described.read_bytes()).title == "Other"
@@ -231,7 +230,7 @@ async def main() -> None:
 run_to_end(main)
 """
     done = aira("model", "new", program(tmp_path, text))
-    refused(done, ProgramUnusable, "robot.py starts its agent", exit_code=2)
+    refused(done, "program-unusable", "robot.py starts its agent", exit_code=2)
 
 
 @pytest.mark.parametrize(
@@ -247,5 +246,5 @@ run_to_end(main)
 )
 def test_new_refuses_a_program_without_one_agent(tmp_path: Path, text: str, said: str) -> None:
     done = model("new", program(tmp_path, text), folder=tmp_path)
-    refused(done, ProgramUnusable, said, exit_code=2)
+    refused(done, "program-unusable", said, exit_code=2)
     assert not (tmp_path / "model.json").exists()

@@ -8,24 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.cli.errors import (
-    FileExists,
-    FileUnreadable,
-    FileUnwritable,
-    FolderMissing,
-    InvalidDestination,
-    InvalidOptions,
-    NotAFileOrCid,
-)
-from mesh.cli.objective_plot import FIELDS, POINTS, TOPICS, Line, lines_of
+from mesh.agent.objectives import ObjectiveUnfit
+from mesh.base.extras import PackageMissing
+from mesh.cli.objective import FIELDS, POINTS, TOPICS, Line, lines_of
 from mesh.cli.output import format_size
 from mesh.content import Store
 from mesh.errors import AiraError, InvalidCid
-from mesh.extras import PackageMissing
-from mesh.recording import Played, Recorder, RecordingAbout, open_objective
-from mesh.recording.errors import NotARecording, RecordingError, RecordingExists
-from mesh.recording.packing import InvalidLine
-from mesh.work.objectives import ObjectiveUnfit
+from mesh.recording import Played, Recorder, RecordingAbout, open_objective, pack
+from mesh.recording._source import NotARecording, RecordingError
 from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import JSON, STRING, Empty, String, encode_value
 from tests.mesh.cli.calls import call
@@ -40,8 +30,8 @@ if TYPE_CHECKING:
 
 
 LINES = b"""{"topic": "/blink"}
-{"topic": "/blink", "time": 0.5, "data": "blue"}
-{"topic": "/move", "time": 2, "data": {"x": 1}}
+{"topic": "/blink", "time": 0.5, "value": "blue"}
+{"topic": "/move", "time": 2, "value": {"x": 1}}
 """
 
 
@@ -92,25 +82,25 @@ def test_a_bag_is_packed_without_losing_anything(tmp_path: Path) -> None:
 
 def test_an_error_names_the_invalid_line_and_nothing_is_written(tmp_path: Path) -> None:
     done = call("pack", "-", "--out", tmp_path / "it.mcap", given=LINES + b'{"topic": "blink"}\n')
-    refused(done, InvalidLine, "line 4", "blink")
+    refused(done, "invalid-line", "line 4", "blink")
     assert not (tmp_path / "it.mcap").exists()
 
 
 @pytest.mark.parametrize(
     ("words", "error", "value"),
     [
-        (["pack", "--out", "new"], InvalidOptions, "SOURCE"),
-        (["pack", "-", "--hear", "a", "--out", "new"], InvalidOptions, "SOURCE"),
-        (["pack", "missing", "--out", "new"], FileUnreadable, "missing"),
-        (["pack", "missing", "--out", "/"], FileExists, "/"),
-        (["pack", "-", "--out", "nowhere/new"], FolderMissing, "nowhere"),
-        (["pack", "--hear", "a//b", "--out", "new"], InvalidDestination, "a//b"),
-        (["show", "missing"], NotAFileOrCid, "missing"),
-        (["show", "."], FileUnreadable, "."),
-        (["convert", "missing"], FileUnreadable, "missing"),
-        (["add", "missing"], FileUnreadable, "missing"),
-        (["recover", "missing"], FileUnreadable, "missing"),
-        (["check", "missing"], NotAFileOrCid, "missing"),
+        (["pack", "--out", "new"], "invalid-options", "SOURCE"),
+        (["pack", "-", "--hear", "a", "--out", "new"], "invalid-options", "SOURCE"),
+        (["pack", "missing", "--out", "new"], "file-unreadable", "missing"),
+        (["pack", "missing", "--out", "/"], "file-exists", "/"),
+        (["pack", "-", "--out", "nowhere/new"], "folder-missing", "nowhere"),
+        (["pack", "--hear", "a//b", "--out", "new"], "invalid-destination", "a//b"),
+        (["show", "missing"], "not-a-file-or-cid", "missing"),
+        (["show", "."], "file-unreadable", "."),
+        (["convert", "missing"], "file-unreadable", "missing"),
+        (["add", "missing"], "file-unreadable", "missing"),
+        (["recover", "missing"], "file-unreadable", "missing"),
+        (["check", "missing"], "not-a-file-or-cid", "missing"),
         (["get", "Qm", "--out", "new"], InvalidCid, "Qm"),
     ],
 )
@@ -125,10 +115,10 @@ def test_invalid_arguments_are_one_clear_line(
 def test_no_file_is_overwritten(tmp_path: Path, sound: Path) -> None:
     before = sound.read_bytes()
     for words in (["pack", "-", "--out"], ["get", cid_of_bytes(b"x"), "--out"], ["recover", sound, "--out"]):
-        refused(call(*words, sound), FileExists, sound)
+        refused(call(*words, sound), "file-exists", sound)
     bag = tmp_path / "it.bag"
     bag.write_bytes(Bag([BagMessage("/blink", string("blue"), T0)]).encode())
-    refused(call("convert", bag, sound), FileExists, sound)
+    refused(call("convert", bag, sound), "file-exists", sound)
     assert sound.read_bytes() == before
 
 
@@ -184,7 +174,7 @@ def test_cat_prints_the_messages_of_a_topic(tmp_path: Path) -> None:
         ("/raw", None, "AQI="),
         ("/at", {"x": 1.5}, None),
     ]
-    refused(call("cat", "missing"), NotAFileOrCid, "missing")
+    refused(call("cat", "missing"), "not-a-file-or-cid", "missing")
 
 
 @pytest.fixture
@@ -235,7 +225,16 @@ def test_show_draws_a_plot(tmp_path: Path, sound: Path, measured: Path) -> None:
         done = call("show", shown, "--png", tmp_path / "it.png")
         assert done.exit_code == 0, done.output
     assert (tmp_path / "it.png").read_bytes().startswith(b"\x89PNG\r\n")
-    refused(call("show", sound, "--png", tmp_path / "nowhere" / "it.png"), FileUnwritable)
+    refused(call("show", sound, "--png", tmp_path / "nowhere" / "it.png"), "file-unwritable")
+
+
+@pytest.mark.parametrize("number", ["1e308", "-1e308", "1" + "0" * 400, "[1e308,-1e308]", '{"a":1,"b":1e300}'])
+def test_numbers_that_can_not_be_drawn_are_gaps_in_a_plot(tmp_path: Path, number: str) -> None:
+    messages = [Played("/x", text.encode(), at, at, 0, JSON) for at, text in enumerate(["1", number, "2"], 1)]
+    pack(messages, tmp_path / "huge.mcap")
+    done = call("show", tmp_path / "huge.mcap", "--png", tmp_path / "it.png")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "it.png").read_bytes().startswith(b"\x89PNG\r\n")
 
 
 def test_without_matplotlib_the_error_says_how_to_install_it(
@@ -244,7 +243,7 @@ def test_without_matplotlib_the_error_says_how_to_install_it(
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     done = call("show", sound, "--png", tmp_path / "it.png")
     refused(done, PackageMissing, "matplotlib")
-    assert "pip install 'aira-mesh[plot]'" in done.stderr
+    assert "pip install '.[plot]'" in done.stderr
 
 
 def test_a_file_that_is_no_recording_can_not_be_shown(tmp_path: Path) -> None:
@@ -340,7 +339,7 @@ def test_the_readable_part_of_a_truncated_file_is_recovered(tmp_path: Path) -> N
     saved = tmp_path / "it.recovered.mcap"
     assert (said["file"], said["cid"]) == (str(saved), cid_of_file(saved))
     assert 0 < said["messages"] == open_objective(saved).count < 500
-    refused(call("recover", tmp_path / "it.mcap"), RecordingExists)
+    refused(call("recover", tmp_path / "it.mcap"), "recording-exists")
     (tmp_path / "text").write_bytes(b"hello")
     refused(call("recover", tmp_path / "text"), RecordingError, "text")
 

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import zenoh
 
-from mesh.cli.errors import NothingRecorded
 from mesh.content import Exchange, Store
-from mesh.content.errors import ContentUnavailable
+from mesh.content._errors import ContentUnavailable
 from mesh.errors import NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network
 from mesh.recording import open_objective
@@ -161,5 +160,5 @@ def test_ctrl_c_ends_the_capture_with_a_complete_file(router: EmbeddedRouter, tm
 def test_without_messages_no_file_is_left(router: EmbeddedRouter, tmp_path: Path) -> None:
     out = tmp_path / "it.mcap"
     words: list[str | Path] = ["--hear", "silence/**", "--seconds", "0.2", "--out", out, "--connect", router.endpoint]
-    refused(call("pack", *words), NothingRecorded, "silence/**")
+    refused(call("pack", *words), "nothing-recorded", "silence/**")
     assert not out.exists()

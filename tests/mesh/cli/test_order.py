@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import OrderState
-from mesh.cli.demand import demand
-from mesh.cli.errors import InvalidOptions, UnknownOrder
-from mesh.cli.order import _list, _withdraw
+from mesh.agent.orders import OrderState
+from mesh.cli import demand as commands
+from mesh.cli.order import list_orders, withdraw
+from mesh.errors import InputError
 from mesh.network import Endpoints, Network
 from schemas import RejectKey, verify
 from schemas.signing import Rejection
 from tests.mesh.operations.site import MODEL, Site, settings_of
-from tests.support.commands import invoke
+from tests.support.commands import coroutine, invoke
+from tests.support.raising import raises_with
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -28,15 +29,18 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 
+demand = coroutine(commands.demand)
+
+
 @pytest.fixture
 async def site(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path) -> Site:
     return await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
 
 
 async def test_an_account_without_a_ledger_has_no_orders(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
-    await _list(settings_of(site, "poor"), as_json=False)
+    await coroutine(list_orders)(settings_of(site, "poor"), as_json=False)
     assert capsys.readouterr().out == f"no open orders of {site.address('poor')}\n"
-    await _list(settings_of(site, "poor"), as_json=True)
+    await coroutine(list_orders)(settings_of(site, "poor"), as_json=True)
     assert json.loads(capsys.readouterr().out) == []
     assert not (site.folder / "state" / site.address("poor")).exists()
 
@@ -45,17 +49,17 @@ async def test_orders_are_listed_and_withdrawn_by_their_hash(site: Site, capsys:
     settings = settings_of(site, "person")
     async with site.agent("person") as person:
         orders = [await person.order(site.job("one"), cost=cost) for cost in (5, 6)]
-    await _list(settings, as_json=True)
+    await coroutine(list_orders)(settings, as_json=True)
     listed = json.loads(capsys.readouterr().out)
     assert [(one["hash"], one["kind"], one["state"], one["cost"]) for one in listed] == [
         (order.hash, "demand", "open", order.message.cost) for order in orders
     ]
     assert all(0 < one["blocksLeft"] <= one["deadline"] for one in listed)
-    with pytest.raises(UnknownOrder):
-        await _withdraw(settings, ("00" * 32,), everything=False, on_chain=False, as_json=True)
-    with pytest.raises(InvalidOptions):
-        await _withdraw(settings, ("",), everything=False, on_chain=False, as_json=True)
-    await _withdraw(settings, (orders[0].hash[:20],), everything=False, on_chain=False, as_json=True)
+    with raises_with(InputError, code="unknown-order"):
+        await coroutine(withdraw)(settings, ("00" * 32,), everything=False, on_chain=False, as_json=True)
+    with raises_with(InputError, code="invalid-options"):
+        await coroutine(withdraw)(settings, ("",), everything=False, on_chain=False, as_json=True)
+    await coroutine(withdraw)(settings, (orders[0].hash[:20],), everything=False, on_chain=False, as_json=True)
     (fact,) = json.loads(capsys.readouterr().out)
     assert fact == {
         "hash": orders[0].hash,
@@ -66,11 +70,11 @@ async def test_orders_are_listed_and_withdrawn_by_their_hash(site: Site, capsys:
         "honouredBy": [],
         "tx": None,
     }
-    await _list(settings, as_json=False)
+    await coroutine(list_orders)(settings, as_json=False)
     printed = capsys.readouterr().out
     assert all(order.hash in printed for order in orders)
     assert [word for word in printed.split() if word in ("open", "withdrawn")] == ["open", "withdrawn"]
-    await _withdraw(settings, (), everything=True, on_chain=False, as_json=False)
+    await coroutine(withdraw)(settings, (), everything=True, on_chain=False, as_json=False)
     said = capsys.readouterr().out
     assert f"demand {orders[1].hash} is withdrawn" in said
     assert "may still become a contract" in said
@@ -83,7 +87,9 @@ async def test_the_provider_confirms_a_withdrawal_and_does_not_match_the_order(
     async with site.provider():
         async with site.agent("person") as person:
             old = await person.order(site.job("withdrawn"), cost=5)
-        await _withdraw(settings_of(site, "person"), (old.hash,), everything=False, on_chain=False, as_json=True)
+        await coroutine(withdraw)(
+            settings_of(site, "person"), (old.hash,), everything=False, on_chain=False, as_json=True
+        )
         (fact,) = json.loads(capsys.readouterr().out)
         assert (fact["providers"], fact["confirmedBy"]) == (1, 1)
         assert fact["honouredBy"] == [site.accounts["provider"].address]

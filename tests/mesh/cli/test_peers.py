@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from mesh.cli.status import show_peers
+from mesh.cli.status import peers
 from mesh.network import Channel, Endpoints, Network
 from mesh.network.channel import PRESENT_LIMIT
 from mesh.settings import Settings
 from mesh.watching import present
 from schemas.status import BridgeStatus, bridge_status_key
 from tests.mesh.watching.test_presence import answering, bridge_status
+from tests.support.commands import coroutine
 from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER
 from tests.support.waiting import until_answered, until_found
 
@@ -54,21 +55,21 @@ async def bridging(router: EmbeddedRouter, *bridges: BridgeStatus) -> AsyncItera
 async def test_an_empty_channel_is_printed_as_a_line(
     router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    await show_peers(Settings(connect=(router.endpoint,)), as_json=False)
+    await coroutine(peers)(Settings(connect=(router.endpoint,)), as_json=False)
     assert capsys.readouterr().out == f"0 peers on {MARKET}; IPFS side: unknown, there is no bridge\n"
 
 
 async def test_peers_are_listed_by_role_and_address(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
     connected = msgspec.structs.replace(bridge_status(), ipfs_peers=NODES, state="connected")
     async with bridging(router, connected) as settings:
-        await show_peers(settings, as_json=False)
+        await coroutine(peers)(settings, as_json=False)
         assert capsys.readouterr().out.splitlines() == [
             "role    address",
             f"agent   {ROBOT.address}",
             f"bridge  {STRANGER.address}",
             f"2 peers on {MARKET}; IPFS side: 3 nodes",
         ]
-        await show_peers(settings, as_json=True)
+        await coroutine(peers)(settings, as_json=True)
         assert json.loads(capsys.readouterr().out) == {
             "lighthouse": MARKET,
             "peers": [
@@ -91,7 +92,7 @@ async def test_a_flood_of_agents_hides_no_bridge(router: EmbeddedRouter, capsys:
             channel.announce("agent", f"0x{number:040x}")
 
         async def found() -> bool:
-            await show_peers(settings, as_json=True)
+            await coroutine(peers)(settings, as_json=True)
             said = json.loads(capsys.readouterr().out)
             assert {"role": "bridge", "address": STRANGER.address} in said["peers"]
             assert len(said["peers"]) <= PRESENT_LIMIT + 1
@@ -106,11 +107,11 @@ async def test_of_several_bridges_the_one_that_carries_is_used(
     carries = msgspec.structs.replace(bridge_status(), ipfs_peers=NODES[:1], state="connected")
     stands_by = msgspec.structs.replace(bridge_status(bridge=PERSON.address), ipfs_peers=NODES, carries=False)
     async with bridging(router, stands_by, carries) as settings:
-        await show_peers(settings, as_json=False)
+        await coroutine(peers)(settings, as_json=False)
     assert capsys.readouterr().out.endswith("IPFS side: 1 node\n")
 
 
 async def test_a_bridge_without_its_daemon_says_so(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
     async with bridging(router, msgspec.structs.replace(bridge_status(), state="no daemon")) as settings:
-        await show_peers(settings, as_json=False)
+        await coroutine(peers)(settings, as_json=False)
     assert capsys.readouterr().out.endswith("IPFS side: 0 nodes; the bridge reports: no daemon\n")

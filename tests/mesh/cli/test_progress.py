@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.cli import main
-from mesh.running import INTERRUPTED
+from mesh.role.running import INTERRUPTED
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.commands import AIRA, SECONDS, environment
 from tests.support.objectives import objective

@@ -13,12 +13,11 @@ from click.testing import CliRunner
 
 from mesh.chain.errors import NodeUnreachable
 from mesh.cli import main
-from mesh.cli.errors import AccountMissing, FileUnreadable, InvalidDestination, NotAFileOrCid, UnknownTopic
 from mesh.content import Store
-from mesh.content.errors import ContentUnavailable
+from mesh.content._errors import ContentUnavailable
 from mesh.errors import AiraError, InvalidKey, NetworkUnavailable
 from mesh.recording import Recorder, RecordingAbout
-from mesh.recording.errors import NotARecording
+from mesh.recording._source import NotARecording
 from schemas import String, cid_of_bytes
 from schemas.payloads import STRING
 from tests.support.commands import AIRA, Serving, refused
@@ -74,12 +73,19 @@ def test_a_file_is_published_on_the_topics_of_a_device(stage: Stage, listener: L
     done = stage.play(stage.path, "--to", f"{ROBOT}/lamp")
     assert done.exit_code == 0, done.output
     assert done.stdout.startswith("3 messages in ")
+    assert done.stderr == ""
     device = f"aira/agent/{ROBOT}/device/lamp"
     assert [(key, payload, encoding) for key, payload, encoding, _ in listener.heard(3)] == [
         (f"{device}/go", String("there").encode(), "ros1;std_msgs/String"),
         (f"{device}/move/left", b'{"x":1}', "application/json;raw"),
         (f"{device}/go", b"\1", "application/octet-stream;raw"),
     ]
+
+
+def test_a_playback_that_nobody_hears_says_so(stage: Stage) -> None:
+    done = stage.play(stage.path, "--to", f"{ROBOT}/absent", "--topics", "/go")
+    assert done.stderr == f"aira: nobody listens on aira/agent/{ROBOT}/device/absent/go\n"
+    assert done.exit_code == 0
 
 
 def test_a_file_is_published_under_a_given_key_prefix(stage: Stage, listener: Listener) -> None:
@@ -149,14 +155,14 @@ def test_ctrl_c_ends_it(stage: Stage, listener: Listener) -> None:
 @pytest.mark.parametrize(
     ("words", "error", "value"),
     [
-        (["missing", "--to", "a/b"], NotAFileOrCid, "missing"),
-        ([".", "--to", "a/b"], FileUnreadable, "."),
-        (["it.mcap"], InvalidDestination, "destination"),
-        (["it.mcap", "--to", "lamp"], AccountMissing, "lamp"),
+        (["missing", "--to", "a/b"], "not-a-file-or-cid", "missing"),
+        ([".", "--to", "a/b"], "file-unreadable", "."),
+        (["it.mcap"], "invalid-destination", "destination"),
+        (["it.mcap", "--to", "lamp"], "account-missing", "lamp"),
         (["it.mcap", "--to", f"{ROBOT}/la mp"], InvalidKey, "la mp"),
-        (["it.mcap", "--to", "a/**"], InvalidDestination, "a/**"),
-        (["it.mcap", "--to", "a//b"], InvalidDestination, "a//b"),
-        (["it.mcap", "--to", "a/b", "--topics", "/stop"], UnknownTopic, "/stop"),
+        (["it.mcap", "--to", "a/**"], "invalid-destination", "a/**"),
+        (["it.mcap", "--to", "a//b"], "invalid-destination", "a//b"),
+        (["it.mcap", "--to", "a/b", "--topics", "/stop"], "unknown-topic", "/stop"),
         (["text", "--to", "a/b"], NotARecording, "text"),
         (["odd.mcap", "--to", "a/b"], InvalidKey, "a b"),
     ],

@@ -9,27 +9,29 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import Agent
-from mesh.cli.demand import demand
-from mesh.cli.errors import OutputFailed
+from mesh.agent.agent import Agent
+from mesh.cli import demand as commands
 from mesh.cli.provider import serve as serve_provider
 from mesh.cli.router import serve as serve_router
 from mesh.cli.up import serve_market as serve_up
-from mesh.composition import load_account
-from mesh.errors import ConfigurationError, NetworkUnavailable
+from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable
+from mesh.role.composition import load_account
 from mesh.settings import Settings
 from schemas import EventKey, cid_of_bytes, cid_of_file
+from tests.support.commands import coroutine
 from tests.support.development import settings_of
 from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
+from tests.support.raising import raises_with
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
 
+demand = coroutine(commands.demand)
 MODEL = cid_of_bytes(b"what is asked for on the command line")
 ORDER = {"model": MODEL, "cost": "0", "validator": "", "validator_fee": "0", "lifetime": 1000}
 
@@ -100,7 +102,7 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
         assert str(tmp_path) in end["recording"]
         printed.text = ""
         full = Path("/dev/full")
-        with pytest.raises(OutputFailed, match="/dev/full") as caught:
+        with raises_with(AiraError, code="output-failed", match="/dev/full") as caught:
             await demand(person, objective=cid_of_file(path), out=full, as_json=True, **order)
         assert '"liability"' in printed
         _, summary = progress_and_end(printed.text)

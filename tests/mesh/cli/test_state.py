@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 from click.testing import CliRunner
 
+from mesh.agent.ledger import Ledger
 from mesh.cli import main
-from mesh.state.layout import StateExists, StateInUse
-from mesh.work import Ledger
-from tests.mesh.state.conftest import ADDRESS, CHAIN, JOB, Folder, folder
+from tests.mesh.ops.state.conftest import ADDRESS, CHAIN, JOB, Folder, folder
 from tests.support.commands import aira, refused
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ def test_backup_and_restore_print_json(folder: Folder, tmp_path: Path) -> None:
 def test_an_existing_state_is_an_error_with_a_hint(folder: Folder, tmp_path: Path) -> None:
     call("backup", tmp_path / "it", "--data-dir", folder.path)
     done = call("restore", tmp_path / "it", "--data-dir", folder.path)
-    assert "--existing set-aside" in refused(done, StateExists, folder.path)
+    assert "--existing set-aside" in refused(done, "state-exists", folder.path)
     again = call("restore", tmp_path / "it", "--data-dir", folder.path, "--existing", "set-aside")
     assert again.exit_code == 0
     assert f"old state    {folder.path}/.replaced-" in again.stdout
@@ -94,7 +93,7 @@ async def test_a_state_in_use_is_refused_with_every_option(folder: Folder, tmp_p
     async with Ledger(folder.ledger):
         assert aira(*backup).returncode == 0
         done = aira(*restore)
-    refused(done, StateInUse, folder.ledger)
+    refused(done, "state-in-use", folder.ledger)
 
 
 def test_mistakes_are_one_line_and_a_hint(folder: Folder, tmp_path: Path) -> None:

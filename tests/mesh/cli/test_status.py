@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 
 import mesh
-from mesh.agent import Agent
+from mesh.agent.agent import Agent
 from mesh.chain import Chain
-from mesh.cli.errors import NoAnswer
-from mesh.cli.status import describe_status, show_all, show_one, summarize_status
-from mesh.devchain import JsonRpcServer
+from mesh.cli import status as commands
+from mesh.cli.status import describe_status, summarize_status
+from mesh.dev import JsonRpcServer
 from mesh.errors import InvalidAddress
-from mesh.network import Endpoints, Network
+from mesh.network import Endpoints, Network, ServiceFailed
 from mesh.settings import Settings
 from mesh.validator.validator import Validator
 from schemas import RpcKey
@@ -23,9 +24,11 @@ from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, Valid
 from tests.mesh.cli.served_chain import columns
 from tests.mesh.market.local_market import QUICK
 from tests.mesh.watching.test_presence import WAY, bridge_status, status
+from tests.support.commands import coroutine
 from tests.support.market import MODEL, offering, offering_unseen
 from tests.support.objectives import objective
 from tests.support.orders import MARKET, OBJECTIVE, ROBOT, STRANGER
+from tests.support.raising import raises_with
 from tests.support.waiting import until_answered, until_found
 
 if TYPE_CHECKING:
@@ -62,7 +65,7 @@ async def read_status(place: Place, role: str, capsys: pytest.CaptureFixture[str
     """The status of a role as `aira status --json` prints it."""
     async with Network(Endpoints(connect=(place.endpoint,))) as network:
         await until_answered(network.session, str(RpcKey(place.address(role), "status")))
-    await show_one(place.settings("watcher"), place.address(role), timeout=60.0, as_json=True)
+    await coroutine(commands.status)(place.settings("watcher"), place.address(role), timeout=60.0, as_json=True)
     (found,) = json.loads(capsys.readouterr().out)
     assert isinstance(found, dict)
     return found
@@ -150,7 +153,9 @@ async def test_a_provider_reports_its_orders_and_earnings(place: Place, capsys: 
 
         await until_found(has_created, what="the contract in the provider's count", seconds=60)
         found = await read_status(place, "provider", capsys)
-        await show_one(place.settings("watcher"), place.address("provider"), timeout=60.0, as_json=False)
+        await coroutine(commands.status)(
+            place.settings("watcher"), place.address("provider"), timeout=60.0, as_json=False
+        )
         shown = columns(capsys.readouterr().out)
     assert (found["role"], found["market"]["created"], found["market"]["openOrders"]) == ("provider", 1, 0)
     assert int(found["market"]["spent"]) > 0
@@ -162,12 +167,12 @@ async def test_each_peer_on_the_lighthouse_has_a_line(place: Place, capsys: pyte
     async with place.at_work(place.agent("robot")):
 
         async def all_there() -> bool:
-            await show_all(place.settings("watcher"), timeout=60.0, as_json=True)
+            await coroutine(commands.status)(place.settings("watcher"), None, timeout=60.0, as_json=True)
             people = json.loads(capsys.readouterr().out)["peers"]
             return len(people) == 3 and all(person["status"] for person in people)
 
         await until_found(all_there, what="three peers", seconds=30)
-        await show_all(place.settings("watcher"), timeout=60.0, as_json=False)
+        await coroutine(commands.status)(place.settings("watcher"), None, timeout=60.0, as_json=False)
     head, *rows = capsys.readouterr().out.splitlines()
     assert head.split() == ["role", "address", "status"]
     assert sorted(row.split()[0] for row in rows) == ["agent", "agent", "provider"]
@@ -179,19 +184,38 @@ async def test_a_peer_that_does_not_answer_is_listed(place: Place, capsys: pytes
         robot.channel.announce("person", STRANGER.address)
 
         async def is_there() -> bool:
-            await show_all(place.settings("watcher"), timeout=60.0, as_json=False)
+            await coroutine(commands.status)(place.settings("watcher"), None, timeout=60.0, as_json=False)
             return f"person  {STRANGER.address}  no answer\n" in capsys.readouterr().out
 
         await until_found(is_there, what="the silent one", seconds=30)
 
 
+@pytest.mark.parametrize("number", [b"1e308", b"-1e308", b"1" + b"0" * 4000, b"18446744073709551616", b"-1e18"])
+@pytest.mark.parametrize("field", [b'"uptime":0.0', b'"head":7', b'"chainId":1'])
+async def test_a_stranger_with_strange_numbers_is_shown_or_has_not_answered(
+    router: EmbeddedRouter, capsys: pytest.CaptureFixture[str], number: bytes, field: bytes
+) -> None:
+    settings, key = Settings(connect=(router.endpoint,)), str(RpcKey(STRANGER.address, "status"))
+    reply = status(address=STRANGER.address).encode()
+    assert field in reply
+    strange = reply.replace(field, field.partition(b":")[0] + b":" + number)
+    async with Network(Endpoints(connect=(router.endpoint,))) as network:
+        answering: Any = network.session.declare_queryable(key, lambda query: query.reply(key, strange))
+        await until_answered(network.session, key)
+        for as_json in (False, True):
+            with suppress(ServiceFailed):
+                await coroutine(commands.status)(settings, STRANGER.address, timeout=1.0, as_json=as_json)
+        answering.undeclare()
+    assert len(capsys.readouterr().out) < 3000
+
+
 async def test_a_missing_peer_is_one_clear_line(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
     settings = Settings(connect=(router.endpoint,))
-    with pytest.raises(NoAnswer, match=STRANGER.address):
-        await show_one(settings, STRANGER.address, timeout=1.0, as_json=False)
+    with raises_with(ServiceFailed, code="no-answer", match=STRANGER.address):
+        await coroutine(commands.status)(settings, STRANGER.address, timeout=1.0, as_json=False)
     with pytest.raises(InvalidAddress):
-        await show_one(settings, "robot", timeout=1.0, as_json=False)
-    await show_all(settings, timeout=1.0, as_json=False)
+        await coroutine(commands.status)(settings, "robot", timeout=1.0, as_json=False)
+    await coroutine(commands.status)(settings, None, timeout=1.0, as_json=False)
     assert capsys.readouterr().out == f"no peers on {MARKET}\n"
 
 

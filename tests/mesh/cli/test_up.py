@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 import pytest
@@ -9,11 +10,11 @@ from click.testing import CliRunner
 
 from mesh.chain import Node
 from mesh.cli import main
-from mesh.cli.errors import AnvilMissing
 from tests.mesh.cli.served_chain import columns
-from tests.support.commands import AIRA, Serving, refused
+from tests.support.commands import AIRA, Serving, aira, refused
 from tests.support.peers import require
 from tests.support.ports import free_port
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,8 +32,8 @@ def test_anvil_on_the_path_is_used(tmp_path: Path, on_path: dict[str, str]) -> N
         assert columns(server.log())["engine"] == f"anvil ({tmp_path}/programs/anvil)"
 
 
-def kept_withdrawals(folder: Path) -> int:
-    return len(list(folder.rglob("withdrawals-*.sqlite")))
+def kept_providers(folder: Path) -> int:
+    return len(list(folder.rglob("provider-*.sqlite")))
 
 
 @pytest.mark.full
@@ -44,10 +45,37 @@ async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
             async with Node(columns(server.log())["chain"]) as node:
                 first_blocks.append(await node.header(1))
     assert first_blocks[0] == first_blocks[1]
-    assert kept_withdrawals(tmp_path) == 2  # of one chain, for the market of each generation
+    assert kept_providers(tmp_path) == 2  # of one chain, for the market of each generation
 
 
 def test_a_state_file_without_anvil_is_one_clear_line(tmp_path: Path) -> None:
     options = ["--engine", "embedded", "--state", str(tmp_path / "chain.json")]
     done = CliRunner().invoke(main, ["up", "--listen", f"tcp/127.0.0.1:{free_port()}", *options])
-    refused(done, AnvilMissing, "--state")
+    refused(done, "anvil-missing", "--state")
+
+
+def test_it_prints_where_it_listens_and_how_to_use_it(tmp_path: Path) -> None:
+    options = ("--engine", "embedded", "--port", "0", "--listen", "tcp/127.0.0.1:0", "--no-web", "--data-dir", tmp_path)
+    with Serving(
+        *AIRA, "up", *options, says="export AIRA_KEYFILE_PASSWORD_FILE", variables={"AIRA_GENERATION": "5"}
+    ) as up:
+        printed = up.log()
+        lines = [line.removeprefix("export ") for line in printed.splitlines() if line.startswith("export ")]
+        variables = dict(line.split("=", 1) for line in lines)
+        shown = columns("\n".join(line for line in printed.splitlines() if not line.startswith("export ")))
+        assert shown["lighthouse"] == "airalab.lighthouse.5.robonomics.eth"
+        assert shown["router"] == variables["AIRA_CONNECT"] != "tcp/127.0.0.1:0"
+        seen = aira("lighthouse", "list", "--json", **variables)
+        assert seen.returncode == 0, seen.stderr
+        peers = aira("peers", "--json", **variables)
+        assert '"provider"' in peers.stdout, peers.stderr
+
+
+def test_it_prints_the_same_for_programs(tmp_path: Path) -> None:
+    options = ("--engine", "embedded", "--port", "0", "--listen", "tcp/127.0.0.1:0", "--no-web", "--data-dir", tmp_path)
+    with Serving(*AIRA, "up", *options, "--json", says='"environment"') as up:
+        wait_until(lambda: up.log().endswith("\n"), what="the whole line")
+        facts = json.loads(up.log())
+    assert facts["environment"]["AIRA_WEB3_HTTP_PROVIDER"] == facts["chain"]
+    assert facts["lighthouseName"] == "airalab.lighthouse.3.robonomics.eth"
+    assert [facts["environment"]["AIRA_CONNECT"]] == facts["router"]

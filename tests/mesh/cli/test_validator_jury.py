@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 
 from mesh.amounts import InvalidAmount
-from mesh.chain import XRT, InsufficientTokens, InvalidJury, NoFees, NotAJury, Reverted
-from mesh.cli.errors import InvalidOptions
+from mesh.chain import XRT, InsufficientTokens, Reverted
+from mesh.errors import ChainError, InputError
 from schemas import address_bytes
 from schemas.errors import InvalidAddress
 from tests.mesh.cli.served_chain import ServedChain, columns
 from tests.support.commands import refused
-
-if TYPE_CHECKING:
-    from mesh.errors import AiraError
 
 
 def ascending(served: ServedChain, *roles: str) -> list[str]:
@@ -65,19 +60,17 @@ def test_deploying_says_what_to_do_next(served: ServedChain) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error"),
+    ("arguments", "code"),
     [
-        (("--quorum", "0"), InvalidJury),
-        (("--quorum", "2"), InvalidJury),
-        (("--juror", "nobody"), InvalidAddress),
-        (tuple(word for number in range(1, 9) for word in ("--juror", f"0x{number:040x}")), InvalidJury),
-        (("--juror", f"0x{1:040x}", "--juror", f"0x{1:040x}"), InvalidJury),
+        (("--quorum", "0"), "invalid-jury"),
+        (("--quorum", "2"), "invalid-jury"),
+        (("--juror", "nobody"), InvalidAddress.code),
+        (tuple(word for number in range(1, 9) for word in ("--juror", f"0x{number:040x}")), "invalid-jury"),
+        (("--juror", f"0x{1:040x}", "--juror", f"0x{1:040x}"), "invalid-jury"),
     ],
 )
-def test_what_is_no_jury_is_one_clear_line(
-    served: ServedChain, arguments: tuple[str, ...], error: type[AiraError]
-) -> None:
-    refused(served.aira("validator", "deploy", *arguments), error)
+def test_what_is_no_jury_is_one_clear_line(served: ServedChain, arguments: tuple[str, ...], code: str) -> None:
+    refused(served.aira("validator", "deploy", *arguments), InputError, code=code)
 
 
 def test_the_keeper_collects_all_or_a_part(served: ServedChain) -> None:
@@ -89,7 +82,7 @@ def test_the_keeper_collects_all_or_a_part(served: ServedChain) -> None:
     said = columns(served.aira("validator", "collect", AIRA_VALIDATOR_CONTRACT=contract).stdout)
     assert (said["collected"], said["left"]) == ("2.5 XRT", "0 XRT")
     assert served.ask("person", lambda chain: chain.tokens.balance()) == before + 3 * XRT
-    assert refused(served.aira("validator", "collect", contract), NoFees)
+    assert refused(served.aira("validator", "collect", contract), ChainError, code="no-fees")
 
 
 def test_what_can_not_be_collected_is_one_clear_line(served: ServedChain) -> None:
@@ -98,5 +91,5 @@ def test_what_can_not_be_collected_is_one_clear_line(served: ServedChain) -> Non
     assert "deployed" in refused(served.aira("validator", "collect", contract, by="robot"), Reverted)
     assert refused(served.aira("validator", "collect", contract, "--value", "2"), InsufficientTokens)
     assert refused(served.aira("validator", "collect", contract, "--value", "much"), InvalidAmount)
-    assert refused(served.aira("validator", "collect", served.deployment.factory), NotAJury)
-    assert refused(served.aira("validator", "collect"), InvalidOptions)
+    assert refused(served.aira("validator", "collect", served.deployment.factory), ChainError, code="not-a-jury")
+    assert refused(served.aira("validator", "collect"), "invalid-options")

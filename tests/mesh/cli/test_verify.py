@@ -5,26 +5,26 @@ from __future__ import annotations
 import asyncio
 import json
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import zenoh
 from click.testing import CliRunner
 
-from mesh.agent import Agent, Phase
+from mesh.agent.agent import Agent
+from mesh.agent.ledger import Phase
 from mesh.chain.errors import NodeUnreachable
-from mesh.cli import main
-from mesh.cli.demand import demand
-from mesh.cli.errors import FileUnreadable, InvalidOptions
-from mesh.cli.replay import ReplayOptions, replay
+from mesh.cli import demand as commands
+from mesh.cli import main, replay
 from mesh.cli.up import serve_market as serve_up
-from mesh.cli.verify import VerifiedFiles, verify_job
-from mesh.composition import load_account
+from mesh.cli.verify import verify_job
 from mesh.errors import AiraError, InvalidAddress
+from mesh.role.composition import load_account
 from mesh.settings import Settings
 from schemas import cid_of_bytes
 from tests.mesh.evidence.jobs import LIABILITY, OTHER, WORDS, make_job
-from tests.support.commands import aira, refused
+from tests.support.commands import aira, coroutine, refused
 from tests.support.development import settings_of
 from tests.support.listening import Listener
 from tests.support.market import offering
@@ -39,9 +39,10 @@ if TYPE_CHECKING:
 
     from click.testing import Result
 
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
     from tests.mesh.evidence.jobs import JobFiles
 
+demand = coroutine(commands.demand)
 MODEL = cid_of_bytes(b"what is verified")
 
 
@@ -112,10 +113,10 @@ def test_control_characters_of_untrusted_text_are_not_printed(job: JobFiles) -> 
 @pytest.mark.parametrize(
     ("words", "error", "value"),
     [
-        (["verify"], InvalidOptions, "files"),
-        (["verify", LIABILITY, "--offline"], InvalidOptions, "files"),
-        (["verify", "--objective", "nowhere", "--result", "nowhere"], FileUnreadable, "nowhere"),
-        (["verify", "--objective", ".", "--result", "."], FileUnreadable, "."),
+        (["verify"], "invalid-options", "files"),
+        (["verify", LIABILITY, "--offline"], "invalid-options", "files"),
+        (["verify", "--objective", "nowhere", "--result", "nowhere"], "file-unreadable", "nowhere"),
+        (["verify", "--objective", ".", "--result", "."], "file-unreadable", "."),
         (["verify", "0x12", "--offline", "--objective", "a", "--result", "b"], InvalidAddress, "0x12"),
         (["verify", LIABILITY, "--web3-http-provider", "http://127.0.0.1:9"], NodeUnreachable, "http://127.0.0.1:9"),
     ],
@@ -181,7 +182,8 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
     path.write_bytes(objective(("/go", "there"), ("/go", "back")))
     easier.write_bytes(objective(("/go", "there")))
     order: dict[str, Any] = {"model": MODEL, "cost": "7wn", "validator": "", "validator_fee": None, "lifetime": 1000}
-    nothing, other = (VerifiedFiles(objective=file, result=None, message=None) for file in (None, easier))
+    nothing: dict[str, Any] = {"result": None, "message": None, "offline": False}
+    again: dict[str, Any] = {"topics": None, "role": None, "rate": 1.0, "at_once": False, "start": 0.0}
     async with asyncio.timeout(180), served_market(tmp_path, capsys) as (endpoint, url):
         robot, person = (
             settings_of(role, tmp_path, url=url, endpoint=endpoint, connect_timeout=30.0, fetch_timeout=5.0)
@@ -189,24 +191,25 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
         )
         folder = str(tmp_path / "arbiter")
         nobody = Settings(connect=(endpoint,), fetch_timeout=10.0, web3_http_provider=url, data_dir=folder)
+        play_again = partial(coroutine(replay.command), nobody, as_json=False, **again)
         async with moving(robot) as worker:
             await demand(person, objective=str(path), out=None, as_json=True, **order)
             liability = json.loads(capsys.readouterr().out.splitlines()[-1])["liability"]
             await until_found(lambda: has_finalized(worker, liability), what="the robot's last word", seconds=60)
-            assert await verify_job(nobody, liability, nothing, offline=False, as_json=True)
+            assert await verify_job(nobody, liability=liability, objective=None, as_json=True, **nothing)
             said = json.loads(capsys.readouterr().out)
             assert [finding["holds"] for finding in said["findings"]] == [True] * 17
             with zenoh.open(client_config(endpoint)) as session:
                 listener = Listener(session)
                 await asyncio.to_thread(wait_until_declared, endpoint, "any/key")
-                await replay(nobody, ReplayOptions(source=liability))
+                await play_again(source=liability, of_objective=False, to=None)
                 robots = f"aira/agent/{load_account(robot).address.lower()}/liability/{liability.lower()}"
                 keys = sorted(await asyncio.to_thread(listener.keys, 4))
                 assert keys == [f"{robots}/objective/go"] * 2 + [f"{robots}/topic/gone"] * 2
-                await replay(nobody, ReplayOptions(source=liability, of_objective=True, to="lab/stage"))
+                await play_again(source=liability, of_objective=True, to="lab/stage")
                 assert (await asyncio.to_thread(listener.keys, 6))[4:] == ["lab/stage/go"] * 2
             capsys.readouterr()
-            assert not await verify_job(nobody, liability, other, offline=False, as_json=False)
+            assert not await verify_job(nobody, liability=liability, objective=easier, as_json=False, **nothing)
             assert "FAILS  objective-file" in capsys.readouterr().out
             with pytest.raises(AiraError):
-                await verify_job(nobody, OTHER, nothing, offline=False, as_json=False)
+                await verify_job(nobody, liability=OTHER, objective=None, as_json=False, **nothing)

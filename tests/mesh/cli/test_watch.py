@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from mesh.cli.watch import watch
-from mesh.errors import InvalidCid, NetworkUnavailable
+from mesh.errors import InputError, NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network, Reading, message_key
 from mesh.recording import open_objective
 from mesh.settings import Settings
@@ -28,13 +28,14 @@ from tests.support.log_events import logged_events
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.orders import CONTRACT, MARKET, PERSON, ROBOT, STRANGER, demand, result
+from tests.support.raising import raises_with
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
 
@@ -134,7 +135,7 @@ async def test_an_order_that_was_open_before_is_printed_when_asked_for(place: Pl
 
 
 async def test_a_model_that_is_not_a_cid_is_an_error() -> None:
-    with pytest.raises(InvalidCid):
+    with raises_with(InputError, code="not-a-model"):
         await watch(Settings(), "blink", with_open=False, as_json=False)
 
 

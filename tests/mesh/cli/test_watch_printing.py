@@ -6,11 +6,10 @@ from typing import Any
 
 import msgspec
 
-from mesh.cli.event_lines import EventFormatter, event_json
-from mesh.cli.watch import format_counters
+from mesh.cli.watch import EventFormatter, event_json, format_counters
 from mesh.network import Reading
 from mesh.watching import JobEvent, MarketCounters, PresenceChange, PresentPeer
-from schemas import Empty, String, verify_message
+from schemas import String, verify_message
 from schemas.payloads import encode_value
 from schemas.signing import Decline, Rejection
 from tests.mesh.watching.test_market import JOB
@@ -124,7 +123,7 @@ def test_the_line_of_a_reading_is_short_and_has_no_control_characters() -> None:
     assert "\x1b" not in line
     assert len(line) < 300
     assert format_line(read({"CO": 1})).startswith('reading    /air  {"CO":1}, from 0x')
-    assert format_line(read(Empty())).startswith("reading    /air  null, from 0x")
+    assert format_line(read(None)).startswith("reading    /air  null, from 0x")
     assert format_line(read(b"ab")).startswith('reading    /air  "YWI=", from 0x')
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.content import Assembly, BlockRef, ContentCorrupt, ContentTooLarge, Store
-from mesh.content.dag import MAX_DEPTH
+from mesh.content._blocks import MAX_DEPTH
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream
 from tests.support.content import block_of, leaf, parent
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.content import ContentCorrupt, DownloadTiming, Exchange, Store
-from schemas.selectors import cid_selector
+from schemas.keys import cid_selector
 from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
 from tests.support.content import answer_queries, holder_of, sample_bytes
 from tests.support.waiting import until

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 
-from mesh.content import ContentCorrupt, ContentUnavailable, Exchange, QuotaReached, Store
-from schemas.selectors import cid_selector
+from mesh.content import ContentCorrupt, ContentUnavailable, Exchange, Store, StoreFull
+from schemas.keys import cid_selector
 from schemas.unixfs import CHUNK_SIZE, write_bytes, write_number
 from tests.support.content import (
     ROOT,
@@ -29,6 +29,7 @@ from tests.support.content import (
     sample_bytes,
     until_held,
 )
+from tests.support.raising import raises_with
 from tests.support.routers import EmbeddedRouter, client_config
 from tests.support.waiting import until
 
@@ -248,7 +249,7 @@ async def test_a_file_over_the_quota_is_refused_by_its_root(
     cid = holder_store.put_bytes(sample_bytes(4 * CHUNK_SIZE))
     with Store(tmp_path / "small", quota=CHUNK_SIZE) as small:
         async with Exchange(other_session, holder_store) as holder, Exchange(session, small) as exchange:
-            with pytest.raises(QuotaReached):
+            with raises_with(StoreFull, code="quota-reached"):
                 await exchange.fetch(cid)
             assert holder.statistics().served == 1
         assert small.usage().bytes == 0

@@ -9,7 +9,7 @@ import pytest
 
 from mesh.content import ContentTooLarge, ContentUnavailable, Exchange, Store
 from mesh.errors import ClosedError, InvalidCid
-from schemas.selectors import cid_selector
+from schemas.keys import cid_selector
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream, cid_of_bytes
 from tests.support.content import answer_queries, sample_bytes, until_held
 from tests.support.waiting import at_most, until

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 
+from mesh.base.flood import Drops
+from mesh.base.retry import RetryPolicy
 from mesh.content import DownloadTiming, Exchange, Store
-from mesh.content.requester import LIE, Liars, Replier
-from mesh.flood import Drops
-from mesh.retry import RetryPolicy
+from mesh.content._exchange import LIE, Liars, Replier
 from schemas.unixfs import CHUNK_SIZE
 from tests.support.clocks import SECOND, SetClock
 from tests.support.content import sample_bytes, until_held

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.content import ContentCorrupt, ContentTooLarge, ContentUnavailable, Store, StoreFull
-from mesh.content.index import BlockIndex
+from mesh.content.store import BlockIndex
 from mesh.errors import ConfigurationError, InvalidCid
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream, cid_of_bytes
 from tests.support.content import ROOT, RandomStream, chunked, flip_bit, leftovers

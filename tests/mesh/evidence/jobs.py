@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from mesh.evidence import Claim, Verdict, verify
 from mesh.recording import Recorder, RecordingAbout, open_objective
-from mesh.recording.mcap_writer import McapWriter
+from mesh.recording._mcap_writer import McapWriter
+from mesh.validator.verification import Claim, Verdict, verify
 from schemas import Result, Signer, String, cid_of_file, encode
 from schemas.payloads import STRING
 from tests.support.objectives import objective

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mesh.evidence import Claim
+from mesh.validator.verification import Claim
 from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, encode
 from tests.mesh.evidence.jobs import OTHER, ROBOT, THIEF, JobFiles, failures
 

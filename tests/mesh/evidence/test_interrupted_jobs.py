@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from mesh.clock import SYSTEM_CLOCK
-from mesh.evidence import verify
+from mesh.base.clock import SYSTEM_CLOCK
 from mesh.recording import Recorder, RecordingAbout, open_objective
+from mesh.validator.verification import verify
 from schemas import cid_of_file
 from tests.mesh.evidence.jobs import WORDS, JobFiles, failures, make_job, record, stop
 from tests.support.clocks import HOUR, NOON, SECOND, SetClock

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from mesh.evidence.clock_checks import MOST_SEAMS
 from mesh.recording import ABOUT, CLOCK_RECORD, RECOVERED, Recorder, RecordingAbout, open_objective
+from mesh.validator.verification import MOST_SEAMS
 from schemas import cid_of_file
 from tests.mesh.evidence.jobs import LIABILITY, OTHER, ROBOT, JobFiles, failures, make_job
 from tests.support.objectives import objective
@@ -83,7 +83,7 @@ def test_a_changed_byte_of_metadata_which_have_no_checksum_is_found(job: JobFile
 
 
 def test_the_period_is_checked_if_it_is_known(job: JobFiles) -> None:
-    from mesh.evidence import verify
+    from mesh.validator.verification import verify
 
     start = open_objective(job.result).start_ns
     for period, holds in (

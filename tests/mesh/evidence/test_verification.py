@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from mesh.evidence import Claim
 from mesh.recording import CLOSED, Recorder, RecordingAbout
+from mesh.validator.verification import Claim
 from schemas import String, cid_of_bytes, cid_of_file
 from schemas.payloads import STRING
 from tests.mesh.evidence.jobs import (

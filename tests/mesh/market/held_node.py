@@ -12,7 +12,7 @@ import aiohttp
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from mesh.chain.transports import Transport
+    from mesh.chain.rpc import Transport
 
 
 class HeldNode:

@@ -6,24 +6,25 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
-from mesh.background import Background
+from mesh.base.background import Background
+from mesh.base.retry import RetryPolicy
 from mesh.chain import XRT, Account, Chain, Timing
-from mesh.chain.events import NewLiability
-from mesh.market.provider import Provider
+from mesh.chain.following import NewLiability
+from mesh.market.provider import Provider, ProviderOptions
 from mesh.network import Channel, Endpoints, Network
-from mesh.retry import RetryPolicy
 from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key, verify_message
 from schemas.signing import Rejection
 from tests.support.orders import RECORDING, terms, withdrawal
 from tests.support.waiting import until, until_found, until_heard
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncIterator, Callable, Sequence
 
     import zenoh
 
-    from mesh.chain.transports import Transport
-    from mesh.devchain.development import DevelopmentMarket
+    from mesh.chain.rpc import Transport
+    from mesh.dev.development import DevelopmentMarket
+    from mesh.market import Match
     from schemas import Liability, SignedMessage, Withdrawal
 
 QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01)
@@ -45,8 +46,8 @@ class LocalMarket:
         self.node = node
         self.deployment = market.deployment
         self.accounts = market.accounts | {
-            "rival": Account.from_key(keys[5]),
-            "poor": Account.from_key(keys[6]),
+            "rival": Account(keys[5]),
+            "poor": Account(keys[6]),
         }
         self.endpoint = endpoint
         self.lighthouse = self.deployment.lighthouse
@@ -126,13 +127,16 @@ class LocalMarket:
         *,
         endpoint: str | Transport | None = None,
         timing: Timing = QUICK,
+        matched: Callable[[Match], None] = lambda match: None,
         **options: Any,
     ) -> AsyncIterator[Provider]:
         """A running provider that the traders can reach."""
         session = await self.new_session()
         async with (
             self.chain_of(role, endpoint, timing=timing) as chain,
-            Provider(session, chain, self.market, **({"retry": QUICK_RETRY} | options)) as provider,
+            Provider(
+                session, chain, self.market, ProviderOptions(**({"retry": QUICK_RETRY} | options)), matched=matched
+            ) as provider,
             Background() as tasks,
         ):
             tasks.start(provider.run(), f"{role} at work")

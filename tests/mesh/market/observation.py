@@ -25,7 +25,7 @@ async def works_on(local: LocalMarket, provider: Provider) -> bool:
 async def until_read(local: LocalMarket, provider: Provider) -> None:
     """Wait until the provider has read the chain up to its latest block."""
     head = await local.chain.block_number()
-    await until(lambda: provider.settlement.events.head >= head)
+    await until(lambda: provider.head.head >= head)
 
 
 def outages(caplog: pytest.LogCaptureFixture, name: str) -> list[str]:

@@ -8,7 +8,7 @@ import pytest
 
 from mesh.chain import Reverted
 from mesh.market import Match
-from mesh.market.rejections import at_fault, reason_of
+from mesh.market._settlement import at_fault, reason_of
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
 
 DEMAND = verified_demand(cost=10, validator_fee=20, deadline=50)

@@ -9,8 +9,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from mesh.market import Added, Match, OrderBook, Refusal, order_id
+from mesh.market import Added, Match, OrderBook, order_id
 from schemas import Demand, Offer, Verified, verify_message
+from schemas.signing import Refusal
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, TOKEN, terms, verified_demand, verified_offer
 
 if TYPE_CHECKING:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, nullcontext
 from typing import TYPE_CHECKING
 
 from mesh.chain import Funding, Holding
-from mesh.market.funding import Commitments
+from mesh.market.transactions import Commitments, Stakes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -15,6 +15,14 @@ if TYPE_CHECKING:
 HOLDING = Holding("token", "maker")
 TURNS = 100
 """Turns of the event loop in which what need not wait is taken, however busy the machine is."""
+
+
+def of(amount: int) -> Stakes:
+    return Stakes({HOLDING: amount})
+
+
+def alone(what: str) -> Stakes:
+    return Stakes(alone=frozenset({what}))
 
 
 class Purses:
@@ -31,12 +39,12 @@ class Purses:
         return dict.fromkeys(holdings, answer)
 
 
-async def taken_at_once(commitments: Commitments, *wanted: Mapping[Holding | str, int]) -> list[bool]:
+async def taken_at_once(commitments: Commitments, *wanted: Stakes) -> list[bool]:
     """Which of these can be taken while those before are."""
     async with AsyncExitStack() as stack:
         found = []
         for stakes in wanted:
-            taking = asyncio.create_task(stack.enter_async_context(commitments.take(stakes)))
+            taking = asyncio.create_task(stack.enter_async_context(commitments.take(stakes, nullcontext())))
             for _ in range(TURNS):
                 await asyncio.sleep(0)
             found.append(taking.done())
@@ -48,32 +56,32 @@ async def taken_at_once(commitments: Commitments, *wanted: Mapping[Holding | str
 
 async def test_no_more_is_taken_of_a_makers_funds_than_there_is() -> None:
     commitments = Commitments(Purses(10).of)
-    five: Mapping[Holding | str, int] = {HOLDING: 5}
-    assert await taken_at_once(commitments, five, five, {HOLDING: 1}) == [True, True, False]
-    assert await taken_at_once(commitments, {HOLDING: 4}, five, five) == [True, True, False]
+    five = of(5)
+    assert await taken_at_once(commitments, five, five, of(1)) == [True, True, False]
+    assert await taken_at_once(commitments, of(4), five, five) == [True, True, False]
 
 
 async def test_the_first_is_left_to_the_simulation_without_asking_the_node() -> None:
     purses = Purses(1)
     commitments = Commitments(purses.of)
-    assert await taken_at_once(commitments, {HOLDING: 5}, {Holding("token", "other"): 5}) == [True, True]
+    assert await taken_at_once(commitments, of(5), Stakes({Holding("token", "other"): 5})) == [True, True]
     assert purses.asked == 0
 
 
 async def test_funds_that_can_not_be_read_are_taken_by_one_at_a_time() -> None:
-    assert await taken_at_once(Commitments(Purses(None).of), {HOLDING: 5}, {HOLDING: 5}) == [True, False]
+    assert await taken_at_once(Commitments(Purses(None).of), of(5), of(5)) == [True, False]
 
 
 async def test_a_name_is_taken_by_one_at_a_time() -> None:
     commitments = Commitments(Purses(10).of)
-    assert await taken_at_once(commitments, {"one": 1}, {"one": 1}, {"other": 1}) == [True, False, True]
+    assert await taken_at_once(commitments, alone("one"), alone("one"), alone("other")) == [True, False, True]
 
 
 async def test_who_waits_goes_on_when_it_is_given_back() -> None:
     commitments, order = Commitments(Purses(10).of), []
 
     async def take(number: int) -> None:
-        async with commitments.take({HOLDING: 6}):
+        async with commitments.take(of(6), nullcontext()):
             order.append(number)
             await asyncio.sleep(0.01)
             order.append(-number)
@@ -81,7 +89,7 @@ async def test_who_waits_goes_on_when_it_is_given_back() -> None:
     async with asyncio.timeout(60):
         await asyncio.gather(*map(take, (1, 2, 3)))
     assert order == [1, -1, 2, -2, 3, -3]
-    assert await taken_at_once(commitments, {HOLDING: 6}) == [True]
+    assert await taken_at_once(commitments, of(6)) == [True]
 
 
 async def test_what_was_spent_is_not_counted_again_though_the_answer_is_older() -> None:
@@ -90,17 +98,17 @@ async def test_what_was_spent_is_not_counted_again_though_the_answer_is_older() 
     commitments, given_back = Commitments(purses.of), asyncio.Event()
 
     async def first() -> None:
-        async with commitments.take({HOLDING: 8}):
+        async with commitments.take(of(8), nullcontext()):
             await given_back.wait()
 
     holding = asyncio.create_task(first())
     await asyncio.sleep(0)
-    async with commitments.take({HOLDING: 1}):
+    async with commitments.take(of(1), nullcontext()):
         assert purses.asked == 1
         purses.amount = 2
         given_back.set()
         await holding
-        assert await taken_at_once(commitments, {HOLDING: 2}, {HOLDING: 1}) == [False, True]
+        assert await taken_at_once(commitments, of(2), of(1)) == [False, True]
 
 
 async def test_those_that_wait_ask_the_node_once_after_each_that_ends() -> None:
@@ -108,7 +116,7 @@ async def test_those_that_wait_ask_the_node_once_after_each_that_ends() -> None:
     commitments, done = Commitments(purses.of), []
 
     async def take(number: int) -> None:
-        async with commitments.take({HOLDING: 6}):
+        async with commitments.take(of(6), nullcontext()):
             await asyncio.sleep(0.001)
             done.append(number)
 

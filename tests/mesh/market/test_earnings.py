@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from mesh.chain import Created, Reverted, Settled
-from mesh.market import earnings
-from mesh.market.earnings import REASONS, Earnings, EarningsLedger
+from mesh.market import _earnings
+from mesh.market._earnings import REASONS, Earnings, EarningsLedger
 
 ADDRESS = "0x19437Cb65760805A0e55339186F03B2d980eBBf9"
 CREATION, OTHER_CREATION, FINALIZATION = "0xabc", "0xbca", "0xdef"
@@ -110,4 +110,4 @@ def test_a_limited_number_of_reasons_is_counted_separately() -> None:
     rejected = ledger.earnings().rejected
     assert len(rejected) == REASONS + 1
     assert rejected["DeadlineReached"] == 2
-    assert rejected[earnings.OTHER] == 1000 - (REASONS - 1)
+    assert rejected[_earnings.OTHER] == 1000 - (REASONS - 1)

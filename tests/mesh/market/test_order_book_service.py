@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from mesh.flood import Drops, Rate
+from mesh.base.flood import Drops, Rate
 from mesh.market import OrderBook
-from mesh.market.services import THREADS, OrderBookService
+from mesh.market._services import THREADS, OrderBookService
 from mesh.market.withdrawals import Withdrawals
 from mesh.network import Channel, Endpoints, Network, message_key
 from schemas import Demand, Withdrawal, decode, market_selector, verify_message
-from schemas.selectors import withdrawal_selector
+from schemas.keys import withdrawal_selector
 from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, PERSON, verified_demand, verified_offer
 from tests.support.waiting import at_most, until, until_answered
 

@@ -6,11 +6,12 @@ import asyncio
 import secrets
 from typing import TYPE_CHECKING, Any
 
-from mesh.background import Background
-from mesh.flood import Drops, KnownSenders
-from mesh.market import Added, OrderBook, Refusal
-from mesh.market.arrivals import CHECKED, OrderArrivals
+from mesh.base.background import Background
+from mesh.base.flood import Drops, KnownSenders
+from mesh.market import Added, OrderBook, order_id
+from mesh.market.provider import CHECKED, Arrivals
 from schemas import Demand, Signer, verify_message
+from schemas.signing import Refusal
 from tests.mesh.market.held_node import HeldNode
 from tests.mesh.market.observation import until_read
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
@@ -129,8 +130,8 @@ class Market:
         return priority > self._full
 
 
-def arrivals_of(market: Market, known: KnownSenders) -> OrderArrivals:
-    return OrderArrivals(market, market, worth=worth, known=known, drops=Drops())  # type: ignore[arg-type]
+def arrivals_of(market: Market, known: KnownSenders) -> Arrivals:
+    return Arrivals(market, market, worth=worth, known=known, drops=Drops())  # type: ignore[arg-type]
 
 
 def worth(order: Order) -> int:
@@ -143,7 +144,7 @@ async def test_known_signers_are_checked_before_strangers_that_promise_more() ->
     market, known = Market(*promised, honest), KnownSenders()
     known.add(PERSON.address)
     arrivals = arrivals_of(market, known)
-    await arrivals.take(market)  # type: ignore[arg-type]
+    await arrivals.take_orders(market)  # type: ignore[arg-type]
     async with Background() as tasks:
         tasks.start(arrivals.run(), "arrivals")
         await until(lambda: market.checked)
@@ -155,7 +156,7 @@ async def test_while_transactions_wait_for_free_contracts_orders_that_pay_more_a
     paid = verified_demand(signer=PERSON, cost=1)
     market = Market(*free, paid, full=0)
     arrivals = arrivals_of(market, KnownSenders())
-    await arrivals.take(market)  # type: ignore[arg-type]
+    await arrivals.take_orders(market)  # type: ignore[arg-type]
     async with Background() as tasks:
         tasks.start(arrivals.run(), "arrivals")
         await until(lambda: market.checked)
@@ -175,7 +176,7 @@ async def test_results_of_unknown_contracts_hold_up_no_others(local: LocalMarket
             local.publish(*(local.result(stranger().address, "rival") for _ in range(50)))
             await until(lambda: node.waiting["eth_call"])
             local.publish(honest)
-            await until(lambda: verify_message(honest) in provider.settlement.events.unconfirmed)
+            await until(lambda: provider.orders.settling(order_id(verify_message(honest))))
         await until(lambda: provider.earnings().finalized == 1)
 
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec import structs
 
-from mesh.background import Background
+from mesh.base.background import Background
 from mesh.chain import Account, DeploymentPlan, TransactionSender, new_private_key
-from mesh.devchain import EmbeddedChain
-from mesh.devchain.development import deploy_market
-from mesh.market import judgements
+from mesh.dev import EmbeddedChain
+from mesh.dev.development import deploy_market
+from mesh.market import _settlement
 from mesh.market.provider import Provider
 from schemas import address_bytes, cid_of_bytes
 from tests.contracts.suite import artifact
@@ -60,7 +60,7 @@ class Court:
 
     async def jury(self, *, quorum: int, size: int) -> tuple[str, list[Account]]:
         """A jury of new accounts, in ascending order; the rival keeps it."""
-        jurors = [Account.from_key(new_private_key()) for _ in range(size)]
+        jurors = [Account(new_private_key()) for _ in range(size)]
         jurors.sort(key=lambda juror: address_bytes(juror.address))
         async with self.local.chain_of("rival") as chain:
             deployed = await chain.validators.deploy([juror.address for juror in jurors], quorum)
@@ -166,7 +166,7 @@ async def test_two_of_three_jurors_finalize_in_any_order_and_a_late_one_changes_
     for first, second, late in (jurors, jurors[::-1]):
         liability = await court.job(provider, validator)
         court.local.publish(court.verdict(liability, first))
-        await until(lambda: len(provider.settlement.events.unconfirmed.held(liability.address)) == 1)  # noqa: B023
+        await until(lambda: len(provider.orders.held(liability.address)) == 1)  # noqa: B023
         assert not (await court.read(liability)).is_finalized
         court.local.publish(court.verdict(liability, second))
         assert (await court.ended(liability)).is_success
@@ -181,7 +181,7 @@ async def test_jurors_who_disagree_leave_the_refund(court: Court, provider: Prov
     liability = await court.job(provider, validator)
     before = await court.balance("person")
     court.local.publish(court.verdict(liability, first), court.verdict(liability, second, success=False))
-    await until(lambda: len(provider.settlement.events.unconfirmed.held(liability.address)) == 2)
+    await until(lambda: len(provider.orders.held(liability.address)) == 2)
     await court.stays_open(provider, liability)
     await court.local.mine(REFUND_DELAY)
     async with court.local.chain_of("person") as chain:
@@ -194,7 +194,7 @@ async def test_a_juror_who_disagrees_is_outvoted(court: Court, provider: Provide
     validator, (first, second, third) = await court.jury(quorum=2, size=3)
     liability = await court.job(provider, validator)
     court.local.publish(court.verdict(liability, first))
-    await until(lambda: provider.settlement.events.unconfirmed.held(liability.address))
+    await until(lambda: provider.orders.held(liability.address))
     async with paid(court, success=False):
         court.local.publish(*(court.verdict(liability, juror, success=False) for juror in (second, third)))
         assert not (await court.ended(liability)).is_success
@@ -218,7 +218,7 @@ async def test_a_juror_that_signs_nonsense_does_not_count_and_prevents_nothing(
         structs.replace(court.verdict(liability, second), signature=sound.signature),
         spoiled,
     )
-    await until(lambda: len(provider.settlement.events.unconfirmed.held(liability.address)) == 2)
+    await until(lambda: len(provider.orders.held(liability.address)) == 2)
     await court.stays_open(provider, liability)
     assert not (await court.read(other)).is_finalized
     court.local.publish(court.verdict(liability, second))
@@ -231,7 +231,7 @@ async def test_a_juror_that_signs_nonsense_does_not_count_and_prevents_nothing(
 async def test_a_jurors_last_result_counts(court: Court, provider: Provider) -> None:
     validator, (first, second) = await court.jury(quorum=2, size=2)
     liability = await court.job(provider, validator)
-    unconfirmed = provider.settlement.events.unconfirmed
+    unconfirmed = provider.orders
     for changes in ({"success": False}, {"result": OTHER_RECORDING}, {}):
         court.local.publish(verdict := court.verdict(liability, first, **changes))
         await until(lambda: [one.message for one in unconfirmed.held(liability.address)] == [verdict])
@@ -260,13 +260,36 @@ async def test_a_provider_that_restarts_hears_the_jurors_again(court: Court) -> 
     async with court.local.provider() as before:
         liability = await court.job(before, validator)
         court.local.publish(verdict := court.verdict(liability, first))
-        await until(lambda: before.settlement.events.unconfirmed.held(liability.address))
+        await until(lambda: before.orders.held(liability.address))
     async with court.local.provider() as after:
         await until_read(court.local, after)
         court.local.publish(court.verdict(liability, second))
         await court.stays_open(after, liability)
         court.local.publish(verdict)
         assert (await court.ended(liability)).is_success
+
+
+async def test_jurors_are_heard_again_after_a_node_did_not_know_their_jury(
+    court: Court, provider: Provider, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of several nodes may be behind, or wrong, for a while."""
+    validator, (juror,) = await court.jury(quorum=1, size=1)
+    liability = await court.job(provider, validator)
+    monkeypatch.setattr(_settlement, "ACCEPTED_SECONDS", 0.1)
+    validators, asked = provider._chain.validators, list[str]()
+
+    async def unknown(validator: str) -> int:
+        asked.append(validator)
+        return 0
+
+    with monkeypatch.context() as wrong:
+        wrong.setattr(validators, "quorum", unknown)
+        court.local.publish(verdict := court.verdict(liability, juror))
+        await until(lambda: asked)
+    async with asyncio.timeout(30):
+        while not (await court.read(liability)).is_finalized:
+            court.local.publish(verdict)
+            await asyncio.sleep(0.05)
 
 
 async def test_a_reverted_finalization_is_sent_again(court: Court, provider: Provider) -> None:
@@ -286,9 +309,9 @@ async def test_a_flood_of_strangers_costs_the_node_nothing(court: Court, provide
     validator, jurors = await court.jury(quorum=2, size=3)
     liability = await court.job(provider, validator)
     court.local.publish(court.verdict(liability, jurors[0]))
-    await until(lambda: provider.settlement.events.unconfirmed.held(liability.address))
+    await until(lambda: provider.orders.held(liability.address))
     calls = Calls(provider)
-    strangers = [Account.from_key(new_private_key()) for _ in range(FLOOD)]
+    strangers = [Account(new_private_key()) for _ in range(FLOOD)]
     court.local.publish(*(court.verdict(liability, stranger) for stranger in strangers))
     await until(lambda: provider.drops.totals().get("no-juror", 0) == FLOOD)
     assert calls.made("eth_call", "eth_getCode") == 0
@@ -300,13 +323,13 @@ async def test_a_flood_of_strangers_costs_the_node_nothing(court: Court, provide
 async def test_another_validator_accepts_one_signature_and_is_not_asked_about_every_stranger(
     court: Court, provider: Provider
 ) -> None:
-    signer = Account.from_key(new_private_key())
+    signer = Account(new_private_key())
     argument = address_bytes(signer.address).rjust(32, b"\0")
     validator = await deployed(court, "OneSigner", argument)
     liability = await court.job(provider, validator)
     calls = Calls(provider)
-    budget = int(judgements.PER_VALIDATOR.burst)
-    strangers = [Account.from_key(new_private_key()) for _ in range(4 * budget)]
+    budget = int(_settlement.PER_VALIDATOR.burst)
+    strangers = [Account(new_private_key()) for _ in range(4 * budget)]
     court.local.publish(*(court.verdict(liability, stranger) for stranger in strangers))
     await until(lambda: provider.drops.totals().get("no-juror", 0) == len(strangers))
     assert calls.made("eth_call") < 2 * budget
@@ -323,8 +346,8 @@ async def test_a_validator_that_fails_only_in_blocks_is_soon_left_alone(
     code = bytes.fromhex("3a156008575f5ffd5b60015f5260205ff3")
     validator = await placed(court, bytes.fromhex(f"60{len(code):02x}8060095f395ff3") + code)
     liability = await court.job(provider, validator)
-    calls, burst = Calls(provider), int(judgements.WASTED.burst)
-    strangers = [Account.from_key(new_private_key()) for _ in range(4 * burst)]
+    calls, burst = Calls(provider), int(_settlement.WASTED.burst)
+    strangers = [Account(new_private_key()) for _ in range(4 * burst)]
     court.local.publish(*(court.verdict(liability, stranger) for stranger in strangers))
     await until(lambda: events(caplog, "validator-shunned"))
     await court.stays_open(provider, liability)
@@ -388,12 +411,12 @@ async def test_in_generation_3_a_jurors_result_is_tried_once(court: Court, provi
 async def test_what_does_not_fit_is_heard_again(court: Court, monkeypatch: pytest.MonkeyPatch) -> None:
     validator, (first, second) = await court.jury(quorum=2, size=2)
     async with court.local.provider() as provider:
-        monkeypatch.setattr(provider.settlement.results._judgements, "_limit", 2)
+        monkeypatch.setattr(provider.orders, "_held_limit", 2)
         jobs = [await court.job(provider, validator) for _ in range(4)]
         verdicts = [court.verdict(job, first) for job in jobs]
         court.local.publish(*verdicts)
         await until(lambda: provider.drops.totals().get("judgements-full") == 2)
-        held = [bool(provider.settlement.events.unconfirmed.held(job.address)) for job in jobs]
+        held = [bool(provider.orders.held(job.address)) for job in jobs]
         assert held == [False, False, True, True]
         court.local.publish(court.verdict(jobs[0], second), verdicts[0])
         assert (await court.ended(jobs[0])).is_success
@@ -417,7 +440,7 @@ class Calls:
 
     def __init__(self, provider: Provider) -> None:
         self._asked: list[str] = []
-        rpc = provider._chain.node._rpc
+        rpc = provider._chain.node.rpc
         request = rpc.request
 
         async def counted(method: str, params: Sequence[Any], **options: Any) -> Any:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.base.retry import RetryPolicy
 from mesh.chain import GWEI
-from mesh.devchain import JsonRpcServer
-from mesh.devchain.development import deploy_market
-from mesh.retry import RetryPolicy
+from mesh.dev import JsonRpcServer
+from mesh.dev.development import deploy_market
 from schemas import cid_of_bytes, parse_cid
 from tests.mesh.market.local_market import QUICK, LocalMarket
 from tests.mesh.market.observation import events, outages, until_read, works_on
@@ -47,7 +47,7 @@ class FailingNode:
             self.left -= 1
             if self._fails == "silence":
                 raise ConnectionResetError
-            return {"jsonrpc": "2.0", "id": 1, "error": {"code": -32005, "message": "too many requests"}}
+            return {"jsonrpc": "2.0", "id": 1, "error": {"code": -32600, "message": "not allowed for this customer"}}
         return await self._node.make_request(method, params)
 
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.background import Background
+from mesh.base.background import Background
 from mesh.chain import XRT
 from mesh.market.provider import Provider
 from tests.support.waiting import until_found, until_heard
 
 if TYPE_CHECKING:
-    from mesh.chain.contracts import ContractKind
+    from mesh.chain._contracts import ContractKind
     from tests.mesh.market.local_market import LocalMarket
 
 _names = count(1)
@@ -21,7 +21,7 @@ _names = count(1)
 
 async def verdicts(provider: Provider) -> dict[tuple[str, str], float]:
     """The received messages by kind and verdict."""
-    families = {family.name: family for family in await provider.measure()}
+    families = {family.name: family for family in await provider.status.measure()}
     return {
         (sample.labels["kind"], sample.labels["verdict"]): sample.value
         for sample in families["aira_messages_total"].samples

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from typing import TYPE_CHECKING
 
-from mesh.chain.policy import REORG_DEPTH
-from mesh.market import Refusal, order_id
+from mesh.chain._policy import REORG_DEPTH
+from mesh.market import order_id
 from mesh.market.withdrawals import withdrawn_id
 from schemas import Withdrawal, verify_message
+from schemas.signing import Refusal
 from tests.mesh.market.held_node import HeldNode
 from tests.mesh.market.observation import until_read, works_on
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import pytest
 
     from tests.mesh.market.local_market import LocalMarket
 
@@ -33,6 +38,19 @@ async def test_a_withdrawn_order_leaves_the_book_and_is_refused(local: LocalMark
         await until(lambda: order_id(verify_message(offer)) in provider.book)
         assert await local.liabilities_of(demand) == []
         assert provider.earnings().rejected == {}
+
+
+async def test_a_withdrawal_that_can_not_be_kept_takes_its_order_out_of_the_book_all_the_same(
+    local: LocalMarket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot that loses many offers withdraws more than a provider keeps of one account."""
+    async with local.provider() as provider:
+        monkeypatch.setattr(provider.withdrawals, "_limit_per_signer", 0)
+        local.publish(demand := local.demand())
+        await until(lambda: len(provider.book) == 1)
+        local.publish(local.withdrawal(demand))
+        await until(lambda: len(provider.book) == 0)
+        assert len(provider.withdrawals) == 0
 
 
 async def test_an_order_that_arrives_after_its_withdrawal_is_refused(local: LocalMarket) -> None:
@@ -89,11 +107,11 @@ async def test_a_transaction_that_was_sent_is_not_stopped(local: LocalMarket) ->
 
 async def test_withdrawals_survive_a_restart(local: LocalMarket, tmp_path: Path) -> None:
     path, demand = tmp_path / "withdrawals.sqlite", local.demand()
-    async with local.provider(withdrawals=path):
+    async with local.provider(store=path):
         local.publish(local.withdrawal(demand))
         await local.rejection_of(demand)
 
-    async with local.provider(withdrawals=path) as provider:
+    async with local.provider(store=path) as provider:
         local.publish(demand, local.offer())
         await until(lambda: provider.earnings().rejected == {"withdrawn": 1})
         assert await local.liabilities_of(demand) == []
@@ -116,10 +134,15 @@ async def test_a_flood_of_strangers_withdrawals_makes_no_other_forgotten(local: 
         assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
 
 
-async def test_a_withdrawal_that_is_not_on_the_disk_is_not_promised(local: LocalMarket, tmp_path: Path) -> None:
-    path, demand = tmp_path / "withdrawals.sqlite", local.demand()
-    path.write_bytes(b"not a database, however you look at it" * 100)
-    async with local.provider(withdrawals=path) as provider:
+async def test_a_withdrawal_that_is_not_on_the_disk_is_not_promised(
+    local: LocalMarket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(descriptor: int) -> None:
+        raise OSError(errno.EIO, "the disk is broken")
+
+    demand = local.demand()
+    async with local.provider(store=tmp_path / "store.sqlite") as provider:
+        monkeypatch.setattr(os, "fsync", fail)
         local.publish(withdrawal := local.withdrawal(demand))
         await until(lambda: withdrawn_id(verify_message(withdrawal)) in provider.withdrawals)
         assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
@@ -145,14 +168,14 @@ async def test_withdrawals_are_known_until_no_reorganisation_reaches_their_deadl
     local: LocalMarket, tmp_path: Path
 ) -> None:
     path, demand = tmp_path / "withdrawals.sqlite", local.demand(deadline=await local.chain.block_number() + 3)
-    async with local.provider(withdrawals=path) as provider:
+    async with local.provider(store=path) as provider:
         local.publish(local.withdrawal(demand))
         await local.rejection_of(demand)
         await local.mine(3)
         await until_read(local, provider)
         assert len(provider.withdrawals) == 1
 
-    async with local.provider(withdrawals=path) as provider:  # it reads the blocks again that may be replaced
+    async with local.provider(store=path) as provider:  # it reads the blocks again that may be replaced
         assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
         assert provider.earnings().rejected == {"withdrawn": 1}
         await local.mine(REORG_DEPTH)

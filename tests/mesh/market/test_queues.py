@@ -7,32 +7,41 @@ import weakref
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.market.queues import QueueNode, Queues
+from mesh.market.book import Queues
 
 
 class Item:
-    """An object that can have a weak reference."""
+    """An item with its neighbours in one kind of queue."""
+
+    __slots__ = ("__weakref__", "after_test", "before_test", "number")
+
+    def __init__(self, number: int) -> None:
+        self.number = number
 
 
-def items(queues: Queues[str, int], key: str) -> list[int]:
+def empty() -> Queues[str, Item]:
+    return Queues("test")
+
+
+def items(queues: Queues[str, Item], key: str) -> list[int]:
     """The items at `key`, removed one after the other."""
     taken = []
-    while (node := queues.first(key)) is not None:
-        queues.remove(key, node)
-        taken.append(node.item)
+    while (item := queues.first(key)) is not None:
+        queues.remove(key, item)
+        taken.append(item.number)
     return taken
 
 
-def filled(*numbers: int, key: str = "a") -> tuple[Queues[str, int], list[QueueNode[int]]]:
-    queues: Queues[str, int] = Queues()
-    nodes = [QueueNode(number) for number in numbers]
+def filled(*numbers: int, key: str = "a") -> tuple[Queues[str, Item], list[Item]]:
+    queues = empty()
+    nodes = [Item(number) for number in numbers]
     for node in nodes:
         queues.append(key, node)
     return queues, nodes
 
 
 def test_a_key_without_a_queue_has_no_first() -> None:
-    assert Queues[str, int]().first("a") is None
+    assert empty().first("a") is None
 
 
 def test_the_oldest_node_is_first() -> None:
@@ -59,7 +68,7 @@ def test_a_removed_node_can_be_appended_again() -> None:
 
 def test_each_key_has_its_own_queue_and_an_empty_queue_is_dropped() -> None:
     queues, (node,) = filled(1)
-    other = QueueNode(2)
+    other = Item(2)
     queues.append("b", other)
     assert queues.first("a") is node
 
@@ -71,31 +80,29 @@ def test_each_key_has_its_own_queue_and_an_empty_queue_is_dropped() -> None:
 
 
 def test_the_queues_hold_no_reference_to_a_removed_item() -> None:
-    queues: Queues[str, Item] = Queues()
-    nodes = [QueueNode(Item()) for _ in range(3)]
-    for node in nodes:
-        queues.append("a", node)
-    watched = weakref.ref(nodes[1].item)
+    queues, nodes = filled(1, 2, 3)
+    watched = weakref.ref(nodes[1])
 
     queues.remove("a", nodes.pop(1))
-    del node
 
     assert watched() is None
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9) | st.none())))
 def test_the_queues_behave_like_lists(steps: list[tuple[str, int | None]]) -> None:
-    queues: Queues[str, int] = Queues()
-    expected: dict[str, list[QueueNode[int]]] = {key: [] for key in "abc"}
+    queues = empty()
+    expected: dict[str, list[Item]] = {key: [] for key in "abc"}
     for number, (key, position) in enumerate(steps):
         if position is None:
-            node = QueueNode(number)
+            node = Item(number)
             queues.append(key, node)
             expected[key].append(node)
         elif expected[key]:
             queues.remove(key, expected[key].pop(position % len(expected[key])))
-        assert {key: queues.first(key) for key in "abc"} == {
-            key: nodes[0] if nodes else None for key, nodes in expected.items()
-        }
+        for ends, place in ((queues.first, 0), (queues.last, -1)):
+            assert {key: ends(key) for key in "abc"} == {
+                key: nodes[place] if nodes else None for key, nodes in expected.items()
+            }
     for key, nodes in expected.items():
-        assert items(queues, key) == [node.item for node in nodes]
+        assert list(queues.items(key)) == nodes
+        assert items(queues, key) == [node.number for node in nodes]

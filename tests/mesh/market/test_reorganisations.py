@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.devchain.development import deploy_market
+from mesh.dev.development import deploy_market
 from tests.mesh.market.held_node import HeldNode
 from tests.mesh.market.local_market import QUICK, LocalMarket
 from tests.mesh.market.observation import until_read

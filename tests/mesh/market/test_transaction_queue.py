@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.base.retry import RetryPolicy
 from mesh.chain import InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
-from mesh.chain.lighthouses import Lighthouses
-from mesh.market.earnings import EarningsLedger
-from mesh.market.transaction_queue import RESERVED, TransactionQueue
-from mesh.retry import RetryPolicy
+from mesh.chain._lighthouses import Lighthouses
+from mesh.market._earnings import EarningsLedger
+from mesh.market.transactions import RESERVED, TransactionQueue
 from tests.mesh.market.local_market import QUICK, QUICK_RETRY
 from tests.support.waiting import until
 

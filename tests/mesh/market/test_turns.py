@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT
-from mesh.market.turns import NoStake, Turns
+from mesh.market.transactions import NoStake, Turns
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from mesh.background import Background
-from mesh.market import Match, OrderBook, Refusal, order_id
-from mesh.market.funding import CHECKS, UnfundedOrders
-from mesh.retry import RetryPolicy
+from mesh.market import Match, OrderBook, order_id
 from schemas import verify_message
+from schemas.signing import Refusal
 from tests.mesh.market.observation import until_read
 from tests.support.orders import LIGHTHOUSE, verified_demand, verified_offer
 from tests.support.waiting import until, until_found
@@ -22,28 +19,6 @@ if TYPE_CHECKING:
 
     from schemas import Demand, Offer, Verified
     from tests.mesh.market.local_market import LocalMarket
-
-HOURLY = RetryPolicy(initial=3600.0, ceiling=3600.0)
-OFTEN = RetryPolicy(initial=0.01, ceiling=0.01)
-
-
-class Purse:
-    """Who can pay, instead of a chain. `asked` are the orders whose makers were asked after."""
-
-    def __init__(self) -> None:
-        self.can_pay_now = False
-        self.asked: list[Verified[Demand | Offer]] = []
-
-    async def shortages(self, orders: Sequence[Verified[Demand | Offer]]) -> list[str]:
-        self.asked += orders
-        return len(orders) * ["" if self.can_pay_now else "ERC20InsufficientBalance"]
-
-
-def unfunded(book: OrderBook, purse: Purse, **options: Any) -> tuple[UnfundedOrders, list[Verified[Demand | Offer]]]:
-    funded: list[Verified[Demand | Offer]] = []
-    chosen: dict[str, Any] = {"interval": 0.01, "retry": OFTEN} | options
-    made = UnfundedOrders(book, purse.shortages, funded=funded.append, **chosen)
-    return made, funded
 
 
 def test_an_order_that_is_set_aside_is_in_the_book_and_is_not_matched() -> None:
@@ -59,54 +34,6 @@ def test_an_order_that_is_set_aside_is_in_the_book_and_is_not_matched() -> None:
     book.set_aside(demand)
     assert book.expire(10) == [demand]
     assert not book.set_aside(demand)
-
-
-async def test_orders_are_looked_at_again_until_their_makers_can_pay() -> None:
-    book, purse, demand = OrderBook(LIGHTHOUSE), Purse(), verified_demand()
-    waiting, funded = unfunded(book, purse)
-    assert waiting.add(demand)
-    async with Background() as tasks:
-        tasks.start(waiting.run(), "unfunded")
-        await until(lambda: len(purse.asked) > 2)
-        assert demand in waiting
-        assert list(book.orders()) == [demand]
-        purse.can_pay_now = True
-        await until(lambda: funded == [demand])
-    assert demand not in waiting
-    assert len(book) == 0
-
-
-async def test_a_copy_hastens_the_next_look_and_orders_that_left_the_book_are_forgotten() -> None:
-    book, purse, demand, gone = OrderBook(LIGHTHOUSE), Purse(), verified_demand(), verified_demand()
-    waiting, funded = unfunded(book, purse, retry=HOURLY, limit=2)
-    assert waiting.add(demand)
-    assert waiting.add(gone)
-    assert not waiting.add(verified_demand())
-    waiting.hasten(gone)
-    book.remove(order_id(gone))
-    async with Background() as tasks:
-        tasks.start(waiting.run(), "unfunded")
-        waiting.hasten(demand)
-        waiting.hasten(demand)
-        await until(lambda: purse.asked == [demand])
-        purse.can_pay_now = True
-        waiting.hasten(demand)
-        await until(lambda: funded == [demand])
-    assert purse.asked == [demand, demand]
-    assert gone not in waiting
-
-
-async def test_a_limited_number_is_looked_at_in_one_round() -> None:
-    book, purse = OrderBook(LIGHTHOUSE), Purse()
-    waiting, _ = unfunded(book, purse, retry=OFTEN, interval=0.2)
-    for _ in range(2 * CHECKS):
-        waiting.add(verified_demand())
-    begun = time.monotonic()
-    async with Background() as tasks:
-        tasks.start(waiting.run(), "unfunded")
-        await until(lambda: len(purse.asked) > CHECKS)
-        assert time.monotonic() - begun > 0.39, "it takes two rounds, each after an interval"
-        await until(lambda: len(purse.asked) >= 2 * CHECKS)
 
 
 async def test_a_demand_is_matched_when_its_makers_tokens_return(local: LocalMarket) -> None:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import Timing
-from mesh.market import Refusal, order_id
-from mesh.market.sent_orders import SentOrders
-from mesh.market.versions import OrderVersions
+from mesh.market import order_id
+from mesh.market._orders import OrderVersions
+from mesh.market.store import MarketStore
 from mesh.market.withdrawals import withdrawn_id
 from schemas import Demand, Withdrawal, verify_message
+from schemas.signing import Refusal
 from tests.mesh.market.held_node import HeldNode
 from tests.mesh.market.observation import until_read
 from tests.support.waiting import until
@@ -208,11 +209,11 @@ async def test_no_withdrawal_is_honoured_while_a_reverted_contract_may_come_back
         await until_read(local, provider)
         withdrawal = verify_message(local.withdrawal(demand))
         await until(lambda: provider.settlement.add(verify_message(demand)) is Refusal.DUPLICATE)
-        provider.settlement.withdrawn.add(withdrawal)
+        provider.settlement.withdraw(withdrawal)
         assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
         await local.mine(DEPTH)
         await until_read(local, provider)
-        provider.settlement.withdrawn.add(withdrawal)
+        provider.settlement.withdraw(withdrawal)
         await local.rejection_of(demand)
         assert reasons(local) == ["withdrawn"]
 
@@ -222,15 +223,16 @@ async def test_a_restarted_provider_knows_the_orders_of_earlier_transactions(
 ) -> None:
     older, newer = await versions_of(local, 2)
     async with HeldNode(local.node) as node:
-        async with local.provider(endpoint=node, sent_orders=tmp_path / "sent") as provider:
+        async with local.provider(endpoint=node, store=tmp_path / "sent") as provider:
             await fail_when_mined(local, provider, node, older)
-        async with local.provider(endpoint=node, sent_orders=tmp_path / "sent") as provider:
+        async with local.provider(endpoint=node, store=tmp_path / "sent") as provider:
             assert provider.settlement.add(verify_message(newer)) is Refusal.UNDECIDED
+            await until_read(local, provider)  # the blocks that confirm the failure come after the first that it reads
             await local.mine(DEPTH)
             await until_read(local, provider)
             assert provider.settlement.add(verify_message(newer)) is None
-        async with SentOrders(tmp_path / "sent") as sent:
-            assert sent.left == ()
+        with MarketStore(tmp_path / "sent") as store:
+            assert store.sent_orders() == []
 
 
 async def test_a_restarted_provider_honours_no_withdrawal_of_what_may_be_mined(
@@ -238,16 +240,16 @@ async def test_a_restarted_provider_honours_no_withdrawal_of_what_may_be_mined(
 ) -> None:
     demand = local.demand()
     async with HeldNode(local.node) as node:
-        async with local.provider(endpoint=node, sent_orders=tmp_path / "sent") as provider:
+        async with local.provider(endpoint=node, store=tmp_path / "sent") as provider:
             await fail_when_mined(local, provider, node, demand)
-        async with local.provider(endpoint=node, sent_orders=tmp_path / "sent") as provider:
+        async with local.provider(endpoint=node, store=tmp_path / "sent") as provider:
             local.publish(withdrawal := local.withdrawal(demand))
             await until(lambda: withdrawn_id(verify_message(withdrawal)) in provider.withdrawals)
             assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
             assert "withdrawn" not in reasons(local)
             await local.mine(DEPTH + 1)
             await until_read(local, provider)
-            provider.settlement.withdrawn.add(verify_message(withdrawal))
+            provider.settlement.withdraw(verify_message(withdrawal))
             await local.rejection_of(demand)
             assert reasons(local).count("withdrawn") == 1
 
@@ -256,7 +258,7 @@ async def test_the_end_of_a_match_that_was_not_sent_ends_no_other(local: LocalMa
     older, newer = map(verify_message, await versions_of(local, 2))
     versions = OrderVersions(DEPTH)
     versions.note(older)
-    await versions.sending([older])
+    versions.sending([older])
     versions.note(newer)
     versions.ended([newer], head=10)
     assert versions.refusal(order_id(newer), head=99) is Refusal.UNDECIDED
@@ -316,29 +318,27 @@ async def test_a_transaction_is_decided_by_the_nonces_of_its_account(
 
 
 async def test_a_transaction_mined_in_a_block_that_was_not_looked_at_is_decided_once_that_is_deep(
-    local: LocalMarket, tmp_path: Path
+    local: LocalMarket,
 ) -> None:
     """The chain is followed from block to block with events, and from far back after a restart."""
     older, newer = map(verify_message, await versions_of(local, 2))
-    async with SentOrders(tmp_path / "sent") as sent:
-        versions = OrderVersions(DEPTH, sent)
-        versions.note(older)
-        await versions.sending([older])
-    async with SentOrders(tmp_path / "sent") as sent:
-        versions = OrderVersions(DEPTH, sent)
-        versions.restore(nonce=3, head=20)
-        versions.note(newer)
-        versions.counted(3, None, head=20 - DEPTH)
-        versions.counted(4, 4, head=17)
-        versions.counted(4, 4, head=20)
-        assert versions.is_undecided(order_id(older), head=16 + DEPTH)
-        assert not versions.is_undecided(order_id(older), head=17 + DEPTH)
-        versions.counted(3, 3 + 1, head=25)  # a reorganisation reverted it
-        versions.counted(4, 4, head=35)  # and it was mined in a block up to this one
-        versions.counted(4, 4, head=34 + DEPTH)
-        assert versions.refusal(order_id(newer), head=34 + DEPTH) is Refusal.UNDECIDED
-        versions.counted(4, 4, head=35 + DEPTH)
-        assert versions.refusal(order_id(newer), head=35 + DEPTH) is None
+    versions = OrderVersions(DEPTH)
+    versions.note(older)
+    left = versions.sending([older])
+    versions = OrderVersions(DEPTH)
+    versions.restore(left, nonce=3, head=20)
+    versions.note(newer)
+    versions.counted(3, None, head=20 - DEPTH)
+    versions.counted(4, 4, head=17)
+    versions.counted(4, 4, head=20)
+    assert versions.is_undecided(order_id(older), head=16 + DEPTH)
+    assert not versions.is_undecided(order_id(older), head=17 + DEPTH)
+    versions.counted(3, 3 + 1, head=25)  # a reorganisation reverted it
+    versions.counted(4, 4, head=35)  # and it was mined in a block up to this one
+    versions.counted(4, 4, head=34 + DEPTH)
+    assert versions.refusal(order_id(newer), head=34 + DEPTH) is Refusal.UNDECIDED
+    versions.counted(4, 4, head=35 + DEPTH)
+    assert versions.refusal(order_id(newer), head=35 + DEPTH) is None
 
 
 async def test_a_restarted_provider_settles_no_version_of_an_order_that_was_a_contract_long_ago(
@@ -347,11 +347,11 @@ async def test_a_restarted_provider_settles_no_version_of_an_order_that_was_a_co
     older, newer = await versions_of(local, 2)
     robot = local.address("robot")
     offer = local.offer(sender=robot, nonce=await local.chain.liabilities.next_nonce(robot))
-    async with local.provider(sent_orders=tmp_path / "sent") as provider:
+    async with local.provider(store=tmp_path / "sent") as provider:
         local.publish(older, offer)
         await local.liability_of(older)
         await local.mine(DEPTH + 4)
         await until_read(local, provider)
-    async with local.provider(sent_orders=tmp_path / "sent") as provider:
+    async with local.provider(store=tmp_path / "sent") as provider:
         await until_read(local, provider)
         assert provider.settlement.add(verify_message(newer)) is Refusal.REPLACED

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.network import Services
 from schemas import RpcKey
-from schemas.rpc import Done, StartLiability
+from schemas.rpc import Done, LiabilityRequest
 from tests.support.orders import LIGHTHOUSE, ROBOT
 from tests.support.waiting import until_answered
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from schemas import Record
 
 ADDRESS = ROBOT.address
-REQUEST = StartLiability(LIGHTHOUSE)
+REQUEST = LiabilityRequest(LIGHTHOUSE)
 
 
 @asynccontextmanager

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from mesh.errors import ClosedError, InputError, InvalidKey
-from mesh.network import Channel, Endpoints, Network, ValidationStatistics, message_key, pump, ring
+from mesh.network import Channel, Endpoints, Network, ValidationStatistics, message_key, pump
 from schemas import Demand, Offer, Result, SignedMessage, Verified, encode, message_hash
 from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
 from tests.support.orders import (
@@ -195,7 +195,7 @@ async def test_a_slow_consumer_loses_the_oldest_messages_and_gets_the_newest_fir
         assert max(dropped) < len(sent) - pump.RING_CAPACITY
         first = numbers[: (pump.BATCHES_IN_FLIGHT + 1) * pump.BATCH]
         assert len(sent) - 1 in first, "it waited only for batches that were taken before"
-        rest = numbers[-ring.IN_ORDER :]
+        rest = numbers[-pump.IN_ORDER :]
         assert rest == sorted(rest)
 
 

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.background import Background
-from mesh.flood import Drops
-from mesh.identity import Member
-from mesh.identity.routers import router_endpoints
+from mesh.base.background import Background
+from mesh.base.flood import Drops
 from mesh.network import Endpoints, Network
-from mesh.network.connections import (
+from mesh.network.session import (
     BlockedSessions,
     Connection,
     connections,
@@ -23,6 +21,8 @@ from mesh.network.connections import (
     received,
     report_traffic,
 )
+from mesh.ops.identity import Member
+from mesh.ops.identity.routers import router_endpoints
 from tests.support.log_events import logged_facts
 from tests.support.ports import free_port
 from tests.support.sites import Site

@@ -10,11 +10,11 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
+from mesh.base.flood import Drops
 from mesh.chain import UnknownName
 from mesh.errors import AiraError, RemoteError
-from mesh.flood import Drops
 from mesh.network import Channel, message_key
-from mesh.network.lookups import FAILURE_KEPT, KEPT, NameCache, Unresolved
+from mesh.network._validation import FAILURE_KEPT, KEPT, NameCache, Unresolved
 from schemas import Demand, Offer, Verified, encode, message_hash
 from tests.mesh.network.validating import NAME, check, check_payload, counted, validator
 from tests.support.clocks import SECOND, SetClock

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from typing import TYPE_CHECKING
 
-from mesh.flood import Drops
+from mesh.base.flood import Drops
 from mesh.network import Channel
 from mesh.network.channel import PRESENT_LIMIT
 from mesh.watching import PresentPeer, present

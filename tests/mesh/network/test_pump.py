@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import zenoh
 
+from mesh.base.flood import Drops
 from mesh.errors import ClosedError
-from mesh.flood import Drops
 from mesh.network import Pump, pump
 from tests.support.waiting import at_most, until, until_heard
 

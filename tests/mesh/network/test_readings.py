@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.network import MessageValidator, message_key
-from mesh.network.lookups import Unresolved
+from mesh.network import MarketRules, MessageValidator, message_key
+from mesh.network._validation import Unresolved
 from schemas import (
     ZERO_ADDRESS,
     AiraError,
@@ -123,9 +123,7 @@ class Factory:
 def is_accepted(message: SignedMessage, *, factory: Factory | None) -> bool:
     """Whether an agent or a provider of any lighthouse accepts the signed message."""
     for lighthouse in LIGHTHOUSES:
-        validator = MessageValidator(
-            type(message), lighthouse=MARKET, address=lighthouse, head=lambda: 0, validators=factory
-        )
+        validator = MessageValidator(type(message), MarketRules(MARKET, address=lighthouse, validators=factory))
         accepted = check_payload(validator, message_key(MARKET, message), encode(message))
         assert not isinstance(accepted, Unresolved)
         if accepted is not None:

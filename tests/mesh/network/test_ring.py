@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.network.ring import IN_ORDER, REMEMBERED, ReceiveRing
+from mesh.network.pump import IN_ORDER, REMEMBERED, ReceiveRing
 
 
 def ring(capacity: int = 4, capacity_bytes: int = 1000, *, second_chance: bool = True) -> ReceiveRing:

@@ -11,16 +11,7 @@ from mesh.errors import AiraError
 from mesh.network import ServiceFailed, Services, call
 from mesh.network.services import CONCURRENT_REQUESTS
 from schemas import InvalidRecord, RpcKey
-from schemas.rpc import (
-    AccountBalance,
-    Balance,
-    Done,
-    FinishLiability,
-    LiabilityRead,
-    Nothing,
-    ReadLiability,
-    StartLiability,
-)
+from schemas.rpc import AccountBalance, Balance, Done, FinishLiability, LiabilityRead, LiabilityRequest, Nothing
 from tests.mesh.network.services import ADDRESS, REQUEST, done, offering
 from tests.support.orders import LIGHTHOUSE, PERSON, liability
 from tests.support.waiting import at_most, until, until_answered
@@ -34,7 +25,7 @@ if TYPE_CHECKING:
 async def test_a_request_is_handled_in_the_event_loop_of_the_agent(here: zenoh.Session, there: zenoh.Session) -> None:
     loop = asyncio.get_running_loop()
 
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         return Done(asyncio.get_running_loop() is loop, request.address)
 
     async with offering(there, here, start=start):
@@ -53,11 +44,11 @@ async def test_amounts_beyond_what_json_numbers_hold_survive(here: zenoh.Session
 async def test_a_whole_record_travels(here: zenoh.Session, there: zenoh.Session) -> None:
     job = liability(lighthouse_fee=1, cost=2, validator=PERSON.address, validator_fee=3)
 
-    async def read(request: ReadLiability) -> LiabilityRead:
+    async def read(request: LiabilityRequest) -> LiabilityRead:
         return LiabilityRead(True, job)
 
     async with offering(there, here, read=read):
-        assert await call(here, ADDRESS, "read", ReadLiability(LIGHTHOUSE)) == LiabilityRead(True, job)
+        assert await call(here, ADDRESS, "read", LiabilityRequest(LIGHTHOUSE)) == LiabilityRead(True, job)
 
 
 async def test_a_query_without_a_payload_is_an_empty_request(here: zenoh.Session, there: zenoh.Session) -> None:
@@ -70,7 +61,7 @@ async def test_a_query_without_a_payload_is_an_empty_request(here: zenoh.Session
 
 
 async def test_an_error_reaches_the_caller_with_its_hint(here: zenoh.Session, there: zenoh.Session) -> None:
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         raise AiraError("there is no such job", hint="look at `aira status`")
 
     async with offering(there, here, start=start):
@@ -86,7 +77,7 @@ async def test_an_error_reaches_the_caller_with_its_hint(here: zenoh.Session, th
 async def test_an_unexpected_error_stays_in_the_agents_log(
     here: zenoh.Session, there: zenoh.Session, caplog: pytest.LogCaptureFixture, failure: str
 ) -> None:
-    async def start(request: StartLiability) -> Any:
+    async def start(request: LiabilityRequest) -> Any:
         if failure == "an error":
             raise ZeroDivisionError("a secret")
 
@@ -107,7 +98,7 @@ async def test_a_malformed_request_gets_an_error_reply(
 ) -> None:
     asked: list[Record] = []
 
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         asked.append(request)
         return Done(True)
 
@@ -116,7 +107,7 @@ async def test_a_malformed_request_gets_an_error_reply(
         (reply,) = await asyncio.to_thread(lambda: list(here.get(key, payload=payload)))
 
     assert reply.err is not None
-    assert b"not a StartLiability" in reply.err.payload.to_bytes()
+    assert b"not a LiabilityRequest" in reply.err.payload.to_bytes()
     assert asked == []
 
 
@@ -149,7 +140,7 @@ async def test_an_unknown_service_suggests_the_nearest(here: zenoh.Session, ther
 
 
 async def test_an_agent_that_does_not_reply_in_time(here: zenoh.Session, there: zenoh.Session) -> None:
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         await asyncio.Event().wait()
         raise AssertionError
 
@@ -181,7 +172,7 @@ async def test_an_unreadable_reply(here: zenoh.Session, there: zenoh.Session) ->
 async def test_requests_are_handled_concurrently(here: zenoh.Session, there: zenoh.Session) -> None:
     together = asyncio.Barrier(3)
 
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         await together.wait()
         return Done(True)
 
@@ -194,7 +185,7 @@ async def test_requests_are_handled_concurrently(here: zenoh.Session, there: zen
 async def test_requests_beyond_the_limit_get_an_error_reply(here: zenoh.Session, there: zenoh.Session) -> None:
     enough = asyncio.Event()
 
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         await enough.wait()
         return Done(True)
 

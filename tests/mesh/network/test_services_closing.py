@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from schemas.rpc import Done, StartLiability
+    from schemas.rpc import Done, LiabilityRequest
 
 
 async def test_closing_cancels_requests_in_progress(here: zenoh.Session, there: zenoh.Session) -> None:
     begun = asyncio.Event()
     ended: list[str] = []
 
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         begun.set()
         try:
             await asyncio.Event().wait()
@@ -77,7 +77,7 @@ async def test_a_query_that_arrives_while_closing_is_dropped(here: zenoh.Session
 async def test_closing_after_the_session_was_closed_does_not_hang(there: zenoh.Session, here: zenoh.Session) -> None:
     begun = asyncio.Event()
 
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         begun.set()
         await asyncio.Event().wait()
         raise AssertionError
@@ -95,7 +95,7 @@ async def test_closing_after_the_session_was_closed_does_not_hang(there: zenoh.S
 async def test_cancelling_a_call_takes_effect_at_once(here: zenoh.Session, there: zenoh.Session) -> None:
     begun = threading.Event()
 
-    async def start(request: StartLiability) -> Done:
+    async def start(request: LiabilityRequest) -> Done:
         begun.set()
         await asyncio.Event().wait()
         raise AssertionError

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.base.flood import Drops
 from mesh.errors import RemoteError
-from mesh.flood import Drops
 from mesh.network import ValidationStatistics, message_key
-from mesh.network.subscription import LOOKUP_LIMIT, RECALL_LIMIT
+from mesh.network.channel import LOOKUP_LIMIT, RECALL_LIMIT
 from schemas import Demand, SignedMessage, encode, message_hash
 from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
 from tests.support.orders import MARKET, STRANGER, demand

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from mesh.network import ValidationStatistics, message_key, validation
+from mesh.network import ValidationStatistics, _validation, message_key
 from schemas import Demand, Offer, Result, Verified, encode, message_hash
 from schemas.signing import SignedDigest, recover_keys
 from tests.mesh.network.validating import HEAD, check, check_payload, counted, validator
@@ -234,7 +234,7 @@ def test_many_threads_accept_each_message_once_and_count_exactly() -> None:
 def test_a_copy_of_an_accepted_message_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
     checked, message = validator(), demand()
     assert check(checked, message) is not None
-    monkeypatch.setattr(validation, "decode", None)
+    monkeypatch.setattr(_validation, "decode", None)
 
     assert check(checked, message) is None
     assert checked.statistics(received=0, dropped=0).duplicate == 1
@@ -248,8 +248,8 @@ def test_the_signature_of_a_message_that_comes_twice_at_once_is_verified_once(mo
         recovered.extend(together := list(signed))
         return recover_keys(together)
 
-    monkeypatch.setattr(validation, "recover_keys", recover)
-    messages = [demand() for _ in range(validation.SLICE)]
+    monkeypatch.setattr(_validation, "recover_keys", recover)
+    messages = [demand() for _ in range(_validation.SLICE)]
     copies = [json.dumps(json.loads(encode(messages[place]))).encode() for place in (0, 1)]
     payloads = [encode(messages[0]), copies[0], *map(encode, messages[1:]), copies[1]]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from mesh.network import MessageValidator, message_key
-from mesh.network.lookups import Unresolved
+from mesh.network import MarketRules, MessageValidator, message_key
+from mesh.network._validation import Unresolved
 from schemas import Demand, SignedMessage, Verified, encode
 from tests.support.orders import LIGHTHOUSE, MARKET
 
@@ -14,8 +14,9 @@ NAME = "xrt.3.robonomics.eth"
 
 
 def validator(kind: type[Any] = Demand, **options: Any) -> MessageValidator[Any]:
-    given: dict[str, Any] = {"lighthouse": MARKET, "address": LIGHTHOUSE, "head": lambda: HEAD} | options
-    return MessageValidator(kind, **given)
+    of_rules = {name: options.pop(name) for name in tuple(options) if name not in ("deduplication_limit", "clock")}
+    given: dict[str, Any] = {"address": LIGHTHOUSE, "head": lambda: HEAD} | of_rules
+    return MessageValidator(kind, MarketRules(MARKET, **given), **options)
 
 
 def counted(checked: MessageValidator[Any]) -> dict[str, int]:

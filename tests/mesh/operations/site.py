@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent import Agent
+from mesh.agent.agent import Agent
+from mesh.base.retry import RetryPolicy
 from mesh.chain import XRT, Account, Chain
-from mesh.composition import chain_of
-from mesh.devchain.development import ALLOWANCE, PLAN, ROLES, deploy_market
-from mesh.retry import RetryPolicy
+from mesh.dev.development import ALLOWANCE, PLAN, ROLES, deploy_market
+from mesh.role.composition import chain_of
 from mesh.settings import Settings
 from schemas import cid_of_bytes
 from tests.mesh.cli.served_chain import write_quick_keyfile
@@ -47,7 +47,7 @@ class Site:
         self.endpoint = endpoint
         self.folder = folder
         self.keys = dict(zip(PEOPLE, keys, strict=False))
-        self.accounts = {role: Account.from_key(key) for role, key in self.keys.items()}
+        self.accounts = {role: Account(key) for role, key in self.keys.items()}
         self.lighthouse = Settings().lighthouse_contract
 
     @classmethod

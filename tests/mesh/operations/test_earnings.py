@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from msgspec.structs import asdict
 
 from mesh.cli import provider as command
-from mesh.market import settlement
-from mesh.market.earnings import Earnings, EarningsLedger
+from mesh.market import _settlement
+from mesh.market._earnings import Earnings, EarningsLedger
 from tests.mesh.operations.site import FEE, Site
 from tests.support.waiting import until
 
@@ -68,7 +68,7 @@ async def gas_used(chain: Chain, start: int) -> int:
 def created(caplog: pytest.LogCaptureFixture) -> int:
     """The number of contracts that the provider knows to have created; agents log this event, too."""
     records = [record for record in caplog.records if getattr(record, "event", "") == "contract-created"]
-    return sum(record.name == settlement.__name__ for record in records)
+    return sum(record.name == _settlement.__name__ for record in records)
 
 
 def finalized(caplog: pytest.LogCaptureFixture) -> int:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import Account, write_keyfile
-from mesh.devchain.development import deploy_market
-from mesh.identity import Member
+from mesh.dev.development import deploy_market
+from mesh.ops.identity import Member
 from tests.mesh.operations.site import events, has_event
 from tests.support.commands import AIRA, Serving
 from tests.support.nodes import Anvil
@@ -90,7 +90,7 @@ async def test_a_server_waits_for_its_files_then_the_node_the_contracts_and_the_
 async def test_a_provider_waits_for_its_stake(tmp_path: Path) -> None:
     with Anvil() as node, EmbeddedRouter() as router:
         market = await deploy_market(node.url, node.private_keys)
-        late = Account.from_key(node.private_keys[3])
+        late = Account(node.private_keys[3])
         await asyncio.to_thread(hand_over, tmp_path, key=node.private_keys[3])
         variables = variables_of(tmp_path, node=node.port, router=router.port)
         with started(*PROVIDER, says='"code": "no-stake"', variables=variables) as server:
@@ -143,7 +143,7 @@ async def test_an_agent_that_the_router_rejects_waits_until_it_is_accepted(tmp_p
     site, other = ClosedSite(tmp_path), ClosedSite(tmp_path / "other")
     with Anvil() as node:
         await deploy_market(node.url, node.private_keys)
-        account = Account.from_key(node.private_keys[1])
+        account = Account(node.private_keys[1])
         await asyncio.to_thread(hand_over, tmp_path, key=node.private_keys[1])
         mine = site.enlist(Member(name="robot", address=account.address, roles=("agent",)))
         member = other.certify("robot", account.address, "agent")

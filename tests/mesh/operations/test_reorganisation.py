@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import Phase
+from mesh.agent.ledger import Phase
 from mesh.watching import status_of
 from schemas.status import Status
 from tests.mesh.operations.site import FEE, Site, has_event, has_traceback
@@ -17,7 +17,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from mesh.chain import Chain
     from schemas import Demand, Liability, Verified
     from tests.support.nodes import Anvil
@@ -81,7 +81,7 @@ async def test_a_reverted_contract_is_created_again_and_its_job_paid_once(
         await request(chain, "anvil_reorg", 1, [])
         await request(chain, "evm_mine")
         await until(
-            lambda: has_event(provider, "chain-reorganised", created="1"), what="the reorganisation", seconds=TIMEOUT
+            lambda: has_event(provider, "chain-reorganised", events="1"), what="the reorganisation", seconds=TIMEOUT
         )
         await until(lambda: len(incoming) == 2, what="the contract created again", seconds=TIMEOUT)
         assert await robot.parts.ledger.job(first) is None or contract.address == first

@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
-from mesh.background import Background
-from mesh.devchain import ServedChain, serve_embedded
+from mesh.base.background import Background
 from schemas import parse_address
 from tests.mesh.operations.site import FEE, Site
+from tests.support.development import ServedChain, serve_embedded
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from mesh.agent import Agent, Outcome
+    from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Outcome
     from mesh.chain import Chain
     from tests.support.routers import EmbeddedRouter
 
@@ -40,7 +41,7 @@ class Sent(NamedTuple):
 @pytest.fixture
 async def served() -> AsyncIterator[ServedChain]:
     """A chain of this test's own, which makes a block for each transaction."""
-    async with serve_embedded(port=0) as running:
+    async with serve_embedded() as running:
         yield running
 
 

@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingTooLarge, open_objective
+from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingError, open_objective
 from schemas.payloads import STRING, PayloadType
 from tests.mesh.recording.files import SECOND, T0
 from tests.support.bags import MAGIC, Bag, BagMessage, Compression, record, string
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -94,8 +95,8 @@ def chunk(data: bytes, *, compression: bytes = b"none", size: int | None = None)
     [
         (message(0), "first record"),
         (record({"op": b"\x03"}, b""), "a field of 8 bytes"),
-        (BAG + message(0), "undefined connection 0"),
-        (BAG + chunk(message(0)), "undefined connection 0"),
+        (BAG + message(0), "undefined channel 0"),
+        (BAG + chunk(message(0)), "undefined channel 0"),
         (BAG + chunk(BAG), "something else"),
         (BAG + chunk(b"\0"), "cut off"),
         (BAG + chunk(struct.pack("<I", 0xFFFFFFFF)), "cut off"),
@@ -127,6 +128,6 @@ def test_malformed_records_are_corrupt(tmp_path: Path, content: bytes, why: str)
     ],
 )
 def test_every_limit_is_enforced(tmp_path: Path, limits: Limits, limit: str) -> None:
-    with pytest.raises(RecordingTooLarge) as caught:
+    with raises_with(RecordingError, code="recording-too-large") as caught:
         open_objective(kept(tmp_path, Bag(MESSAGES, "bz2").encode()), limits)
     assert caught.value.limit == limit

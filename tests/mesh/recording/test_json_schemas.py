@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mesh.recording import JsonSchemas, Recorder, RecordingAbout, open_objective
-from mesh.recording.json_schemas import CHANGES, LONGEST, TOPICS
+from mesh.recording._json_schemas import CHANGES, LONGEST, TOPICS
 from schemas.payloads import JSON, RAW, PayloadType, payload_type
 
 if TYPE_CHECKING:
@@ -93,9 +93,38 @@ def fits(value: Any, schema: dict[str, Any]) -> bool:
     return "type" not in schema or kinds[schema["type"]]
 
 
+@pytest.mark.parametrize(
+    ("first", "then", "schema"),
+    [
+        ({"a": 1}, {"a": 1, "b": 1}, {"a": "number", "b": "number"}),
+        ({"a": {"b": 1}}, {"a": {"c": "x"}}, {"a": {"b": "number", "c": "string"}}),
+        ({"a": [{"b": 1}]}, {"a": [{"b": 1}, {"c": 1}]}, {"a": [{"b": "number", "c": "number"}]}),
+        ({"a": []}, {"a": [1]}, {"a": ["number"]}),
+        ({"a": 1}, {"a": True}, {}),
+        ({'"': 1}, {'"': 2, "b": 1}, {'"': "number", "b": "number"}),
+        ({"a": [None]}, {"a": [None, 1]}, {}),
+    ],
+)
+def test_what_a_message_adds_anywhere_is_in_the_schema(first: Any, then: Any, schema: dict[str, Any]) -> None:
+    schemas = JsonSchemas()
+    for _ in range(2):
+        described(schemas, first)
+    assert described(schemas, then) == written(schema)
+
+
+def written(schema: Any) -> dict[str, Any]:
+    match schema:
+        case dict():
+            return {"type": "object", "properties": {name: written(one) for name, one in schema.items()}}
+        case [items]:
+            return {"type": "array", "items": written(items)}
+    return {"type": schema}
+
+
 @given(st.lists(ANYTHING, min_size=1, max_size=6))
 def test_the_last_schema_fits_all_messages(values: list[Any]) -> None:
     schemas = JsonSchemas()
+    values = [*values, *values]
     found = [described(schemas, value) for value in values]
     assert all(fits(value, found[-1]) for value in values)
     assert all(fits(value, schema) for value, schema in zip(values, found, strict=True))

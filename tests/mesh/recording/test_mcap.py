@@ -11,7 +11,7 @@ from mcap.opcode import Opcode
 from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 
-from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingTooLarge, open_objective
+from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingError, open_objective
 from schemas.payloads import PayloadType
 from tests.mesh.recording.files import (
     CHANNEL,
@@ -27,6 +27,7 @@ from tests.mesh.recording.files import (
     with_messages,
 )
 from tests.support.bags import Bag, BagMessage
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -152,7 +153,7 @@ def test_a_flipped_bit_in_the_index_fails_its_checksum(tmp_path: Path) -> None:
 
 
 def test_a_file_over_the_size_limit_is_not_read(tmp_path: Path) -> None:
-    with pytest.raises(RecordingTooLarge) as caught:
+    with raises_with(RecordingError, code="recording-too-large") as caught:
         open_objective(kept(tmp_path, bytes(1001)), Limits(size=1000))
     assert caught.value.reason == "too-large"
 
@@ -164,7 +165,7 @@ def test_a_small_file_that_expands_too_much_is_refused_without_expanding_it(tmp_
     assert path.stat().st_size < 100_000
     tracemalloc.start()
     try:
-        with pytest.raises(RecordingTooLarge) as caught:
+        with raises_with(RecordingError, code="recording-too-large") as caught:
             open_objective(path)
         _, peak = tracemalloc.get_traced_memory()
     finally:
@@ -194,7 +195,7 @@ def test_a_chunk_never_expands_beyond_its_stated_size(tmp_path: Path, compressio
 def test_messages_too_far_out_of_order_to_sort_are_refused(tmp_path: Path) -> None:
     path = kept(tmp_path, with_messages([T0 + n * 7919 % 5000 for n in range(5000)]))
     assert open_objective(path).count == 5000
-    with pytest.raises(RecordingTooLarge) as caught:
+    with raises_with(RecordingError, code="recording-too-large") as caught:
         open_objective(path, Limits(window=100_000))
     assert caught.value.limit == "window"
 
@@ -212,7 +213,7 @@ def test_messages_too_far_out_of_order_to_sort_are_refused(tmp_path: Path) -> No
 def test_every_limit_is_enforced(tmp_path: Path, limits: Limits, limit: str) -> None:
     path = kept(tmp_path, with_messages([T0 + n for n in range(100)]))
     assert open_objective(path).count == 100
-    with pytest.raises(RecordingTooLarge) as caught:
+    with raises_with(RecordingError, code="recording-too-large") as caught:
         open_objective(path, limits)
     assert (caught.value.reason, caught.value.limit) == ("expands-too-much", limit)
 

@@ -12,17 +12,18 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from mcap.reader import make_reader
 
+from mesh.errors import InputError
 from mesh.recording import (
     CorruptRecording,
     NotARecording,
     Recorder,
     RecordingAbout,
-    RecordingExists,
     open_objective,
     recover,
 )
 from schemas.payloads import RAW
 from tests.mesh.recording.files import T0, mcap_file, with_messages
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -33,6 +34,8 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from mesh.recording import Recorder, RecordingAbout
+from tests.support.raising import raises_with
+from mesh.errors import InputError
 from schemas.payloads import RAW
 recorder = Recorder(Path(sys.argv[1]), RecordingAbout(liability="0x1"))
 for number in range(10_000):
@@ -183,7 +186,7 @@ def test_a_complete_file_is_recovered_completely(tmp_path: Path) -> None:
 def test_recovery_never_overwrites_a_file(tmp_path: Path) -> None:
     (tmp_path / "it.mcap.part").write_bytes(with_messages(TIMES)[:500])
     (tmp_path / "it.mcap").write_bytes(b"precious")
-    with pytest.raises(RecordingExists):
+    with raises_with(InputError, code="recording-exists"):
         recover(tmp_path / "it.mcap.part")
     assert (tmp_path / "it.mcap").read_bytes() == b"precious"
 

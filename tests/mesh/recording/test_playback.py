@@ -16,7 +16,6 @@ from mesh.recording import (
     open_objective,
     paced,
     play,
-    timeline,
 )
 from schemas.payloads import RAW
 from tests.mesh.recording.files import SECOND, T0, with_messages
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.recording import Objective
+    from mesh.recording.playback import Step
 
 MILLISECOND = 1_000_000
 
@@ -55,6 +55,10 @@ async def given(items: list[Played]) -> AsyncIterator[Played]:
         yield item
 
 
+async def steps_of(items: list[Played], pace: Pace, **start: int) -> list[Step]:
+    return [step async for step in paced(given(items), pace, WoundClock(), **start)]
+
+
 def objective(directory: Path, *times: int) -> Objective:
     path = directory / "it.mcap"
     path.write_bytes(with_messages(times))
@@ -71,24 +75,24 @@ def objective(directory: Path, *times: int) -> Objective:
         (FixedRate(hz=100), [0, 10, 20, 30]),
     ],
 )
-def test_due_times_of_messages(pace: Pace, due: list[int]) -> None:
+async def test_due_times_of_messages(pace: Pace, due: list[int]) -> None:
     recorded = messages(0, 10 * MILLISECOND, 10 * MILLISECOND, 250 * MILLISECOND)
-    steps = list(timeline(recorded, pace))
+    steps = await steps_of(recorded, pace)
     assert [step.due_ns for step in steps] == [one * MILLISECOND for one in due]
     assert [step.index for step in steps] == [0, 1, 2, 3]
     assert [step.message for step in steps] == recorded
 
 
-def test_starting_at_an_index_makes_its_message_due_at_once() -> None:
-    steps = list(timeline(messages(5, 7, 20)[1:], RecordedTimes(), first_index=1))
+async def test_starting_at_an_index_makes_its_message_due_at_once() -> None:
+    steps = await steps_of(messages(5, 7, 20)[1:], RecordedTimes(), first_index=1)
     assert [(step.index, step.due_ns) for step in steps] == [(1, 0), (2, 13)]
 
 
-def test_starting_at_a_time_skips_earlier_messages() -> None:
+async def test_starting_at_a_time_skips_earlier_messages() -> None:
     recorded = messages(0, 4, 10, 15)
-    steps = list(timeline(recorded, RecordedTimes(), start_ns=6))
+    steps = await steps_of(recorded, RecordedTimes(), start_ns=6)
     assert [(step.index, step.due_ns) for step in steps] == [(2, 4), (3, 9)]
-    steps = list(timeline(recorded, FixedRate(hz=1), start_ns=6))
+    steps = await steps_of(recorded, FixedRate(hz=1), start_ns=6)
     assert [(step.index, step.due_ns) for step in steps] == [(2, 0), (3, SECOND)]
 
 

@@ -11,18 +11,18 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from mesh.errors import ClosedError
+from mesh.errors import ClosedError, InputError
 from mesh.recording import (
     Recorder,
     RecorderSettings,
     RecordingAbout,
-    RecordingExists,
     RecordingFailed,
     Unrecordable,
     open_objective,
 )
 from schemas.payloads import EMPTY, JSON, RAW, STRING, PayloadType, String
 from tests.mesh.recording.files import T0
+from tests.support.raising import raises_with
 
 ROOT = Path(__file__).parents[3]
 SELDOM = RecorderSettings(sync_seconds=3600)
@@ -184,7 +184,7 @@ def test_nothing_is_recorded_after_close(tmp_path: Path) -> None:
 def test_a_finished_recording_is_never_overwritten(tmp_path: Path) -> None:
     Recorder(tmp_path / "it.mcap", ABOUT).close()
     before = (tmp_path / "it.mcap").read_bytes()
-    with pytest.raises(RecordingExists):
+    with raises_with(InputError, code="recording-exists"):
         Recorder(tmp_path / "it.mcap", ABOUT)
     assert (tmp_path / "it.mcap").read_bytes() == before
 
@@ -192,7 +192,7 @@ def test_a_finished_recording_is_never_overwritten(tmp_path: Path) -> None:
 def test_a_recording_in_progress_elsewhere_is_refused(tmp_path: Path) -> None:
     with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
         recorder.record("/a", b"mine", RAW)
-        with pytest.raises(RecordingExists):
+        with raises_with(InputError, code="recording-exists"):
             Recorder(tmp_path / "it.mcap", ABOUT)
     assert open_objective(tmp_path / "it.mcap").count == 1
 

@@ -8,7 +8,7 @@ import weakref
 from typing import TYPE_CHECKING
 
 from mesh.recording import Recorders, RecordingAbout
-from mesh.recording.partial import PartialFile
+from mesh.recording._recorder import PartialFile
 from schemas.payloads import STRING
 from tests.support.waiting import SECONDS, wait_until
 

@@ -1,9 +1,14 @@
-"""Recordings of rosbag2 as objectives: written and read by rosbags, and hostile ones."""
+"""Recordings of rosbag2 as objectives, written and read by rosbags, and hostile ones; and our bags played by ROS 1."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import socket
 import sqlite3
-from typing import TYPE_CHECKING
+import subprocess
+from contextlib import ExitStack, closing
+from typing import TYPE_CHECKING, Final
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -14,21 +19,27 @@ from mesh.recording import (
     Limits,
     NotARecording,
     RecordingError,
-    RecordingTooLarge,
+    convert,
     open_objective,
+    pack,
     preflight,
     recording_file,
 )
-from mesh.recording.ros_values import ros_value
-from mesh.ros import RosTypes
+from mesh.recording.objective import Played
+from mesh.recording.ros import RosTypes, ros_value
 from schemas.payloads import PayloadType
 from tests.mesh.recording.files import SECOND, T0
+from tests.support.peers import require
+from tests.support.ports import free_port
+from tests.support.processes import Server
 from tests.support.rosbag2 import database, rosbag2
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from tests.support.rosbag2 import Sent, Storage
+
 
 ROS = RosTypes("jazzy")
 HELLO = b"\x00\x01\x00\x00\x06\x00\x00\x00Hello\x00"
@@ -125,7 +136,7 @@ HOSTILE = {
     "a long row": (("INSERT INTO messages VALUES (7, 1, 1, zeroblob(40000))",), CorruptRecording),
     "rows that add up": (
         tuple(f"INSERT INTO messages VALUES ({n}, 1, 1, zeroblob(20000))" for n in range(7, 67)),
-        RecordingTooLarge,
+        RecordingError,
     ),
     "a text as time": (("INSERT INTO messages VALUES (7, 1, 'now', x'00')",), CorruptRecording),
     "no data": (("INSERT INTO messages VALUES (7, 1, 1, NULL)",), CorruptRecording),
@@ -135,9 +146,9 @@ HOSTILE = {
     "a name that is not UTF-8": (("UPDATE topics SET name = x'ff'",), CorruptRecording),
     "many topics": (
         tuple(f"INSERT INTO topics VALUES ({n}, '/t{n}', 'a/msg/B', 'cdr')" for n in range(2, 40)),
-        RecordingTooLarge,
+        RecordingError,
     ),
-    "a long type": (("UPDATE topics SET type = hex(zeroblob(10000))",), RecordingTooLarge),
+    "a long type": (("UPDATE topics SET type = hex(zeroblob(10000))",), RecordingError),
     "compressed messages": (("INSERT INTO messages VALUES (7, 1, 1, x'28b52ffd00')",), NotARecording),
 }
 SMALL = Limits(size=4 << 20, expanded=1 << 20, record=32 << 10, window=1 << 20, definitions=16 << 10, channels=16)
@@ -161,14 +172,68 @@ def test_a_hostile_database_is_refused(tmp_path: Path, name: str) -> None:
     assert type(refused.value) is error
 
 
-def test_nothing_is_written_beside_a_database_and_no_journal_is_read(tmp_path: Path) -> None:
-    path = database(tmp_path / "it.db3", "PRAGMA journal_mode = WAL", rows=[(1, 1, HELLO)])
-    (tmp_path / "it.db3-journal").write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + bytes(504))
-    names = sorted(file.name for file in tmp_path.iterdir())
-    content = path.read_bytes()
+LEFT_BY_A_CRASH: dict[str, tuple[str, tuple[str, ...], int | str]] = {
+    "a transaction that is only in the log": ("WAL", ("BEGIN", "ADD", "COMMIT"), "it.db3-wal"),
+    "a log that was merged": ("WAL", ("BEGIN", "ADD", "COMMIT", "MERGE"), 15),
+    "a merged log, and the beginning of a transaction": (
+        "WAL",
+        ("BEGIN", "ADD", "COMMIT", "MERGE", "BEGIN", "ADD"),
+        15,
+    ),
+    "the beginning of a transaction in the log": ("WAL", ("BEGIN", "ADD"), 0),
+    "a merged transaction and one in the log": (
+        "WAL",
+        ("BEGIN", "ADD", "COMMIT", "MERGE", "BEGIN", "ADD", "COMMIT"),
+        "it.db3-wal",
+    ),
+    "a transaction that is to be taken back": ("DELETE", ("BEGIN", "ADD"), "it.db3-journal"),
+    "a journal without content": ("TRUNCATE", ("BEGIN", "ADD", "COMMIT"), 15),
+    "a journal that was reset": ("PERSIST", ("BEGIN", "ADD", "COMMIT"), 15),
+}
+
+
+@pytest.mark.parametrize("name", LEFT_BY_A_CRASH)
+def test_a_database_is_read_unless_a_journal_has_what_it_lacks(tmp_path: Path, name: str) -> None:
+    mode, steps, expected = LEFT_BY_A_CRASH[name]
+    path = database(tmp_path / "it.db3")
+    killed = tmp_path / "killed"
+    with closing(sqlite3.connect(path, isolation_level=None)) as opened:
+        opened.executescript(f"PRAGMA journal_mode = {mode}; PRAGMA wal_autocheckpoint = 0; PRAGMA cache_size = 1")
+        for step in steps:
+            match step:
+                case "ADD":
+                    rows = [(1, time, bytes(9000)) for time in range(15)]
+                    opened.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+                case "MERGE":
+                    opened.execute("PRAGMA wal_checkpoint(PASSIVE)")
+                case statement:
+                    opened.execute(statement)
+        shutil.copytree(tmp_path, killed, ignore=shutil.ignore_patterns("*-shm", "killed"))
+    before = {file.name: file.read_bytes() for file in killed.iterdir()}
+    assert len(before) == 2
+
+    if isinstance(expected, int):
+        assert open_objective(killed / "it.db3").count == expected
+    else:
+        with pytest.raises(NotARecording, match=expected):
+            open_objective(killed / "it.db3")
+
+    assert {file.name: file.read_bytes() for file in killed.iterdir()} == before
+
+
+@pytest.mark.parametrize("suffix", ["-wal", "-journal"])
+@pytest.mark.parametrize("content", [b"", bytes(512), b"no journal of SQLite at all"])
+def test_a_journal_without_content_is_harmless(tmp_path: Path, suffix: str, content: bytes) -> None:
+    path = database(tmp_path / "it.db3", rows=[(1, 1, HELLO)])
+    path.with_name(f"it.db3{suffix}").write_bytes(content)
     assert [one.payload for one in open_objective(path).messages()] == [HELLO]
-    assert sorted(file.name for file in tmp_path.iterdir()) == names
-    assert path.read_bytes() == content
+
+
+def test_a_folder_of_compressed_files_says_how_to_decompress_them(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("")
+    (tmp_path / "bag_0.db3.zstd").write_bytes(b"")
+    with pytest.raises(NotARecording, match=r"zstd -d bag_0\.db3\.zstd"):
+        recording_file(tmp_path)
 
 
 def test_triggers_and_indexes_of_a_stranger_are_not_used(tmp_path: Path) -> None:
@@ -229,3 +294,97 @@ def test_a_stranger_s_definition_harms_nothing(capsys: pytest.CaptureFixture[str
 def test_any_payload_of_a_type_has_a_value(payload: bytes, name: str) -> None:
     kind = ROS.message(name).type
     assert ros_value(payload, kind) == payload or isinstance(ros_value(payload, kind), dict)
+
+
+PYTHON: Final = "/usr/bin/python3"
+"""The only one that has Debian's ROS."""
+SECONDS: Final = 60
+TYPES = RosTypes("jazzy")
+SENT: Final = {
+    "/said": TYPES.message("std_msgs/String", data="go"),
+    "/number": TYPES.message("std_msgs/Float64", data=2.5),
+    "/led": TYPES.message("std_msgs/Empty"),
+}
+SHOWN: Final = {"/said": 'data: "go"\n---\n', "/number": "data: 2.5\n---\n", "/led": "\n---\n"}
+
+
+class RosMaster(Server):
+    """The master of ROS 1, without the logger that `roscore` starts."""
+
+    name = "rosmaster"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.port = free_port()
+
+    @property
+    def environment(self) -> Mapping[str, str]:
+        """What nodes find in their environment."""
+        return {
+            "PATH": "/usr/bin:/bin",
+            "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
+            "ROS_IP": "127.0.0.1",
+            "ROS_HOME": str(self.folder),
+            "ROS_LOG_DIR": str(self.folder),
+        }
+
+    def command(self) -> Sequence[str | Path]:
+        variables = [f"{name}={value}" for name, value in self.environment.items()]
+        return ["/usr/bin/env", *variables, PYTHON, require("rosmaster"), "--core", "-p", str(self.port)]
+
+    def is_ready(self) -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", self.port)) == 0
+
+
+def bag(folder: Path, times: Sequence[int]) -> Path:
+    """A bag with a message on each topic at each of these times, converted from MCAP."""
+    sent = [Played(topic, each.data, time, time, 0, each.type) for time in times for topic, each in SENT.items()]
+    pack(sent, folder / "in.mcap")
+    return convert(folder / "in.mcap", folder / "out.bag", to="bag").path
+
+
+def run(*command: str | Path, environment: Mapping[str, str] | None = None) -> str:
+    """What a program of ROS prints."""
+    done = subprocess.run(
+        [PYTHON, *command],
+        env=dict(environment or {"PATH": "/usr/bin:/bin", "HOME": os.environ["HOME"]}),
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_rosbag_describes_our_bags(tmp_path: Path) -> None:
+    rosbag, path = require("rosbag"), bag(tmp_path, [0, 10**9])
+    said = run(rosbag, "info", "--yaml", path)
+    assert "messages: 6\n" in said
+    for topic, each in SENT.items():
+        assert f"topic: {topic}\n      type: {each.type.schema_name.replace('/msg/', '/')}\n      messages: 2\n" in said
+    assert "does not need any migrations" in run(rosbag, "check", path)
+
+
+def test_rosbag_plays_our_bags(tmp_path: Path) -> None:
+    """Also messages at time 0, which its player refuses: they are written as at 1 ns."""
+    rosbag, rostopic, path = require("rosbag"), require("rostopic"), bag(tmp_path, [0, 10**8])
+    with RosMaster() as master, ExitStack() as stack:
+        listening = {
+            topic: stack.enter_context(
+                subprocess.Popen(
+                    [PYTHON, rostopic, "echo", "-n", "2", topic],
+                    env=dict(master.environment),
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL,
+                    text=True,
+                )
+            )
+            for topic in SENT
+        }
+        for each in listening.values():
+            stack.callback(each.kill)
+        run(rosbag, "play", "--quiet", "--wait-for-subscribers", path, environment=master.environment)
+        heard = {topic: each.communicate(timeout=SECONDS)[0] for topic, each in listening.items()}
+    assert heard == {topic: 2 * shown for topic, shown in SHOWN.items()}

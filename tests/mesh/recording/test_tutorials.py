@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from mesh.recording import bag_to_mcap, open_objective, preflight
+from mesh.recording import convert, open_objective, preflight
 from schemas import Empty, String, cid_of_file
 from schemas.payloads import decode_value
 from tests.support.bags import MAGIC, fields, record, string
@@ -142,6 +142,6 @@ def test_a_tutorial_has_its_one_message(bag: Path, tutorial: Tutorial) -> None:
 
 
 def test_a_tutorial_is_unchanged_as_mcap(bag: Path, tutorial: Tutorial) -> None:
-    converted = open_objective(bag_to_mcap(bag, bag.with_suffix(".mcap"), cid=tutorial.cid))
+    converted = open_objective(convert(bag, bag.with_suffix(".mcap"), to="mcap", cid=tutorial.cid).path)
     assert converted.metadata["aira"] == {"source": tutorial.cid, "source_format": "bag"}
     assert list(converted.messages()) == list(open_objective(bag).messages())

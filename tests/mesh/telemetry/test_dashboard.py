@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import pytest
 
-from bridges.ipfs.status import BridgeHealth, bridge_families, content_families
+from bridges.ipfs._channel import BridgeHealth, bridge_families
+from bridges.ipfs._content import content_families
+from bridges.serial._edge import edge_families
 from bridges.serial.dialect import LineCounters
-from bridges.serial.metrics import EdgeStatistics, families_of
 from mesh.market.provider import Provider, ProviderProcess
 from mesh.network import Endpoints, Network
-from mesh.telemetry.health import health_metrics
-from mesh.telemetry.metrics import labelled
-from mesh.telemetry.server import render_metrics
+from mesh.telemetry._server import render_metrics
+from mesh.telemetry.metrics import health_metrics, labelled
 from mesh.validator.validator import Validator
 from schemas.status import ContentMetrics
 from tests.bridges.ipfs.statuses import direction, status
@@ -25,7 +25,7 @@ from tests.support.scraping import Scrape
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
     from mesh.telemetry.metrics import MetricFamily
     from tests.support.market import Place
 
@@ -51,17 +51,7 @@ class Known(NamedTuple):
     labels: set[str]
 
 
-def edge_families() -> tuple[MetricFamily, ...]:
-    return families_of(
-        EdgeStatistics(
-            line=LineCounters(),
-            calls={"done": 1},
-            openings=1,
-            board_losses=0,
-            line_is_open=True,
-            board_is_present=True,
-        )
-    )
+EDGE = edge_families(LineCounters(), {"done": 1}, openings=1, losses=0, is_present=True)
 
 
 def bridge() -> tuple[MetricFamily, ...]:
@@ -102,8 +92,8 @@ async def role_families(place: Place) -> list[MetricFamily]:
 @pytest.fixture
 async def served(place: Place) -> Mapping[str, Known]:
     """All that any role serves, by name."""
-    families = [*await role_families(place), *edge_families(), *bridge()]
-    figures = Scrape(render_metrics(families).body.decode())
+    families = [*await role_families(place), *EDGE, *bridge()]
+    figures = Scrape(render_metrics(families)[0].decode())
     known = {}
     for family in figures.families.values():
         name = family.name + ("_total" if family.type == "counter" else "")
@@ -151,7 +141,11 @@ async def test_rates_are_of_counters_only(served: Mapping[str, Known]) -> None:
 
 
 async def test_names_kinds_and_meanings_are_well_formed(served: Mapping[str, Known], place: Place) -> None:
-    families = [*await role_families(place), *edge_families(), *bridge()]
+    families = [
+        *await role_families(place),
+        *EDGE,
+        *bridge(),
+    ]
     for family in families:
         assert re.fullmatch(r"aira(_[a-z]+)+", family.name), family.name
         assert family.name.endswith("_total") == (family.kind == "counter"), family.name

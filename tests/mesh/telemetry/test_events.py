@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from mesh.log_context import LogSource, liability_context, log_event, source_context, with_liability_context
-from mesh.telemetry.events import MAX_EVENT, MAX_MESSAGE, event_of, human_line, json_line, without_secrets
-from schemas.logs import LogEvent
+from mesh.base.log_context import LogSource, liability_context, log_event, source_context, with_liability_context
+from mesh.telemetry.logs import MAX_EVENT, MAX_MESSAGE, event_of, human_line, json_line, without_secrets
+from schemas.status import LogEvent
 from tests.support.orders import ROBOT, STRANGER
 
 LIABILITY = "0x8A7B7Bf07722e6c80579326C4F162692ccD71F39"
@@ -23,7 +23,7 @@ HOSTILE = "so\n12:00:00 INFO    all is well\r\x1b[2J\x9b31m\x85\u2028\u202e\x7f{
 
 def record(message: str, *arguments: object, level: int = logging.INFO, error: BaseException | None = None) -> Any:
     info = None if error is None else (type(error), error, error.__traceback__)
-    return logging.LogRecord("mesh.work.executor", level, __file__, 1, message, arguments, info)
+    return logging.LogRecord("mesh.agent.jobs", level, __file__, 1, message, arguments, info)
 
 
 def failed(words: str) -> ZeroDivisionError:
@@ -41,7 +41,7 @@ def test_an_event_has_its_source_and_its_liability() -> None:
     assert fields.pop("time").endswith("Z")
     assert fields == {
         "level": "info",
-        "logger": "mesh.work.executor",
+        "logger": "mesh.agent.jobs",
         "message": "ready, 3 messages to play",
         "role": "agent",
         "address": ROBOT.address,

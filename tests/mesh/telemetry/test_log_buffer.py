@@ -6,8 +6,8 @@ import pytest
 
 from mesh.errors import InputError
 from mesh.telemetry.logs import LogBuffer
-from schemas.logs import LogEvent, LogsRead, ReadLogs
 from schemas.records import MAX_RECORD_SIZE
+from schemas.status import LogEvent, LogsRead, ReadLogs
 from tests.support.orders import ROBOT, STRANGER
 
 

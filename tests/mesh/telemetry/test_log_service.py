@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import Agent
-from mesh.identity import Member
-from mesh.log_context import LogSource, liability_context, source_context
+from mesh.agent.agent import Agent
+from mesh.base.log_context import LogSource, liability_context, source_context
 from mesh.network import Endpoints, Network, ServiceFailed, Services, call
+from mesh.ops.identity import Member
 from mesh.telemetry.logs import LogHandler, LogService, keep_log
-from mesh.watching.logs import LogReader
+from mesh.watching.presence import LogReader
 from schemas import RpcKey
-from schemas.logs import LogsRead, ReadLogs
+from schemas.status import LogsRead, ReadLogs
 from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.orders import OBJECTIVE, PERSON, ROBOT, STRANGER
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from mesh.identity.roster import Role
+    from mesh.ops.identity.roster import Role
     from schemas import Signer
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter

@@ -13,7 +13,7 @@ from tests.support.commands import run
 START = """
 import asyncio, logging, threading, warnings
 from mesh.errors import RemoteError
-from mesh.running import run_until_stopped
+from mesh.role.running import run_until_stopped
 from mesh.settings import load
 log = logging.getLogger("my.robot")
 

@@ -5,14 +5,23 @@ from __future__ import annotations
 import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as open_metrics
 
-from mesh.telemetry.health import Health, health_metrics
-from mesh.telemetry.metrics import MetricFamily, MetricSample, by_label, counter, gauge, labelled, merged
-from mesh.telemetry.server import render_metrics
+from mesh.telemetry._server import render_metrics
+from mesh.telemetry.metrics import (
+    Health,
+    MetricFamily,
+    MetricSample,
+    by_label,
+    counter,
+    gauge,
+    health_metrics,
+    labelled,
+    merged,
+)
 from tests.support.scraping import Scrape
 
 
 def rendered(*families: MetricFamily) -> Scrape:
-    text, content_type, _ = render_metrics(families)
+    text, content_type = render_metrics(families)
     assert content_type.startswith("text/plain")
     return Scrape(text.decode())
 
@@ -39,7 +48,7 @@ def test_labels_may_hold_any_text() -> None:
 def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
     families = [counter("aira_jobs_done_total", "Jobs done", 3)]
 
-    text, content_type, _ = render_metrics(families, accept="application/openmetrics-text; version=1.0.0")
+    text, content_type = render_metrics(families, accept="application/openmetrics-text; version=1.0.0")
 
     assert content_type.startswith("application/openmetrics-text")
     found = {family.name: family for family in open_metrics(text.decode())}  # type: ignore[no-untyped-call]
@@ -95,4 +104,4 @@ def test_a_waiting_part_is_unhealthy(parts: dict[str, str], ok: bool) -> None:
 def test_health_removes_secrets() -> None:
     why = "waits: no node answers at https://me:hunter2@node.example/v3/0123456789abcdef0123 (401)"
 
-    assert Health.of({"start": why}).parts == {"start": "waits: no node answers at https://node.example/v3/… (401)"}
+    assert Health.of({"start": why}).parts == {"start": "waits: no node answers at https://node.example (401)"}

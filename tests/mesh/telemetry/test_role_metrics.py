@@ -7,8 +7,9 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from mesh.agent import Agent, JobFailed
-from mesh.background import Background
+from mesh.agent.agent import Agent
+from mesh.agent.handlers import JobFailed
+from mesh.base.background import Background
 from mesh.chain import NodeUnreachable
 from mesh.market.provider import Provider, ProviderProcess
 from mesh.network import Endpoints, Network
@@ -103,6 +104,7 @@ async def test_a_job_changes_exactly_these_metrics_of_its_provider(place: Place)
             "aira_matches_total": 1,
             "aira_contracts_created_total": 1,
             "aira_contracts_finalized_total": 1,
+            "aira_free_contracts_total": 1,
             "aira_transactions_total{sent}": 2,
             "aira_transactions_total{mined}": 2,
         }

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.errors import ChainError, ClosedError
+from mesh.errors import ChainError, ClosedError, ConfigurationError
 from mesh.telemetry.metrics import MetricFamily, counter, gauge, labelled
-from mesh.telemetry.server import MetricsNotServed
 from mesh.telemetry.serving import Telemetry
 from schemas.status import ALIVE
+from tests.support.raising import raises_with
 from tests.support.scraping import SECONDS, get, health, scraped
 from tests.support.waiting import until_found
 
@@ -148,7 +148,7 @@ def test_a_request_after_the_end_of_the_loop_is_no_failure(caplog: pytest.LogCap
 
 async def test_two_servers_can_not_share_a_port() -> None:
     async with Telemetry(HERE) as telemetry:
-        with pytest.raises(MetricsNotServed):
+        with raises_with(ConfigurationError, code="metrics-not-served"):
             await Telemetry(telemetry.url.removeprefix("http://")).__aenter__()
 
 
@@ -164,11 +164,13 @@ print(sorted(name for name in names if name in sys.modules))
     ("what", "more"),
     [
         ("from mesh.telemetry.serving import Telemetry\nasyncio.run(Telemetry('').__aenter__())", ""),
-        ("import mesh.agent.agent, mesh.agent.runtime", ""),
+        ("import mesh.agent.agent, mesh.agent._runtime", ""),
         ("import mesh.market.provider", ""),
         ("import mesh.cli.provider, mesh.cli.router, mesh.cli.up", ""),
         (
-            "from bridges.serial.process import serve_metrics\nwith serve_metrics(''): import bridges.serial.edge",
+            "from bridges.serial._edge import Edge, EdgeOptions, serve_metrics\n"
+            "edge = Edge(EdgeOptions(agent='0x' + '11' * 20, port='/dev/tty'))\n"
+            "with serve_metrics(edge, ''): pass",
             '"web3", "aiohttp"',
         ),
     ],

@@ -9,14 +9,25 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
-from mesh.background import Background
+from mesh.base.background import Background
 from mesh.chain import Account, DeploymentPlan
-from mesh.devchain.development import deploy_market
-from mesh.devchain.embedded import EmbeddedChain
+from mesh.dev._embedded import EmbeddedChain
+from mesh.dev.development import deploy_market
 from schemas import Offer
 from schemas.keys import ResultKey
 from tests.mesh.validator.courts import FEE, PRICE, Court
-from tests.mesh.validator.lamps import LEVELS, MODEL, OWN, ROBOT, SHIPPED, THIEF, LampRobot, order, signed_by
+from tests.mesh.validator.lamps import (
+    LEVELS,
+    MODEL,
+    OWN,
+    ROBOT,
+    SHIPPED,
+    THIEF,
+    LampRobot,
+    follows_levels,
+    order,
+    signed_by,
+)
 from tests.mesh.validator.tampered_claims import tampered, tamperings
 from tests.mesh.validator.tampering import Others
 from tests.support.market import Founded, Place
@@ -27,7 +38,8 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Self
 
-    from mesh.agent import Agent, Contract
+    from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Contract
     from schemas import Demand, Liability, Verified
     from tests.mesh.validator.lamps import FinishedJob
     from tests.mesh.validator.tampering import Tampering
@@ -85,7 +97,7 @@ class Tamperers:
         self._session = self._stack.enter_context(zenoh.open(client_config(court.place.endpoint)))
         self._jury = await court.jury(0)
         validator = await court.validator(0, self._jury, policies=SHIPPED)
-        validator.check(OWN.name, description=OWN.description)(OWN.function)
+        validator.check(OWN.name, description=OWN.description)(follows_levels)
         await enter(court.place.provider(seconds=SECONDS))
         await enter(validator)
         self.person = await enter(await court.agent("person", MODEL.cid))
@@ -119,7 +131,7 @@ class Tamperers:
 
     async def _liar(self, name: str, key: bytes, price: int) -> Agent:
         """A robot that offers for demands of a price, and leaves the work to others."""
-        agent = await self._court.agent(name, MODEL.cid, account=Account.from_key(key))
+        agent = await self._court.agent(name, MODEL.cid, account=Account(key))
         agent.settings = dataclasses.replace(agent.settings, enable_executor=False)
 
         @agent.on_demand

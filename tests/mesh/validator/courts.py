@@ -6,13 +6,12 @@ import dataclasses
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any, Literal
 
-from mesh.agent import Agent, Job
+from mesh.agent.agent import Agent
 from mesh.chain import Account
 from mesh.validator.validator import Validator
-from mesh.watching.queries import query_all
+from mesh.watching.market import query_all
 from schemas import Result
-from schemas.keys import ValidatorKey
-from schemas.selectors import report_selector
+from schemas.keys import ValidatorKey, report_selector
 from schemas.verdicts import ValidatorAnnouncement, ValidatorReport
 from tests.support.market import MODEL, QUICK_RESEND, Place, offering_unseen
 from tests.support.objectives import objective
@@ -21,7 +20,8 @@ from tests.support.waiting import until_answered, until_found
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.agent import Contract
+    from mesh.agent.contracts import Contract
+    from mesh.agent.handlers import Job
     from mesh.chain import Chain
     from schemas import Liability
 
@@ -45,7 +45,7 @@ class Court:
 
     def account(self, number: int = 0) -> Account:
         """The account of a juror: one of the chain's own, with ETH."""
-        return Account.from_key(self.place.node.funded_keys[4 + number])
+        return Account(self.place.node.funded_keys[4 + number])
 
     async def chain(self, account: Account) -> Chain:
         return await self._stack.enter_async_context(self.place.chain_of(account, self.generation))

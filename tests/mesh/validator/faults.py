@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
-from mesh.clock import SYSTEM_CLOCK
-from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey
+from mesh.base.clock import SYSTEM_CLOCK
+from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
 from schemas.payloads import Payload, PayloadType, decode_value, encode_value
 from tests.mesh.validator.lamps import (
     LEVELS,
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from mesh.agent.handlers import Job
     from mesh.recording import Played
-    from mesh.work.job import Job
     from tests.mesh.validator.lamps import Handler
 
 HOUR: Final = 3600 * 10**9

@@ -51,9 +51,9 @@ from tests.support.waiting import until_found, until_heard
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from mesh.agent.handlers import Job
+    from mesh.agent.jobs import JobRun
     from mesh.recording import Played
-    from mesh.work.job import Job
-    from mesh.work.run import JobRun
 
 
 async def plain(place: Place, name: str) -> FinishedJob:
@@ -180,7 +180,7 @@ async def several_devices(place: Place, name: str) -> FinishedJob:
 
         async def answered(run: JobRun) -> None:
             async def is_recorded() -> bool:  # each command, the lamp's two answers, and the oven's
-                return (await run.sync()).messages == 4 * len(LEVELS)
+                return (await run.sync())[1] == 4 * len(LEVELS)
 
             await until_found(is_recorded, what="all answers")
 

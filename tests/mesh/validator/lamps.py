@@ -8,19 +8,17 @@ import shutil
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 from msgspec import Meta
 
-from mesh.clock import SYSTEM_CLOCK
-from mesh.recording import Recorders, open_objective
-from mesh.settings import Settings
+from mesh.agent.jobs import JobRecordings, JobRun
+from mesh.agent.ledger import Ledger
+from mesh.base.clock import SYSTEM_CLOCK
+from mesh.recording import AtOnce, RecordedTimes, Recorders, open_objective
 from mesh.validator.judging import Case, Judgement, judge
-from mesh.validator.policies import policy_of
-from mesh.validator.policy import OwnPolicy
-from mesh.work import Ledger
-from mesh.work.playbacks import Playbacks
+from mesh.validator.policies import own_policy, policy_of
 from schemas import (
     ZERO_ADDRESS,
     Liability,
@@ -31,8 +29,7 @@ from schemas import (
     encode,
     keccak256,
 )
-from schemas.model import ModelDescription, ModelTopic
-from schemas.value_schema import ValueSchema
+from schemas.model import ModelDescription, ModelTopic, ValueSchema
 from tests.support.objectives import MILLISECOND, timed
 
 if TYPE_CHECKING:
@@ -41,12 +38,10 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.clock import Clock
-    from mesh.recording import Played
-    from mesh.validator.evidence import Evidence
-    from mesh.validator.policy import Policy
-    from mesh.work.job import Job
-    from mesh.work.run import JobRun
+    from mesh.agent.handlers import Job
+    from mesh.base.clock import Clock
+    from mesh.recording import Pace, Played
+    from mesh.validator.policies import Evidence, Policy
 
     Handler = Callable[[Job, Played], Awaitable[object]]
 
@@ -95,7 +90,7 @@ SHIPPED: Final = (
     "schema",
     "rate:topic=/lamp/temperature:min=2.5:max=1000:gap=2s",
 )
-OWN: Final = OwnPolicy("levels", "The lamp shows each level that it was told to.", follows_levels)
+OWN: Final = own_policy("levels", "The lamp shows each level that it was told to.", follows_levels)
 POLICIES: Final[tuple[Policy, ...]] = (*map(policy_of, SHIPPED), OWN)
 
 
@@ -179,7 +174,7 @@ def signed_by(robot: Signer, liability: str, recording: str, *, success: bool = 
 
 
 class LampRobot:
-    """Does jobs as an agent does: with its ledger, playbacks and recorder, on a session with a router."""
+    """Does jobs as an agent does: with its ledger, runs and recorder, on a session with a router."""
 
     def __init__(
         self, session: zenoh.Session, folder: Path, *, robot: Signer = ROBOT, clock: Clock = SYSTEM_CLOCK
@@ -207,13 +202,14 @@ class LampRobot:
         """
         liability, since = liability or contract(name, objective, robot=self._robot), time.time_ns()
         self.folder.mkdir(parents=True, exist_ok=True)
-        settings: Any = Settings(recording_topics=topics, playback=playback)  # type: ignore[arg-type]
+        recorded = frozenset(topics.split(",")) if topics else None
+        pace = AtOnce() if playback == "at-once" else RecordedTimes()
         async with Ledger(self.folder / "ledger.sqlite") as ledger:
             await ledger.add_job(liability)
             recording = None
             while recording is None:
                 with suppress(Crashed, Stopped):
-                    recording = await self._run(ledger, settings, liability, objective, handler)
+                    recording = await self._run(ledger, pace, recorded, liability, objective, handler)
         return FinishedJob(
             liability=liability,
             objective=objective,
@@ -224,37 +220,45 @@ class LampRobot:
         )
 
     async def _run(
-        self, ledger: Ledger, settings: Any, liability: Liability, objective: Path, handler: Handler | None
+        self,
+        ledger: Ledger,
+        pace: Pace,
+        topics: frozenset[str] | None,
+        liability: Liability,
+        objective: Path,
+        handler: Handler | None,
     ) -> Path:
         """One run from the ledger's position. Raises `Crashed` with the files as a killed process leaves them."""
         job = await ledger.job(liability.address)
         assert job is not None
-        playbacks = Playbacks(self._session, self._robot.address, ledger, settings, self.folder / "recordings")
-        playbacks.recorders = Recorders(clock=self._clock)
-        played = await asyncio.to_thread(open_objective, objective)
+        recordings = JobRecordings(self.folder / "recordings", self._robot.address, topics)
+        recordings.recorders = Recorders(clock=self._clock)
+        run = JobRun(
+            self._session,
+            self._robot.address,
+            job,
+            await recordings.open(liability),
+            objective=await asyncio.to_thread(open_objective, objective),
+            pace=pace,
+            recorded=topics,
+        )
+        run.open()
         try:
-            async with asyncio.TaskGroup() as tasks:
-                await playbacks.begin(job, played, play=lambda run: playbacks.play_and_save(run, handler), tasks=tasks)
-        except ExceptionGroup as group:
-            if group.subgroup(Stopped) is not None:
-                await playbacks.suspend(liability.address)
-                raise Stopped from None
-            if group.subgroup(Crashed) is None:
-                raise
-            await self._crash(playbacks, liability.address)
-            raise Crashed from None
-        run = await playbacks.stop(liability.address)
-        assert run is not None
+            await run.play_and_save(handler, ledger)
+        except Stopped:
+            await run.suspend(ledger)
+            raise
+        except Crashed:
+            await self._crash(run)
+            raise
         if self.before_end is not None:
             await self.before_end(run)
         return (await run.close(sync=False)).path
 
-    async def _crash(self, playbacks: Playbacks, address: str) -> None:
+    async def _crash(self, run: JobRun) -> None:
         """Leave the recording as it is on the disk now, without what the recorder would write when it is closed."""
         recordings, aside = self.folder / "recordings", self.folder / "aside"
         shutil.copytree(recordings, aside)
-        run = await playbacks.stop(address)
-        assert run is not None
         await run.close()
         shutil.rmtree(recordings)
         aside.rename(recordings)

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from mesh.evidence import Finding
+from mesh import ConfigurationError
 from mesh.recording import open_objective
 from mesh.validator.judging import judge
-from mesh.validator.policies import POLICIES, policy_of
-from mesh.validator.policy import MOST_OVERDUE, InvalidPolicy, OwnPolicy
+from mesh.validator.policies import MOST_OVERDUE, POLICIES, Evidence, Policy, own_policy, policy_of
+from mesh.validator.verification import Finding
 from schemas.verdicts import MOST_FINDINGS
 from tests.mesh.evidence.jobs import OTHER, THIEF, WORDS, make_job
 from tests.mesh.validator.trials import Trial, failed, liability_of
+from tests.support.raising import raises_with
 from tests.support.waiting import wait_until
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from mesh.validator.evidence import Evidence
 
 
 @pytest.fixture
@@ -74,6 +72,24 @@ def test_an_unreadable_recording_is_a_finding(trial: Trial) -> None:
     assert set(failed(judgement)) == {"complete/readable"}
 
 
+def test_log_times_at_both_ends_of_their_range_are_judged(trial: Trial) -> None:
+    damaged = Path(__file__).parents[1] / "recording" / "damaged"
+    trial.job.result.unlink()
+    shutil.copy(damaged / "huge_time.mcap", trial.job.result)
+    judgement = trial.judge(*POLICIES.values())
+    assert (judgement.success, judgement.is_decided) == (False, True)
+    assert "complete/times" in failed(judgement)
+
+
+def test_a_recording_that_raises_an_error_while_it_is_judged_does_not_count(
+    trial: Trial, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Evidence, "add", lambda *_: 1 // 0)
+    judgement = trial.judge()
+    assert (judgement.success, judgement.is_decided) == (False, True)
+    assert "ZeroDivisionError" in failed(judgement)["complete/readable"]
+
+
 def test_a_command_without_an_answer_in_time_does_not_count(tmp_path: Path) -> None:
     trial = Trial(make_job(tmp_path, topics="/say,/stop"))
     judgement = trial.judge(POLICIES["acknowledged"])
@@ -103,12 +119,12 @@ def test_a_topic_with_the_wrong_rate_does_not_count(trial: Trial, text: str, fou
     ["nonsense", "rate:min=x", "rate:min=2:max=1", "rate:most=1", "rate:gap=5", "complete:a=b", "rate:min=1:min=2"],
 )
 def test_a_policy_that_can_not_be_read_is_refused(text: str) -> None:
-    with pytest.raises(InvalidPolicy):
+    with raises_with(ConfigurationError, code="invalid-policy"):
         policy_of(text)
 
 
-def own(function: Any) -> OwnPolicy:
-    return OwnPolicy("own", "All words are said.", function)
+def own(function: Any) -> Policy:
+    return own_policy("own", "All words are said.", function)
 
 
 def says_all(evidence: Evidence) -> bool:
@@ -148,7 +164,7 @@ def test_a_function_of_a_user_is_a_policy(trial: Trial, function: Any, expected:
 def test_messages_beyond_the_memory_for_own_policies_are_read_again(
     trial: Trial, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mesh.validator.evidence.MOST_KEPT", 1000)
+    monkeypatch.setattr("mesh.validator.policies.MOST_KEPT", 1000)
     assert trial.judge(own(says_all)).success
 
 
@@ -164,14 +180,14 @@ def test_files_beyond_the_limits_do_not_count(trial: Trial) -> None:
         until_ns=1 << 63,
         owner_of=lambda mark: "",
     )
-    files = {"objective": trial.job.objective, "recording": trial.job.result}
+    files: dict[str, Any] = {"objective": trial.job.objective, "recording": trial.job.result}
     judgement = judge(case, **files, policies=(), limits=Limits(messages=5))
     assert set(failed(judgement)) == {"complete/readable"}
 
 
 def test_a_check_that_takes_too_long_decides_nothing(trial: Trial) -> None:
     end = threading.Event()
-    overdue = OwnPolicy("own", "It ends.", lambda evidence: end.wait(), 0.05)
+    overdue = own_policy("own", "It ends.", lambda evidence: end.wait(), 0.05)
     try:
         judgement = trial.judge(overdue)
         # What fails for another reason fails all the same.
@@ -186,7 +202,7 @@ def test_a_check_that_takes_too_long_decides_nothing(trial: Trial) -> None:
 
 def test_checks_that_never_end_are_bounded(trial: Trial) -> None:
     end = threading.Event()
-    stuck = OwnPolicy("own", "It ends.", lambda evidence: end.wait(), 0.02)
+    stuck = own_policy("own", "It ends.", lambda evidence: end.wait(), 0.02)
     try:
         details = [trial.judge(stuck).findings[-1].detail for _ in range(MOST_OVERDUE + 1)]
         assert len(checking()) == MOST_OVERDUE
@@ -204,5 +220,5 @@ def checking() -> list[threading.Thread]:
 
 @pytest.mark.parametrize("timeout", [0, -1, float("nan"), float("inf")])
 def test_the_time_of_a_check_is_a_positive_number(timeout: float) -> None:
-    with pytest.raises(InvalidPolicy):
-        OwnPolicy("own", "It ends.", says_all, timeout)
+    with raises_with(ConfigurationError, code="invalid-policy"):
+        own_policy("own", "It ends.", says_all, timeout)

@@ -6,16 +6,17 @@ import asyncio
 import threading
 from typing import TYPE_CHECKING
 
-import pytest
-
-from mesh.validator.components import NotAJuror, NotAValidator
+from mesh import ChainError
 from schemas import Result, verify
 from tests.mesh.validator.courts import PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
 from tests.support.log_events import logged_facts
 from tests.support.objectives import objective
+from tests.support.raising import raises_with
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    import pytest
+
     from mesh import Evidence
     from tests.support.market import Place
 
@@ -154,11 +155,11 @@ async def test_a_validator_that_stops_while_it_judges_judges_again(place: Place)
 
 async def test_what_is_no_validator_of_this_account_is_refused_at_the_start(place: Place) -> None:
     async with Court(place, 5) as court:
-        for contract, error in (
-            (await court.jury(1), NotAJuror),
-            (place.market.deployment.lighthouse, NotAValidator),
-            (place.address("robot"), NotAValidator),
+        for contract, code in (
+            (await court.jury(1), "not-a-juror"),
+            (place.market.deployment.lighthouse, "not-a-validator"),
+            (place.address("robot"), "not-a-validator"),
         ):
-            with pytest.raises(error):
+            with raises_with(ChainError, code=code):
                 async with await court.validator(0, contract):
                     pass

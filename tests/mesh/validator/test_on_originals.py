@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final, Literal
 import pytest
 
 from mesh.chain import XRT, Account, Node
-from mesh.devchain import EmbeddedChain
-from mesh.devchain.development import ROLES, DevelopmentMarket
+from mesh.dev import EmbeddedChain
+from mesh.dev.development import ROLES, DevelopmentMarket
 from tests.mesh.validator.courts import FEE, PRICE, Court, claim, liar, reports_on
 from tests.support.log_events import logged_facts
 from tests.support.market import QUICK, Founded, Place
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from mesh.agent import Agent, Contract
+    from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Contract
     from mesh.validator.validator import Validator
     from tests.support.routers import EmbeddedRouter
 
@@ -34,7 +35,7 @@ pytestmark = NEEDS_ORIGINALS
 
 async def found(node: EmbeddedChain, generation: Literal[3, 5]) -> Founded:
     """The original contracts with a market on them."""
-    accounts = dict(zip(ROLES, map(Account.from_key, node.funded_keys), strict=False))
+    accounts = dict(zip(ROLES, map(Account, node.funded_keys), strict=False))
     async with Node(node.provider, timing=QUICK) as open_node:
         originals = Originals(open_node, accounts["provider"], generation)
         await originals.deploy(timeout_blocks=TIMEOUT)

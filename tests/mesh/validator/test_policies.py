@@ -7,19 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh import ConfigurationError
 from mesh.recording import Played
 from mesh.settings import Settings
-from mesh.validator.evidence import Evidence, JudgedMessage
-from mesh.validator.policies import POLICIES, policy_of
-from mesh.validator.policy import InvalidPolicy
+from mesh.validator.policies import POLICIES, Evidence, JudgedMessage, policy_of
 from mesh.validator.validator import Validator
-from schemas.model import ModelDescription, ModelTopic
+from schemas.model import ModelDescription, ModelTopic, ValueSchema
 from schemas.payloads import PayloadType, encode_value
-from schemas.value_schema import ValueSchema
 from tests.mesh.work.samples import liability
+from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
-    from mesh.validator.policy import Policy
+    from mesh.validator.policies import Policy
 
 COMMAND, ANSWER, OTHER = ("/do", "objective"), ("/done", "device"), ("/else", "device")
 PAIRED = policy_of("acknowledged:command=/do:answer=/done")
@@ -171,10 +170,10 @@ def test_a_validator_has_a_policy_several_times_with_other_options_only() -> Non
     several = ["rate:topic=/imu:min=50", "rate:topic=/gps:min=1"]
     validator = Validator(settings=Settings(), policies=several)
     assert [policy.name for policy in validator.policies] == ["complete", "rate", "rate"]
-    with pytest.raises(InvalidPolicy):
+    with raises_with(ConfigurationError, code="invalid-policy"):
         Validator(settings=Settings(), policies=[*several, several[0]])
     for name in ("rate", "complete"):
-        with pytest.raises(InvalidPolicy):
+        with raises_with(ConfigurationError, code="invalid-policy"):
             validator.check(name, description="Mine.")(lambda evidence: True)
 
 

@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh import ConfigurationError
 from mesh.chain import XRT
-from mesh.validator.publishing import REFRESH, Announcements
+from mesh.validator._runtime import REFRESH, Announcements
 from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
 from tests.support.log_events import logged_facts
 from tests.support.objectives import objective
+from tests.support.raising import raises_with
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from mesh.validator.evidence import Evidence
+    from mesh.validator.policies import Evidence
     from tests.support.market import Place
 
 
@@ -130,6 +132,7 @@ async def test_a_liability_that_pays_too_little_is_refunded(place: Place) -> Non
 async def test_a_validator_that_comes_late_judges_what_it_missed(place: Place) -> None:
     async with Court(place) as court:
         validator, robot = await court.validator(), await court.robot()
+        await (await court.chain(court.account())).validators.introduce()
         async with court.at_work(robot) as person:
             contract = await court.demand(person, court.account().address)
             await asyncio.sleep(0.3)
@@ -165,14 +168,13 @@ async def test_it_shows_its_status_and_metrics(place: Place) -> None:
             await until(lambda: validator.runtime.judge.verdicts["success"])
             names = {family.name for family in await validator.runtime.measure()}
             assert {"aira_validator_cases", "aira_verdicts_total", "aira_account_eth_wei"} <= names
-            assert set(validator.runtime.health().values()) == {"alive"}
+            assert set(validator.runtime.status.health().values()) == {"alive"}
 
 
 @pytest.mark.parametrize("name", ["nonsense", "rate:min=-1"])
 def test_unknown_policies_are_refused(name: str) -> None:
     from mesh.settings import Settings
-    from mesh.validator.policy import InvalidPolicy
     from mesh.validator.validator import Validator
 
-    with pytest.raises(InvalidPolicy):
+    with raises_with(ConfigurationError, code="invalid-policy"):
         Validator(settings=Settings(validator_policies=(name,)))

@@ -12,7 +12,7 @@ from tests.mesh.evidence.jobs import OTHER, JobFiles
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mesh.validator.policy import Policy
+    from mesh.validator.policies import Policy
 
 ALWAYS = (0, 1 << 63)
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.identity import Member
 from mesh.network import Channel, Network, Services
+from mesh.ops.identity import Member
 from mesh.watching import MarketWatch, PresentPeer, present, status_of
 from tests.mesh.watching.test_market import EVENT, JOB
 from tests.mesh.watching.test_presence import QUICK, status

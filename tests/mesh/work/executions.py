@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 from mesh.recording import open_objective
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent, Contract
+    from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Contract
+    from mesh.agent.handlers import Job
     from mesh.recording import Objective
-    from mesh.work.job import Job
 
 COST = 1000
 """What a job pays here, wn."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.work import Ledger
+from mesh.agent.ledger import Ledger
 from schemas import cid_of_bytes
 
 if TYPE_CHECKING:

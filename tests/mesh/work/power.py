@@ -9,7 +9,7 @@ import sys
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, Literal
 
-from mesh.devchain import JsonRpcServer
+from mesh.dev import JsonRpcServer
 from tests.support.market import MODEL
 
 if TYPE_CHECKING:
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 SECONDS = 60.0
 ROBOT = """
 import asyncio, json, os, signal, sys
-from mesh.agent import Agent
+from mesh.agent.agent import Agent
 from mesh.chain import Account
 from mesh.settings import Settings
-from mesh.work import Ledger
+from mesh.agent.ledger import Ledger
 
 given = json.load(sys.stdin)
 fsync, set_position = os.fsync, Ledger.set_position
@@ -41,7 +41,7 @@ async def last_set_position(ledger, liability, position, *more, **named):
         os.kill(os.getpid(), signal.SIGKILL)
 
 os.fsync, Ledger.set_position = noted_fsync, last_set_position
-account = Account.from_key(bytes.fromhex(given["key"]))
+account = Account(bytes.fromhex(given["key"]))
 robot = Agent(given["model"], settings=Settings(**given["settings"]), account=account)
 
 @robot.on_demand

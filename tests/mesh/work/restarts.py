@@ -13,8 +13,9 @@ from tests.support.objectives import objective
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.agent import Agent, Contract
-    from mesh.work.job import Job
+    from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Contract
+    from mesh.agent.handlers import Job
     from tests.support.market import Place
 
 COST = 1000

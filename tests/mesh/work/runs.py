@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 import zenoh
 
+from mesh.agent.jobs import JobRun
 from mesh.recording import AtOnce, RecordedTimes, Recorder, RecorderSettings, RecordingAbout, open_objective
-from mesh.work.run import JobRun
-from tests.mesh.work.samples import liability
+from tests.mesh.work.samples import job
 from tests.support.routers import EmbeddedRouter, client_config
 
 if TYPE_CHECKING:
@@ -54,11 +55,10 @@ class Making:
         return JobRun(
             self.session,
             AGENT,
-            liability(),
+            msgspec.structs.replace(job(), position=position),
             Recorder(self.path, RecordingAbout(), settings=RecorderSettings(queue_bytes=queue_bytes)),
             objective=played,
             pace=pace,
-            position=position,
             recorded=topics,
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mesh.work import JobRecord, Outgoing, Phase
+from mesh.agent.ledger import JobRecord, Outgoing, Phase
 from schemas import ZERO_ADDRESS, Liability, checksum_address, cid_of_bytes, keccak256
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mesh.work import Ledger, Phase
-from mesh.work.outbox import outgoing
+from mesh.agent._outbox import outgoing
+from mesh.agent.ledger import Ledger, Phase
 from tests.mesh.work.samples import liability
 from tests.support.orders import demand
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from mesh.agent import Phase
+from mesh.agent.ledger import Phase
 from schemas import Empty, String, cid_of_file
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
 from tests.support.market import Place, offering
@@ -13,8 +13,8 @@ from tests.support.objectives import MILLISECOND, objective, timed
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    from mesh.agent.handlers import Job
     from mesh.recording import Played
-    from mesh.work.job import Job
     from schemas import Liability
 
 

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from mesh.agent import JobFailed, Phase
+from mesh.agent.handlers import JobFailed
+from mesh.agent.ledger import Phase
 from mesh.recording import NOTE_TOPIC
-from mesh.running import cause_of
-from mesh.work.database import LedgerUnusable
+from mesh.role.database import LedgerUnusable
+from mesh.role.running import cause_of
 from schemas import Empty, String, cid_of_bytes
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
 from tests.support.market import Place, offering, offering_unseen
@@ -24,9 +25,9 @@ from tests.support.objectives import objective
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.agent import Agent
+    from mesh.agent.agent import Agent
+    from mesh.agent.handlers import Job
     from mesh.recording import Objective
-    from mesh.work.job import Job
 
 
 class Speed(msgspec.Struct):
@@ -160,7 +161,7 @@ async def test_a_job_failed_by_its_handler_is_logged_without_a_traceback(
     async def go(job: Job, message: Any) -> None:
         raise JobFailed("the battery is empty")
 
-    with caplog.at_level(logging.WARNING, "mesh.work"):
+    with caplog.at_level(logging.WARNING, "mesh.agent"):
         async with place.at_work(robot) as person:
             await (await person.demand(place.save(objective(("/go", Empty()))))).outcome()
     (record,) = [record for record in caplog.records if vars(record).get("event") == "job-failed"]

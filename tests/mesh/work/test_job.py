@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh import AiraError
+from mesh.agent.handlers import WAITING, Job
+from mesh.agent.jobs import QUEUED
 from mesh.errors import ClosedError, InvalidKey
 from mesh.recording import NOTE_TOPIC, RecordedTimes
-from mesh.work.job import HandlerCancelled, Job
-from mesh.work.listening import WAITING
-from mesh.work.run import QUEUED
 from schemas import InvalidPayload, LiabilityTopicKey, String
 from tests.mesh.work.runs import AGENT, Making, making, session
 from tests.support.objectives import objective
+from tests.support.raising import raises_with
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ async def test_a_handler_that_ends_cancelled_fails_without_cancelling_the_playba
         future.cancel()
         await future
 
-    with pytest.raises(HandlerCancelled):
+    with raises_with(AiraError, code="handler-cancelled"):
         await run.play(wait_for_what_is_cancelled)
     await run.close()
 
@@ -208,9 +209,10 @@ async def test_a_handler_hears_what_comes_on_a_topic_until_the_job_ends(making: 
         assert await asyncio.wait_for(anext(heard), 30) == {"to": 1}
 
     await run.play(answer)
+    run.publish("/answers", None)
     run.publish("/answers", "the last")
     await run.close()
-    assert [message async for message in heard] == [String("the last")]
+    assert [message async for message in heard] == [None, "the last"]
     with pytest.raises(ClosedError):
         run.listen("/answers")
 

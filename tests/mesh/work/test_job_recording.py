@@ -9,9 +9,9 @@ import msgspec
 import pytest
 import zenoh
 
+from mesh.agent.jobs import FLUSH
 from mesh.recording import NOTE_TOPIC, json_type, open_objective
-from mesh.recording.partial import PartialFile
-from mesh.work.run import FLUSH, SyncedRun
+from mesh.recording._recorder import PartialFile
 from schemas import Empty, String
 from tests.mesh.work.runs import AGENT, Making, making, session
 from tests.mesh.work.samples import liability
@@ -23,8 +23,8 @@ from tests.support.waiting import until, until_heard
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from mesh.agent.handlers import Job
     from mesh.recording import Played
-    from mesh.work.job import Job
 
 __all__ = ["making", "session"]
 
@@ -101,7 +101,7 @@ async def test_playing_waits_for_a_slow_disk_and_loses_nothing(making: Making, m
 async def test_a_sync_has_what_was_handled_and_what_the_handlers_published(making: Making) -> None:
     run = making.run(objective(*(("/say", str(number)) for number in range(100))))
     run.open()
-    synced: list[SyncedRun] = []
+    synced: list[tuple[int, int]] = []
 
     async def say(job: Job, message: Played) -> None:
         job.publish("/said", message.payload)

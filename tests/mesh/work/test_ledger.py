@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from mesh.work import Ledger, Phase
-from mesh.work.ledger import NAMES_AT_ONCE
-from mesh.work.outbox import outgoing
+from mesh.agent._outbox import outgoing
+from mesh.agent.ledger import Ledger, Phase
 from tests.mesh.work.ledgers import RESULT, ledger, path
 from tests.mesh.work.samples import liability, message
 from tests.support.orders import PERSON, ROBOT, STRANGER, demand, offer, withdrawal
@@ -45,9 +44,8 @@ async def test_the_promisees_of_the_latest_jobs_are_listed(ledger: Ledger) -> No
 
 async def test_many_names_are_looked_up(ledger: Ledger) -> None:
     await ledger.add_job(liability())
-    assert await ledger.holds([str(number) for number in range(NAMES_AT_ONCE)] + [liability().address]) == {
-        liability().address
-    }
+    names = [*map(str, range(40_000)), liability().address]
+    assert await ledger.holds(names) == {liability().address}
 
 
 async def test_unknown_jobs_are_none(ledger: Ledger) -> None:
@@ -229,7 +227,7 @@ async def test_a_withdrawn_order_is_replaced_by_its_withdrawal_until_its_deadlin
     async with Ledger(path) as ledger:
         for order in (one, other):
             await ledger.post(order)
-        await ledger.withdraw(one.identity, withdrawn)
+        await ledger.withdraw({one.identity: withdrawn})
     async with Ledger(path) as ledger:
         assert await ledger.outbox(head=49) == [other, withdrawn]
         found = [(order.identity, order.is_withdrawn) for order in await ledger.orders()]
@@ -242,7 +240,7 @@ async def test_a_withdrawn_order_that_becomes_a_contract_stays_withdrawn_after_a
     signed = demand()
     order, withdrawn = outgoing(signed), outgoing(withdrawal(signed))
     await ledger.post(order)
-    await ledger.withdraw(order.identity, withdrawn)
+    await ledger.withdraw({order.identity: withdrawn})
     await ledger.spend(order.identity, "0xA")
     assert await ledger.orders() == []
     assert await ledger.spent("0xA") == [order]
@@ -255,7 +253,7 @@ async def test_the_contract_of_a_withdrawn_order_is_listed_like_others(ledger: L
     signed, kept = demand(), demand()
     for order in (outgoing(signed), outgoing(kept)):
         await ledger.post(order)
-    await ledger.withdraw(outgoing(signed).identity, outgoing(withdrawal(signed)))
+    await ledger.withdraw({outgoing(signed).identity: outgoing(withdrawal(signed))})
     assert await ledger.contracts("demand") == []
     for order, address in ((outgoing(kept), "0x" + "1" * 40), (outgoing(signed), "0x" + "2" * 40)):
         await ledger.spend(order.identity, address)
@@ -266,7 +264,7 @@ async def test_an_order_withdrawn_on_the_chain_can_not_become_a_contract(ledger:
     signed = demand()
     order, withdrawn = outgoing(signed), outgoing(withdrawal(signed))
     await ledger.post(order)
-    await ledger.withdraw(order.identity, withdrawn)
+    await ledger.withdraw({order.identity: withdrawn})
     await ledger.use_up(order.identity, "0x" + "a" * 64)
     assert await ledger.orders() == []
     assert await ledger.contracts("demand") == []
@@ -288,7 +286,7 @@ async def test_an_expired_order_is_known_while_a_reorganisation_may_bring_its_co
     async with Ledger(path, reorg_depth=12) as ledger:
         await ledger.post(order)
         if is_withdrawn:
-            await ledger.withdraw(order.identity, outgoing(withdrawal(signed)))
+            await ledger.withdraw({order.identity: outgoing(withdrawal(signed))})
         await ledger.spend(order.identity, "the contract")
         await ledger.unspend("the contract")
         assert await ledger.outbox(head=61) == []

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mesh.work import Phase, WrongPhase
-from mesh.work.phases import NEXT, UNFINISHED, advance
+from mesh.agent.ledger import NEXT, UNFINISHED, Phase, WrongPhase, advance
 
 LIABILITY = "0x" + "12" * 20
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.work.models import ABSENT, Models
+from mesh.role.models import ABSENT, Models
 from schemas import cid_of_bytes
 from schemas.model import MAX_MODEL_SIZE, InvalidDescription, ModelDescription
 from tests.support.clocks import SECOND, SetClock

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.agent.handlers import TopicHandlers
+from mesh.agent.objectives import Objectives, ObjectiveUnfit
 from mesh.content import ContentUnavailable
 from mesh.errors import InputError
-from mesh.work.objectives import Objectives, ObjectiveUnfit
-from mesh.work.topic_handlers import TopicHandlers
 from schemas import Empty, cid_of_bytes
 from tests.support.objectives import objective
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.agent.components import AgentComponents
-    from mesh.work.job import Job
+    from mesh.agent.handlers import Job
     from tests.support.market import Place
 
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.background import Background
+from mesh.agent._outbox import Outbox, outgoing, outgoing_identity
+from mesh.agent.ledger import Ledger
+from mesh.base.background import Background
+from mesh.base.retry import RetryPolicy
 from mesh.network import Channel, Endpoints, Network
-from mesh.retry import RetryPolicy
-from mesh.work import Ledger
-from mesh.work.outbox import Outbox, outgoing, outgoing_identity
 from schemas import decode, encode, message_hash
 from tests.support.orders import LIGHTHOUSE, MARKET, demand, offer, result
 from tests.support.waiting import until, until_found, until_heard

@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from mesh.evidence import Claim, verify
 from mesh.recording import open_objective
-from mesh.work.run import RecordingIncomplete
+from mesh.validator.verification import Claim, verify
 from schemas import String
 from tests.mesh.work.power import powered_robot
 from tests.mesh.work.restarts import COST, WORDS, Paying, paid, speaking, words
@@ -61,5 +60,5 @@ async def test_a_job_whose_recording_lost_what_was_played_is_no_success(
             job = await robot.parts.ledger.job(contract.address)
     assert job is not None
     assert job.success is False
-    assert {"code": RecordingIncomplete.code} in logged_facts(caplog, "job-failed")
+    assert {"code": "recording-incomplete"} in logged_facts(caplog, "job-failed")
     assert not await paid.once()

@@ -7,9 +7,9 @@ import sqlite3
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
-from mesh.agent import Agent, Phase
+from mesh.agent.agent import Agent
+from mesh.agent.ledger import Ledger, Phase
 from mesh.recording import open_objective
-from mesh.work import Ledger
 from schemas import String, cid_of_file
 from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
 from tests.support.market import in_phase, offering, offering_unseen
@@ -19,8 +19,8 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from mesh.agent import Contract
-    from mesh.work.job import Job
+    from mesh.agent.contracts import Contract
+    from mesh.agent.handlers import Job
     from schemas import Liability
     from tests.support.market import Place
 
@@ -129,10 +129,10 @@ async def test_a_liability_that_ended_before_the_agent_read_it_is_not_a_job(plac
 async def created_again(robot: Agent, contract: Contract) -> None:
     """Revert a contract and create it again, as when the same transaction is mined in another block."""
     hashes = (await robot.parts.chain.liabilities.get_with_orders(contract.address))[1]
-    await robot.runtime.listener.liability_reverted(contract.address)
+    await robot.runtime.liability_reverted(contract.address)
     assert await robot.parts.ledger.job(contract.address) is None
     assert "result" not in [waiting.kind for waiting in await robot.parts.ledger.outbox(head=0)]
-    await robot.runtime.listener.new_liability(contract.liability, demand_hash=hashes[0], offer_hash=hashes[1])
+    await robot.runtime.new_liability(contract.liability, demand_hash=hashes[0], offer_hash=hashes[1])
 
 
 async def test_a_job_that_was_set_aside_continues_where_it_was(place: Place, paid: Paying) -> None:
@@ -167,7 +167,7 @@ async def test_a_job_may_be_set_aside_while_its_objective_is_fetched(place: Plac
         path = words(place)
         contract = await person.demand(cid_of_file(path))
         await in_phase(robot, contract, Phase.INCOMING)
-        await robot.runtime.listener.liability_reverted(contract.address)
+        await robot.runtime.liability_reverted(contract.address)
         await asyncio.to_thread(person.parts.store.put_file, path)
         await until_found(lambda: held(robot, contract), what="the objective")
         await created_again(robot, contract)
@@ -194,8 +194,8 @@ async def test_a_finished_job_that_was_set_aside_sends_its_result_again(place: P
 async def test_a_restarted_development_chain_has_a_ledger_of_its_own(place: Place) -> None:
     """A development chain gives the same addresses to other contracts: an old job there must not hide a new one."""
     from mesh.chain import Chain
-    from mesh.devchain import EmbeddedChain
-    from mesh.devchain.development import deploy_market
+    from mesh.dev import EmbeddedChain
+    from mesh.dev.development import deploy_market
 
     async with place.agent("robot") as robot:
         here = robot.parts.directory

@@ -1,5 +1,6 @@
 // Requests to the server. What changes something is a POST with a header that no other site can send.
 
+import { parseExact } from "./numbers";
 import { texts } from "./texts";
 
 /** An answer with an error: `code` is one of docs/codes.md, `hint` says what to do. */
@@ -15,6 +16,11 @@ export class ApiError extends Error {
 
 export async function get<T>(path: string, signal?: AbortSignal): Promise<T> {
   return (await request(path, { signal })).json();
+}
+
+/** The same, with integers that a number can't hold as bigint. */
+export async function getExact<T>(path: string, signal?: AbortSignal): Promise<T> {
+  return parseExact(await (await request(path, { signal })).text());
 }
 
 export async function post<T>(path: string, body: unknown): Promise<T> {

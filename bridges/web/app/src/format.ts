@@ -1,6 +1,7 @@
 // Numbers, times and the texts of strangers, for people.
 
-import { formatUnits, parseUnits } from "viem";
+import { formatUnits } from "viem";
+import { encodeJson } from "./numbers";
 import type { Token } from "./types";
 
 /** Controls, and the signs that turn or hide letters: a stranger's text must not change what stands around it. */
@@ -21,14 +22,6 @@ export function ether(wei: string | bigint): string {
   if (BigInt(wei) > 0n && BigInt(wei) < 10n ** 14n) return `${Number(formatUnits(BigInt(wei), 9)).toLocaleString("en", { maximumSignificantDigits: 3 })} gwei`;
   const [whole, part = ""] = formatUnits(BigInt(wei), 18).split(".");
   return `${grouped(part ? `${whole}.${part.slice(0, 5)}` : whole)} ETH`;
-}
-
-/** The units that a person's number means; null if it is none, negative or finer than the token. */
-export function parseAmount(text: string, decimals: number): bigint | null {
-  const number = text.trim().replace(",", ".");
-  if (!/^\d{1,60}(\.\d{1,36})?$/.test(number)) return null;
-  if ((number.split(".")[1] ?? "").replace(/0+$/, "").length > decimals) return null;
-  return parseUnits(number, decimals);
 }
 
 export function grouped(number: string): string {
@@ -64,5 +57,5 @@ export function clock(at: number): string {
 
 /** A decoded value in one line. */
 export function shown(value: unknown): string {
-  return plain(typeof value === "string" ? value : JSON.stringify(value) ?? "", 600);
+  return plain(typeof value === "string" ? value : encodeJson(value) ?? "", 600);
 }

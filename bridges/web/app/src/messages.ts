@@ -3,6 +3,7 @@
 import { bytesToHex, encodeAbiParameters, encodePacked, keccak256, recoverMessageAddress, toBytes, toHex } from "viem";
 import type { Address, Hex } from "viem";
 import { parseCid } from "./cid";
+import { encodeJson } from "./numbers";
 
 interface Terms {
   model: string;
@@ -88,10 +89,7 @@ export function canonicalSignature(signature: string): string {
 
 /** A signed message as it travels. Integers are written without quotes, as long as they are. */
 export function encodeWire(fields: Record<string, unknown>): string {
-  const texts = Object.entries(fields)
-    .filter(([, value]) => value !== undefined)
-    .map(([name, value]) => `${JSON.stringify(name)}:${typeof value === "bigint" ? value : JSON.stringify(value)}`);
-  return `{${texts.join(",")}}`;
+  return encodeJson(fields);
 }
 
 /** A nonce of generation 3: 32 random bytes whose first is not zero, so that no contract takes it for a sender. */

@@ -2,48 +2,95 @@
 
 import { zeroAddress } from "viem";
 import type { Address, Hex } from "viem";
-import { ApiError, get, post, postText } from "./api";
+import { ApiError, get, getExact, post, postText, query } from "./api";
 import type { Account } from "./app";
 import { canonicalSignature, encodeWire, orderHash, randomNonce, signerOf, withdrawalHash } from "./messages";
 import type { Demand } from "./messages";
 import { texts } from "./texts";
 import { ServerLies, checkAsked, checkOrder, ownOrders, rememberOrder } from "./trust";
-import type { AccountState, Market, Order, PostedOrder } from "./types";
+import type { AccountState, Market, Message, Model, Objective, Order, PostedOrder } from "./types";
 import { personalSign } from "./wallet";
 
-export interface Draft {
-  model: string;
-  objective: string;
+/** What a person has asked for, as the fields of the page have it. What is signed is made from it, and from nothing else. */
+export interface Wish {
+  model: Model;
+  objective: () => Promise<Objective>;
   cost: bigint;
   validator: Address;
   validatorFee: bigint;
+  /** How long it waits for a robot. */
+  minutes: number;
+  /** Throws if the validator does not judge for this fee any more. */
+  confirm?: () => Promise<void>;
+}
+
+export interface Draft extends Omit<Wish, "model" | "objective" | "confirm" | "minutes"> {
+  model: string;
+  objective: string;
   lifetime: number;
 }
 
-/** The demand that a wallet is to sign, with a deadline and a nonce of now. */
-export async function prepare(draft: Draft, account: Address): Promise<{ demand: Demand; hash: Hex }> {
-  const [market, state] = await Promise.all([get<Market>("market"), get<AccountState>(`accounts/${account}`)]);
+export const USUAL_MINUTES = 10;
+
+/** For how many blocks an order is valid that waits so long. */
+export function blocksOf(minutes: number, market: Market): number {
+  if (minutes === USUAL_MINUTES) return market.defaultLifetime;
+  return Math.max(2, Math.round((minutes * 60) / Math.max(market.blockTime, 0.1)));
+}
+
+/** An order that is ready to be looked at: all that is shown of it and signed. */
+export interface Prepared {
+  wish: Wish;
+  account: Account;
+  market: Market;
+  objective: Objective;
+  messages: Message[];
+  draft: Draft;
+  /** What a wallet signs, with a deadline and a nonce of now; the server's account has its own. */
+  demand?: Demand;
+  hash?: Hex;
+}
+
+const SHOWN = 50;
+
+/** What orders of this market depend on: an order that was made for other contracts is not signed. */
+export function contractsOf(market: Market): string {
+  return [market.chainId, market.factory, market.lighthouse.address, market.token.address, market.token.decimals, market.xrt.address].join();
+}
+
+/** Makes the objective, and the order that names it. */
+export async function prepare(wish: Wish, account: Account, shown: Market): Promise<Prepared> {
+  const [objective, market, state] = await Promise.all([wish.objective(), get<Market>("market"), get<AccountState>(`accounts/${account.address}`), wish.confirm?.()]);
+  if (contractsOf(market) !== contractsOf(shown)) throw new Error(texts.changedLookAgain);
+  const isFile = objective.cid !== wish.model.cid && objective.summary.messages > 0;
+  const { messages } = isFile ? await getExact<{ messages: Message[] }>(`files/${objective.cid}/messages${query({ limit: SHOWN })}`) : { messages: [] };
+  const { cost, validator, validatorFee } = wish;
+  const lifetime = blocksOf(wish.minutes, market);
+  const draft = { model: wish.model.cid, objective: objective.cid, cost, validator, validatorFee, lifetime };
+  const prepared = { wish, account, market: shown, objective, messages, draft };
+  if (account.kind === "local") return prepared;
   const demand: Demand = {
     model: draft.model,
     objective: draft.objective,
     token: market.token.address,
-    cost: draft.cost,
+    cost,
     lighthouse: market.lighthouse.address,
-    validator: draft.validator,
-    validatorFee: draft.validatorFee,
-    deadline: BigInt(market.block + draft.lifetime),
+    validator,
+    validatorFee,
+    deadline: BigInt(market.block + lifetime),
     nonce: state.nonce === null ? randomNonce() : BigInt(state.nonce),
-    sender: state.nonce === null ? undefined : account,
+    sender: state.nonce === null ? undefined : account.address,
   };
-  return { demand, hash: orderHash(demand) };
+  return { ...prepared, demand, hash: orderHash(demand) };
 }
 
-/** Signs the hash of exactly these fields, and publishes the demand. Returns its hash. */
-export async function signAndPost(demand: Demand, shown: Hex, account: Account): Promise<string> {
+/** Signs the hash of exactly these fields, and publishes the demand if it is still wanted then. Returns its hash. */
+export async function signAndPost(demand: Demand, shown: Hex, account: Account, isWanted: () => boolean): Promise<string> {
   if (account.kind !== "wallet") throw new Error(texts.needsWallet);
   const hash = orderHash(demand);
   if (hash !== shown) throw new ServerLies(texts.lieHash);
   const signature = canonicalSignature(await personalSign(account.wallet.provider, hash, account.address));
+  if (!isWanted()) throw new Error(texts.changedLookAgain);
   if ((await signerOf(hash, signature)) !== account.address) throw new Error(texts.otherAccountSigned);
   const wire = encodeWire({ ...demand, signature });
   const own = hash.slice(2);

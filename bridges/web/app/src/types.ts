@@ -268,6 +268,7 @@ export interface Job {
   demandHash: string | null;
   offerHash: string | null;
   refundableFrom: number | null;
+  owed: string;
   timeline: Step[];
   resultMessage: { liability: Address; result: string; success: boolean; signature: string; signer: Address } | null;
   reason: { code: string; text: string } | null;

@@ -1,10 +1,12 @@
 // The pieces that pages are made of.
 
-import type { ComponentChildren } from "preact";
+import { cloneElement, toChildArray } from "preact";
+import type { ComponentChildren, VNode } from "preact";
 import { useEffect, useId, useRef, useState } from "preact/hooks";
 import { useApp, wordsOf } from "./app";
 import type { Loaded } from "./app";
 import { amount, plain, short } from "./format";
+import { decimalText, parseDecimal } from "./numbers";
 import { texts } from "./texts";
 import type { Token } from "./types";
 
@@ -83,6 +85,19 @@ export function Field(props: { label: ComponentChildren; hint?: ComponentChildre
   );
 }
 
+/** A field for a number: it keeps the text as it is typed, and says what it means where that is not plain. */
+export function NumberField(props: { label: ComponentChildren; text: string; change: (text: string) => void; error?: string; hint?: ComponentChildren; class?: string; signed?: boolean }) {
+  const number = /[^\d.\s-]/.test(props.text) && !props.error ? parseDecimal(props.text) : null;
+  return (
+    <Field label={props.label} error={props.error} hint={number ? `= ${decimalText(number)}` : props.hint}>
+      {(id, described) => (
+        <input id={id} aria-describedby={described} aria-invalid={Boolean(props.error)} class={props.class} inputMode={props.signed ? undefined : "decimal"} autocomplete="off" spellcheck={false}
+          value={props.text} onInput={(event) => props.change(event.currentTarget.value)} />
+      )}
+    </Field>
+  );
+}
+
 /** What was loaded, or why not. */
 export function Show<T>(props: { of: Loaded<T>; children: (data: T) => ComponentChildren }) {
   const { data, error, loading, reload } = props.of;
@@ -107,20 +122,26 @@ export function Problem(props: { error: unknown; retry?: () => void }) {
   );
 }
 
-export function Table(props: { label: string; head: string[]; numbers?: number[]; children: ComponentChildren; empty?: string }) {
-  const rows = Array.isArray(props.children) ? props.children.flat().filter(Boolean).length : props.children ? 1 : 0;
-  if (!rows && props.empty) return <p class="quiet">{props.empty}</p>;
+type Row = VNode<{ children: ComponentChildren }>;
+
+/** A table of `tr` with `td`; on a phone a row is lines of cells, each with the title of its column. */
+export function Table(props: { label: string; head: string[]; numbers?: number[]; children: Row[]; empty?: string }) {
+  if (!props.children.length && props.empty) return <p class="quiet">{props.empty}</p>;
   return (
     <div class="scroll" tabIndex={0} role="region" aria-label={props.label}>
-      <table>
+      <table class="cells">
         <caption class="hidden">{props.label}</caption>
         <thead>
           <tr>{props.head.map((title, place) => <th key={title} scope="col" class={props.numbers?.includes(place) ? "right" : ""}>{title}</th>)}</tr>
         </thead>
-        <tbody>{props.children}</tbody>
+        <tbody>{props.children.map((row) => cloneElement(row, {}, titled(row, props.head)))}</tbody>
       </table>
     </div>
   );
+}
+
+function titled(row: Row, head: string[]): VNode[] {
+  return toChildArray(row.props.children).map((cell, place) => cloneElement(cell as VNode<object>, { "data-title": head[place] || undefined }));
 }
 
 export function Facts(props: { of: [string, ComponentChildren][] }) {

@@ -74,7 +74,7 @@ export function AccountPage(props: { address: string }) {
                 [texts.allowed, <Money units={state.token.allowance} token={market.token} />],
                 [texts.spent, <Money units={state.spent} token={market.token} />],
                 [texts.earned, <Money units={state.record.earned} token={market.token} />],
-                [texts.record, texts.recordOf(state.record)],
+                [texts.asRobot, texts.recordOf(state.record)],
               ].filter(([name]) => name) as [string, any][]}
             />
             <h2>{texts.openOrders}</h2>

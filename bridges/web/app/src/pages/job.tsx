@@ -43,16 +43,18 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
   const { liability } = job;
   const ended = liability.isFinalized;
   const failed = ended && liability.state !== "paid";
+  const owed = job.owed !== "0";
   const done = ended ? (failed ? 5 : 6) : PHASES[job.phase];
   const share = playback && playback.total ? playback.position / playback.total : undefined;
   return (
     <>
       <Steps done={done} active={!ended} failed={failed} share={job.phase === "running" || playback ? share : undefined} />
       <p class="lead" aria-live="polite">
-        <JobState state={liability.state} /> {texts.jobStateLong[liability.state]}
+        <JobState state={liability.state} /> {owed ? texts.owedNow(amount(job.owed, liability.token), !failed) : texts.jobStateLong[liability.state]}
         {playback && !ended ? ` ${texts.played(playback.position, playback.total)}` : ""}
       </p>
       {job.reason ? <p class="problem"><Strange text={job.reason.text || texts.reason[job.reason.code] || ""} /> <code>{job.reason.code}</code></p> : null}
+      {owed ? <p class="hint">{texts.owedHow} <code>aira liability claim {liability.address}</code></p> : null}
       <Refund job={job} changed={props.changed} />
       {ended ? <p><a class="button quietly" href={`#/order/model/${liability.model}`}>{texts.orderAgain}</a></p> : <Operate robot={liability.promisor} job={liability.address} />}
       <div class="columns">
@@ -74,7 +76,7 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
         </section>
         <section>
           <h2>{texts.timeline}</h2>
-          <Timeline steps={job.timeline} />
+          <Timeline steps={job.timeline} owed={owed} />
         </section>
       </div>
       {liability.result ? (
@@ -98,13 +100,13 @@ function CopyLink() {
   return <Action class="button small quietly" run={copy}>{texts.copyLink}</Action>;
 }
 
-function Timeline(props: { steps: Step[] }) {
+function Timeline(props: { steps: Step[]; owed: boolean }) {
   const { market } = useApp();
   return (
     <ol class="timeline">
       {props.steps.map((step) => (
         <li key={`${step.kind}${step.at}${step.block}`}>
-          <strong>{texts.stepName[step.kind] ?? step.kind}</strong>
+          <strong>{texts.stepName[props.owed && (step.kind === "paid" || step.kind === "refunded") ? "owed" : step.kind] ?? step.kind}</strong>
           <span class="quiet">
             {step.at !== null ? clock(step.at) : ""} {step.block !== null ? texts.block(step.block) : ""}{" "}
             {step.tx ? (market.explorer ? <a href={`${market.explorer}/tx/${step.tx}`} rel="noreferrer">{short(step.tx)}</a> : <Name text={step.tx} />) : null}

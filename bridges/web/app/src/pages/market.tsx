@@ -76,7 +76,7 @@ export function MarketPage() {
       <p class="hint">{texts.ordersPerSecond}</p>
       <Rate perSecond={perSecond.current} />
       <div class="scroll" tabIndex={0} role="region" aria-label={texts.marketTitle}>
-        <table class="ticker">
+        <table class="cells ticker">
           <thead>
             <tr><th scope="col">{texts.time}</th><th scope="col">{texts.what}</th><th scope="col">{texts.who}</th><th scope="col" class="right">{texts.price}</th><th scope="col">{texts.about}</th></tr>
           </thead>
@@ -112,7 +112,7 @@ function rowOf(event: StreamEvent, price: (order: Order) => string): Omit<Row, "
     case "job":
       return { ...row, who: short(data.agent), text: `${plain(data.event, 20)} ${short(data.liability.address)}`, href: `#/job/${data.liability.address}` };
     case "matched":
-      return { ...row, text: short(String(data.liability ?? data.demand)), href: data.liability ? `#/job/${data.liability}` : "" };
+      return { ...row, text: short(data.liability.address), href: `#/job/${data.liability.address}` };
     default:
       return row;
   }

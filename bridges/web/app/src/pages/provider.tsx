@@ -1,10 +1,11 @@
 import { useState } from "preact/hooks";
 import { useApp, useData, useTopic } from "../app";
 import { calls } from "../contracts";
-import { amount, duration, ether, parseAmount } from "../format";
+import { amount, duration, ether } from "../format";
+import { parseAmount } from "../numbers";
 import { texts } from "../texts";
 import type { AccountState, Lighthouse, Order } from "../types";
-import { Action, Badge, Facts, Field, Money, Name, Show, Strange, Table } from "../ui";
+import { Action, Badge, Facts, Field, Money, Name, NumberField, Show, Strange, Table } from "../ui";
 
 /** The lighthouse for those who run it: providers, turns, gas and earnings, stakes, the order book. */
 export function ProviderPage() {
@@ -95,9 +96,7 @@ function Stake(props: { lighthouse: Lighthouse; address: string; changed: () => 
         {(known) => <Facts of={[[texts.stake, <Money units={known.stake} token={market.xrt} />], [texts.balance, <Money units={known.xrt.balance} token={market.xrt} />], [texts.gas, ether(known.eth)]]} />}
       </Show>
       <div class="row end">
-        <Field label={texts.stakeAmount} error={value && units === null ? texts.notAnAmount : ""}>
-          {(id) => <input id={id} inputMode="decimal" value={value} onInput={(event) => setValue(event.currentTarget.value)} />}
-        </Field>
+        <NumberField label={texts.stakeAmount} text={value} change={setValue} error={value && units === null ? texts.notAnAmount : ""} />
         <Action id="stake" class="button" disabled={!units} run={stake}>{texts.stakeButton}</Action>
         <Action id="unstake" class="button quietly" disabled={!units} run={takeBack}>{texts.withdrawStake}</Action>
       </div>
@@ -111,10 +110,11 @@ function CreateLighthouse(props: { done: (text: string) => void }) {
   const { market, send } = useApp();
   const [name, setName] = useState("");
   const [stake, setStake] = useState("1");
-  const [blocks, setBlocks] = useState(10);
+  const [blocks, setBlocks] = useState("10");
   const units = parseAmount(stake, market.xrt.decimals);
+  const turn = parseAmount(blocks, 0);
   const create = async () => {
-    await send(market.factory, calls.createLighthouse(units!, BigInt(blocks), name));
+    await send(market.factory, calls.createLighthouse(units!, turn!, name));
     props.done(texts.lighthouseCreated(name));
   };
   return (
@@ -124,14 +124,10 @@ function CreateLighthouse(props: { done: (text: string) => void }) {
         <Field label={texts.name} hint={texts.lighthouseNameHint}>
           {(id, described) => <input id={id} aria-describedby={described} value={name} spellcheck={false} onInput={(event) => setName(event.currentTarget.value.trim())} />}
         </Field>
-        <Field label={texts.minimalStake} error={units === null ? texts.notAnAmount : ""}>
-          {(id) => <input id={id} inputMode="decimal" value={stake} onInput={(event) => setStake(event.currentTarget.value)} />}
-        </Field>
-        <Field label={texts.turnLength} hint={duration(blocks * market.blockTime)}>
-          {(id) => <input id={id} type="number" min={1} value={blocks} onInput={(event) => setBlocks(Math.max(1, Number(event.currentTarget.value)))} />}
-        </Field>
+        <NumberField label={texts.minimalStake} text={stake} change={setStake} error={units === null ? texts.notAnAmount : ""} />
+        <NumberField label={texts.turnLength} text={blocks} change={setBlocks} error={turn ? "" : texts.notBlocks} hint={turn ? duration(Number(turn) * market.blockTime) : ""} />
       </div>
-      <Action disabled={!name || !units} run={create}>{texts.createLighthouse}</Action>
+      <Action disabled={!name || !units || !turn} run={create}>{texts.createLighthouse}</Action>
     </details>
   );
 }

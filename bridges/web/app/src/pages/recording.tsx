@@ -1,7 +1,7 @@
 import { useEffect, useRef, useState } from "preact/hooks";
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
-import { get, query } from "../api";
+import { get, getExact, query } from "../api";
 import { useData, wordsOf } from "../app";
 import { clock, duration, plain, shown, size } from "../format";
 import { texts } from "../texts";
@@ -71,7 +71,7 @@ function MessageList(props: { cid: string; topic: TopicSummary }) {
   const [error, setError] = useState<unknown>(null);
   const more = async () => {
     const fields = { topic: props.topic.topic, after: next || undefined, limit: PAGE };
-    const page = await get<{ messages: Message[]; next: number | null }>(`files/${props.cid}/messages${query(fields)}`);
+    const page = await getExact<{ messages: Message[]; next: number | null }>(`files/${props.cid}/messages${query(fields)}`);
     setMessages((known) => [...known, ...page.messages.filter((one) => one.role === props.topic.role)]);
     setNext(page.next);
   };
@@ -111,11 +111,13 @@ function MessageList(props: { cid: string; topic: TopicSummary }) {
 function Plot(props: { cid: string; topic: TopicSummary }) {
   const box = useRef<HTMLDivElement>(null);
   const [error, setError] = useState("");
+  const [blank, setBlank] = useState(false);
   useEffect(() => {
     let plot: uPlot | null = null;
     const resized = new ResizeObserver(() => box.current && plot?.setSize(measure(box.current)));
     get<Values>(`files/${props.cid}/values${query({ topic: props.topic.topic })}`).then((values) => {
-      if (!box.current || values.points < 2) return;
+      if (!isLine(values)) setBlank(true);
+      if (!box.current || !isLine(values)) return;
       plot = new uPlot(optionsOf(box.current, values), [values.at, ...values.columns.slice(0, SERIES).map((column) => column.values)], box.current);
       resized.observe(box.current);
     }, (problem) => setError(wordsOf(problem)));
@@ -124,7 +126,13 @@ function Plot(props: { cid: string; topic: TopicSummary }) {
       plot?.destroy();
     };
   }, []);
+  if (blank) return null;
   return error ? <p class="hint">{error}</p> : <div class="plot" ref={box} role="img" aria-label={texts.plotOf(plain(props.topic.topic, 60))} />;
+}
+
+/** Whether there are numbers at two times to draw a line between; the table has them in any case. */
+function isLine({ at, columns }: Values): boolean {
+  return columns.slice(0, SERIES).some(({ values }) => new Set(at.filter((_, place) => typeof values[place] === "number")).size > 1);
 }
 
 const measure = (box: HTMLElement) => ({ width: Math.max(240, box.clientWidth), height: 200 });

@@ -1,20 +1,23 @@
 // The validator of an order: whom to name, and what its jurors have signed about how they judge.
 
-import { useEffect, useMemo, useState } from "preact/hooks";
+import { useEffect, useLayoutEffect, useMemo, useState } from "preact/hooks";
 import { isAddress, zeroAddress } from "viem";
 import type { Address } from "viem";
-import { query } from "../api";
+import { get, query } from "../api";
 import { useApp, useData } from "../app";
-import { amount, parseAmount, short } from "../format";
+import { amount, short } from "../format";
+import { parseAmount } from "../numbers";
 import { texts } from "../texts";
 import { checkValidator } from "../trust";
 import type { Agents, Market, Validator } from "../types";
-import { Facts, Field, Name, Problem, Show, Strange } from "../ui";
+import { Facts, Field, Name, NumberField, Problem, Show, Strange } from "../ui";
 
 /** The validator that an order names, and its fee in the smallest unit of XRT. */
 export interface Judge {
   address: Address;
   fee: bigint;
+  /** Asks again. Throws if what it said has changed. */
+  confirm?: () => Promise<void>;
 }
 
 export const NOBODY: Judge = { address: zeroAddress, fee: 0n };
@@ -31,7 +34,7 @@ export function ValidatorChoice(props: { choose: (judge: Judge | null) => void }
   const [asked, setAsked] = useState<string | null>(null);
   const [problem, setProblem] = useState<unknown>(null);
   const [independent, setIndependent] = useState<boolean | null>(null);
-  const offered = fee === "" ? undefined : parseAmount(fee, market.xrt.decimals);
+  const offered = fee.trim() === "" ? undefined : parseAmount(fee, market.xrt.decimals);
   const isName = isAddress(named) || /^[^\s/]+\.[^\s/]+$/.test(named);
   const path = isName && offered !== null ? `validators/${encodeURIComponent(named)}${query({ fee: offered?.toString() })}` : null;
   const found = useData<Validator>(asked);
@@ -42,7 +45,7 @@ export function ValidatorChoice(props: { choose: (judge: Judge | null) => void }
     return () => clearTimeout(timer);
   }, [path]);
 
-  useEffect(() => {
+  useLayoutEffect(() => {
     let current = true;
     setProblem(null);
     setIndependent(null);
@@ -52,7 +55,7 @@ export function ValidatorChoice(props: { choose: (judge: Judge | null) => void }
       (independent) => {
         if (!current) return;
         setIndependent(independent);
-        if (!Object.keys(said.doubts).length) choose({ address: said.validator, fee: BigInt(said.fee) });
+        if (!Object.keys(said.doubts).length) choose({ address: said.validator, fee: BigInt(said.fee), confirm: () => confirmed(path!, said) });
       },
       (error) => current && setProblem(error),
     );
@@ -60,6 +63,14 @@ export function ValidatorChoice(props: { choose: (judge: Judge | null) => void }
       current = false;
     };
   }, [named, fee, said, account]);
+
+  /** The validator is asked again when the order is looked at. */
+  const confirmed = async (asked: string, said: Validator) => {
+    const now = await get<Validator>(asked);
+    if (now.validator === said.validator && now.fee === said.fee && !Object.keys(now.doubts).length) return;
+    found.reload();
+    throw new Error(texts.changedLookAgain);
+  };
 
   return (
     <details class="more" id="with-validator">
@@ -69,9 +80,7 @@ export function ValidatorChoice(props: { choose: (judge: Judge | null) => void }
         <Field label={texts.validator} error={named && !isName ? texts.notAnAddress : ""} hint={texts.validatorHint}>
           {(id, described) => <input id={id} aria-describedby={described} class="wide" spellcheck={false} value={named} onInput={(event) => setNamed(event.currentTarget.value.trim())} />}
         </Field>
-        <Field label={texts.validatorFee} error={offered === null ? texts.notAnAmount : fee && !named ? texts.feeWithoutValidator : ""} hint={texts.validatorFeeHint}>
-          {(id, described) => <input id={id} aria-describedby={described} inputMode="decimal" value={fee} onInput={(event) => setFee(event.currentTarget.value.trim())} />}
-        </Field>
+        <NumberField label={texts.validatorFee} text={fee} change={setFee} error={offered === null ? texts.notAnAmount : fee && !named ? texts.feeWithoutValidator : ""} hint={texts.validatorFeeHint} />
       </div>
       <div aria-live="polite">
         {problem ? <Problem error={problem} /> : said ? <Announced said={said} independent={independent} /> : asked && asked === path ? <Show of={found}>{() => null}</Show> : null}

@@ -1,0 +1,2 @@
+from bridges.serial._device import CallReply as CallReply, Device as Device
+from bridges.serial.dialect import CallFailed as CallFailed, CallStatus as CallStatus

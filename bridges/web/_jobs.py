@@ -1,0 +1,334 @@
+"""A job, an account, the agents, the lighthouse, as the page shows them: from the chain, the market and the files."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from bridges.web._market import liability_json, result_json
+from mesh.agent.contracts import refusal
+from mesh.agent.jobs import read_reason
+from mesh.chain import NotOffered
+from mesh.errors import AiraError
+from mesh.telemetry.metrics import is_healthy
+from mesh.validator.verification import Claim, Verdict, check_end, verify
+from mesh.watching import present, statuses
+from schemas import ZERO_ADDRESS, encode, parse_cid
+from schemas.decoding import decode_json
+from schemas.status import BridgeStatus, Status
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from bridges.web._files import Files
+    from bridges.web._market import Market, SeenJob, SeenOrder
+    from bridges.web.components import WebComponents
+    from mesh.watching import RoleStatus
+
+
+LONGEST: Final = 200
+"""Characters of a detail, which a stranger may have written."""
+ALERTS: Final = 256
+
+
+def alerts_of(found: Mapping[str, RoleStatus | None], head: int) -> list[dict[str, Any]]:
+    """The alerts about these addresses, at most `ALERTS`; `head` is the last block that the page knows."""
+    alerts = [
+        {"agent": address, "code": code, "detail": detail[:LONGEST]}
+        for address, status in found.items()
+        for code, detail in _alerts(status, head)
+    ]
+    return alerts[:ALERTS]
+
+
+def waiting_parts(status: RoleStatus) -> list[str]:
+    """The parts of an agent, a provider or a bridge that do not work now, each with its state."""
+    if isinstance(status, BridgeStatus):
+        return [] if status.state in ("connected", "alone") else [f"bridge: {status.state}"]
+    return [f"{part}: {state}" for part, state in status.parts.items() if not is_healthy(state)]
+
+
+def _alerts(status: RoleStatus | None, head: int) -> Iterator[tuple[str, str]]:
+    if status is None:
+        yield "silent", ""
+        return
+    for waiting in waiting_parts(status):
+        yield "part-waits", waiting
+    if isinstance(status, BridgeStatus):
+        return
+    if status.head + 60 < head:  # blocks that somebody may be behind the chain
+        yield "behind", f"{head - status.head} blocks"
+    if status.work is not None:
+        store = status.work.store
+        if store.quota and store.bytes > 0.95 * store.quota:  # the part of its quota that a store may use
+            yield "store-full", f"{store.bytes} of {store.quota} bytes"
+    if dropped := sum(sum(senders.values()) for senders in status.heaviest.values()):
+        yield "drops", f"{dropped} in the last minute"
+
+
+LISTED: Final = 200
+"""Jobs and orders in one answer."""
+AGENTS: Final = 256
+"""Agents in one answer."""
+
+
+_ORDER: Final = ("created", "ready", "playing", "result", "judged", "reverted", "paid", "refunded")
+"""The steps of a job, as they follow each other."""
+
+
+def timeline_of(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The steps in their order, none later than the next one.
+
+    Steps have the time at which this server saw them. Those from before it started have the chain's, and that clock may
+    be ahead.
+    """
+    latest = float("inf")
+    ordered: list[dict[str, Any]] = []
+    for step in sorted(steps, key=lambda step: _ORDER.index(step["kind"]), reverse=True):
+        if step["at"] is not None:
+            latest = min(latest, step["at"])
+        ordered.append(step | {"at": None if step["at"] is None else latest})
+    return ordered[::-1]
+
+
+class Views:
+    """Answers the page's questions about jobs, accounts, agents and the lighthouse."""
+
+    def __init__(self, components: WebComponents, market: Market, files: Files) -> None:
+        self._parts = components
+        self._market = market
+        self._files = files
+        self._asking = asyncio.Lock()
+        self._agents: dict[str, Any] | None = None
+        self._agents_at = float("-inf")
+
+    async def job(self, address: str) -> dict[str, Any]:
+        """A job: terms, parties, phase, timeline. Raises `NotALiability`, `ChainError`."""
+        job = await self._market.job(address)
+        liability = job.liability
+        await self._market.labels.learn(liability.token)
+        result = self._market.results.get((address, liability.promisor))
+        position = job.playback
+        for step in job.steps:
+            if step["at"] is None and step["block"] is not None:
+                step["at"] = await self._market.time_of(step["block"])
+        return {
+            "liability": liability_json(liability, self._market.labels),
+            "phase": "finalized" if liability.is_finalized else job.phase,
+            "playback": None if position is None else {"position": position.position, "total": position.total},
+            "demandHash": job.demand,
+            "offerHash": job.offer,
+            "refundableFrom": await self._refundable_from(job),
+            "owed": str(await self._parts.chain.liabilities.owed_after(liability)),
+            "timeline": timeline_of(job.steps),
+            "resultMessage": None if result is None else result_json(result),
+            "present": bool(await self._parts.channel.present("agent", liability.promisor)),
+            "reason": await self._reason(job),
+        }
+
+    async def _refundable_from(self, job: SeenJob) -> int | None:
+        if job.liability.is_finalized:
+            return None
+        with suppress(NotOffered):
+            return await self._parts.chain.liabilities.refundable_from(job.liability.address)
+        return None
+
+    async def _reason(self, job: SeenJob) -> dict[str, str] | None:
+        """Why a job failed, as its validator says, or its recording if that is at hand."""
+        liability = job.liability
+        if not liability.is_finalized or liability.is_success:
+            return None
+        if not liability.result:
+            return {"code": "no-result", "text": ""}
+        if (refused := refusal(job.reports.values())) is not None:
+            return {"code": refused[1], "text": refused[0]}
+        held = await asyncio.to_thread(self._parts.store.checked, liability.result)
+        if held is None:
+            return {"code": "recording-unavailable", "text": ""}
+        with suppress(AiraError):
+            reason = await asyncio.to_thread(read_reason, held)
+            return {"code": reason.code, "text": reason.text}
+        return None
+
+    async def verification(self, address: str) -> dict[str, Any]:
+        """The checklist of `aira verify`. Raises `NotALiability`, `ContentError`, `ChainError`."""
+        liability = await self._parts.chain.liabilities.get(address)
+        claim = Claim.of_contract(liability)
+        message = self._market.results.get((address, liability.promisor))
+        if not claim.result:
+            verdict = Verdict((check_end(claim),))
+        else:
+            objective, result = await self._files.fetch(claim.objective), await self._files.fetch(claim.result)
+            verdict = await self._files.in_thread(
+                verify,
+                claim,
+                objective=objective,
+                result=result,
+                message=None if message is None else encode(message.message),
+                objective_cid=claim.objective,
+                result_cid=claim.result,
+                bags=True,
+            )
+        return {
+            "holds": verdict.holds,
+            "claim": msgspec.to_builtins(claim),
+            "findings": [msgspec.to_builtins(finding) for finding in verdict.findings],
+        }
+
+    async def account(self, address: str) -> dict[str, Any]:
+        """Balances, allowances, the next nonce, orders and jobs of an account. Raises `ChainError`."""
+        parts, chain, market = self._parts, self._parts.chain, self._market
+        eth, xrt, token, count, state = await asyncio.gather(
+            chain.tokens.eth_balance(address),
+            chain.tokens.balance_and_allowance(address, chain.factory),
+            chain.tokens.balance_and_allowance(address, chain.factory, token=parts.token),
+            chain.node.transaction_count(address),
+            chain.lighthouses.get(parts.lighthouse),
+        )
+        is_counted = parts.settings.generation == 5
+        nonce = str(await chain.liabilities.next_nonce(address)) if is_counted else None
+        jobs = [
+            job for job in reversed(market.jobs.values()) if address in (job.liability.promisee, job.liability.promisor)
+        ]
+        own = [order for order in market.orders() if order.verified.signer == address]
+        own = [order for order in own if order.state(market.head) in ("open", "withdrawn")]
+        record = records_of(jobs, parts.token).get(address, AccountRecord())
+        return {
+            "address": address,
+            "eth": str(eth),
+            "xrt": {"balance": str(xrt[0]), "allowance": str(xrt[1])},
+            "token": {"balance": str(token[0]), "allowance": str(token[1])},
+            "nonce": nonce,
+            "transactions": count,
+            "stake": str(state.stakes.get(address, 0)),
+            "orders": [market.posted_json(order) for order in own[-LISTED:]],
+            "record": record.json(),
+            "spent": str(record.spent),
+            "liabilities": [liability_json(job.liability, market.labels) for job in jobs[:LISTED]],
+        }
+
+    async def lighthouse(self) -> dict[str, Any]:
+        """Providers, stakes, turns, quotas. Raises `ChainError`."""
+        parts = self._parts
+        state, gas = await asyncio.gather(parts.chain.lighthouses.get(parts.lighthouse), parts.chain.node.gas_price())
+        statuses = {agent["address"]: agent["status"] for agent in (await self.agents())["agents"]}
+        return {
+            "name": parts.channel.lighthouse,
+            "address": state.address,
+            "minimalStake": str(state.minimal_stake),
+            "timeoutBlocks": state.timeout_blocks,
+            "keepAliveBlock": state.keep_alive_block,
+            "quotaLeft": state.quota,
+            "current": state.current,
+            "block": self._market.head,
+            "providers": [
+                {
+                    "address": provider,
+                    "stake": str(stake),
+                    "quota": stake // state.minimal_stake if state.minimal_stake else 0,
+                    "hasTurn": provider == state.current != ZERO_ADDRESS,
+                    "status": statuses.get(provider),
+                }
+                for provider, stake in list(state.stakes.items())[:AGENTS]
+            ],
+            "gasPrice": str(gas),
+        }
+
+    async def agents(self) -> dict[str, Any]:
+        """Who is present, with status, offers and record; a few seconds old at most."""
+        loop = asyncio.get_running_loop()
+        async with self._asking:
+            # Seconds for which a list of agents is used.
+            if self._agents is None or loop.time() - self._agents_at > 3.0:
+                self._agents = await self._ask_agents()
+                self._agents_at = loop.time()
+            return self._agents
+
+    async def _ask_agents(self) -> dict[str, Any]:
+        parts, market = self._parts, self._market
+        peers = await present(parts.channel)
+        found = await statuses(parts.network.session, parts.channel, peers[:AGENTS], timeout=2.0)
+        records = records_of(list(market.jobs.values()), parts.token)
+        offers, models = self._offers(), self._models()
+        listed = [
+            {
+                "role": peer.role,
+                "address": peer.address,
+                "health": _health(status),
+                "status": None if status is None else decode_json(status.encode()),
+                "models": sorted(models.get(peer.address, set()) | _own_model(status)) if peer.role == "agent" else [],
+                "offers": [order.json() for order in offers.get(peer.address, ())][:LISTED],
+                "record": records.get(peer.address, AccountRecord()).json(),
+            }
+            for peer, status in found.items()
+        ]
+        alerts = alerts_of({peer.address: status for peer, status in found.items()}, market.head)
+        return {"agents": listed, "unlisted": max(0, len(peers) - AGENTS), "alerts": alerts}
+
+    def _offers(self) -> dict[str, list[SeenOrder]]:
+        found: dict[str, list[SeenOrder]] = {}
+        for order in self._market.orders():
+            if order.message.kind == "offer" and order.state(self._market.head) == "open":
+                found.setdefault(order.verified.signer, []).append(order)
+        return found
+
+    def _models(self) -> dict[str, set[str]]:
+        """The models that each account offers or has worked by."""
+        found = {signer: {order.message.model for order in offers} for signer, offers in self._offers().items()}
+        for job in self._market.jobs.values():
+            found.setdefault(job.liability.promisor, set()).add(job.liability.model)
+        return found
+
+
+def _own_model(status: RoleStatus | None) -> set[str]:
+    """The model that an agent says it has: it may wait for demands without an offer."""
+    with suppress(AiraError):
+        if isinstance(status, Status) and status.model:
+            parse_cid(status.model)
+            return {status.model}
+    return set()
+
+
+def _health(status: RoleStatus | None) -> str:
+    if status is None:
+        return "silent"
+    return "degraded" if waiting_parts(status) else "alive"
+
+
+class AccountRecord(msgspec.Struct):
+    """What the chain says of an account's jobs, as far as they were read: amounts are those of one token."""
+
+    created: int = 0
+    done: int = 0
+    failed: int = 0
+    open: int = 0
+    earned: int = 0
+    spent: int = 0
+
+    def json(self) -> dict[str, Any]:
+        return {
+            "created": self.created,
+            "done": self.done,
+            "failed": self.failed,
+            "open": self.open,
+            "earned": str(self.earned),
+        }
+
+
+def records_of(jobs: list[SeenJob], token: str) -> dict[str, AccountRecord]:
+    """The record of each account: jobs as promisor, and what it spent as promisee in `token`."""
+    found: dict[str, AccountRecord] = {}
+    for job in jobs:
+        liability = job.liability
+        record = found.setdefault(liability.promisor, AccountRecord())
+        record.created += 1
+        record.open += not liability.is_finalized
+        record.failed += liability.is_finalized and not liability.is_success
+        record.done += liability.is_success
+        if liability.is_success and liability.token == token:
+            record.earned += liability.cost
+            found.setdefault(liability.promisee, AccountRecord()).spent += liability.cost
+    return found

@@ -1,0 +1,490 @@
+"""An agent with an account at work: it follows the chain, does its jobs, trades, and offers its services.
+
+`AgentRuntime` says what happens on the chain means for the agent: its trade, its jobs, its token events (`on_event`,
+`on_revert`), and what it does until it is cancelled (`tasks`). Handling is idempotent: see `mesh.role.following`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import zenoh
+from msgspec.structs import replace
+
+from mesh.agent._outbox import result_identity
+from mesh.agent._services import offer_services
+from mesh.agent._status import AgentStatus
+from mesh.agent.contracts import ContractReports, Outcome
+from mesh.agent.demands import DemandDispatcher
+from mesh.agent.handlers import call
+from mesh.agent.jobs import Executor
+from mesh.agent.ledger import TO_BE_DONE, UNFINISHED, Phase, advance
+from mesh.agent.objectives import Objectives
+from mesh.agent.trade import Trader
+from mesh.agent.validators import ValidatorDirectory
+from mesh.base.background import call_in_loop
+from mesh.base.flood import Rate, RateLimiter
+from mesh.base.lifecycle import Lifecycle
+from mesh.base.log_context import liability_context, log_event, with_liability_context
+from mesh.chain import (
+    Approval,
+    Finalized,
+    NewLiability,
+    NoContracts,
+    NodeUnreachable,
+    NotALiability,
+    NotOffered,
+    RequestRefused,
+    Reverted,
+    Transfer,
+)
+from mesh.errors import ChainError
+from mesh.network.services import answering, declared
+from mesh.role.following import follow_chain
+from mesh.telemetry.logs import LogService
+from schemas import ZERO_ADDRESS, Demand, Result, Withdrawal, decode, event_selector, parse_address
+from schemas.cid import is_cid
+from schemas.keys import EthEventKey, EventKey, LiabilityEvent, ProgressKey, market_selector
+from schemas.rpc import ApprovalEvent, TransferEvent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterator, Sequence
+    from contextlib import AbstractAsyncContextManager, AbstractContextManager, AsyncExitStack
+
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.handlers import Handler, Handlers
+    from mesh.agent.ledger import JobRecord
+    from mesh.chain import ChainEvent
+    from mesh.network import Subscription
+    from mesh.role.following import Created
+    from mesh.role.models import Models
+    from schemas import Liability, Record
+    from schemas.model import ModelDescription
+    from schemas.verdicts import ValidatorReport
+
+
+log = logging.getLogger(__name__)
+
+PUBLISHED: Final[dict[Phase, LiabilityEvent]] = {
+    Phase.INCOMING: "incoming",
+    Phase.READY: "ready",
+    Phase.COMPLETE: "complete",
+    Phase.FINALIZED: "finalized",
+}
+"""The phases that are published on the agent's keys, with their names there."""
+ASKED: Final = Rate(per_second=20.0, burst=100)
+"""Queries for phases that are answered."""
+
+
+def answering_phases(parts: AgentComponents, executor: Executor) -> AbstractAsyncContextManager[None]:
+    """Meanwhile answer queries on the keys of the agent's events with the present phase of each job that they name.
+
+    A query for all jobs (`*`) is answered with those that have not ended. A job that is played is `ready`, and how far
+    it is.
+    """
+    agent = parts.signer.address
+
+    async def answer(query: zenoh.Query) -> None:
+        chunks = str(query.key_expr).split("/")
+        named = chunks[4] if len(chunks) > 4 else ""
+        jobs = await parts.ledger.jobs(UNFINISHED) if named == "*" else []
+        for address in [job.liability.address for job in jobs] or [parse_address(named)]:
+            if (job := await parts.ledger.job(address)) is not None:
+                event = EventKey(agent, address, PUBLISHED.get(job.phase, "ready"))
+                replies = {str(event): (await executor.read(address)).encode()}
+                if (run := executor.runs.get(address)) is not None and (position := run.playback) is not None:
+                    replies[str(ProgressKey(agent, address))] = position.encode()
+                for key, payload in replies.items():
+                    if query.key_expr.intersects(zenoh.KeyExpr(key)):
+                        query.reply(key, payload, encoding="application/json")
+
+    return answering(parts.network.session, event_selector(agent), answer, ASKED, parts.drops)
+
+
+class TokenEvents:
+    """Publishes token events of `account` on `aira/agent/{account}/eth/event/transfer` or `…/approval`, with `put`.
+
+    An event that is reverted and happens again is published once. One that does not happen again was published in vain,
+    and after a crash in the middle of a block its events are published again: read balances from the chain, don't add
+    up events.
+    """
+
+    def __init__(self, put: Callable[[str, bytes], None], account: str) -> None:
+        self._put = put
+        self._account = account
+        self._reverted: deque[Transfer | Approval] = deque(maxlen=1_000)
+
+    def publish(self, event: Transfer | Approval) -> None:
+        """Publish an event if it concerns the account and was not published before it was reverted."""
+        parties, record = _record(event)
+        if self._account not in parties:
+            return
+        if event in self._reverted:
+            self._reverted.remove(event)
+            return
+        kind: Final = "transfer" if isinstance(event, Transfer) else "approval"
+        self._put(str(EthEventKey(self._account, kind)), record.encode())
+
+    def revert(self, event: Transfer | Approval) -> None:
+        """A reorganisation reverted the event; it may happen again in another block."""
+        if self._account in _record(event)[0]:
+            self._reverted.append(event)
+
+
+def _record(event: Transfer | Approval) -> tuple[tuple[str, str], Record]:
+    """The accounts that an event concerns, and its record."""
+    match event:
+        case Transfer(sender, recipient, value):
+            return (sender, recipient), TransferEvent(sender, recipient, value)
+        case Approval(owner, spender, value):
+            return (owner, spender), ApprovalEvent(owner, spender, value)
+
+
+SHARE: Final = 4
+"""A Result is late when a quarter of the blocks before the refund are left …"""
+LEAST_BLOCKS: Final = 20
+"""… or fewer than this."""
+SOON: Final = 3
+"""Blocks that leave a Result unsettled before the chain is asked when it would be late, and between two attempts."""
+JUDGED: Final = frozenset({"NotTheValidator", "RefusedByValidator"})
+"""How the contracts refuse a Result that only a validator can finalize."""
+NEVER: Final = 2**63
+
+
+class LateResults:
+    """Finalizes liabilities by the account's own Results before they can be refunded, if no provider does.
+
+    The original contracts offer no finalization without a turn; there it does nothing.
+    """
+
+    def __init__(self, parts: AgentComponents) -> None:
+        self._parts = parts
+        self._liabilities = parts.chain.liabilities
+        self._late_from: dict[str, int] = {}  # block, by liability
+        self._since: dict[str, int] = {}  # the block at which its Result was seen first, by liability
+
+    async def run(self) -> None:
+        """Look at the unsettled Results after each block, until cancelled."""
+        head = self._parts.chain_head
+        while True:
+            unsettled = await self._parts.ledger.outbox(head=head.head)
+            results = [decode(one.payload) for one in unsettled if one.kind == Result.kind]
+            waiting = {result.liability: result for result in results if isinstance(result, Result)}
+            self._late_from = {address: block for address, block in self._late_from.items() if address in waiting}
+            self._since = {address: self._since.get(address, head.head) for address in waiting}
+            for address, result in waiting.items():
+                with liability_context(address):
+                    await self._finalize_if_late(result)
+            await head.reached(head.head + 1)
+
+    async def _finalize_if_late(self, result: Result) -> None:
+        address, head = result.liability, self._parts.chain_head.head
+        try:
+            if address not in self._late_from:
+                if head - self._since[address] < SOON:
+                    return
+                refundable = await self._liabilities.refundable_from(address)
+                self._late_from[address] = refundable - max(LEAST_BLOCKS, (refundable - self._since[address]) // SHARE)
+            if head < self._late_from[address]:
+                return
+            settled = await self._liabilities.finalize_without_turn(result)
+        except (NodeUnreachable, RequestRefused, NotALiability) as error:
+            log.debug("looking at the result again after the next block: %s", error)
+        except (NotOffered, Reverted) as error:
+            is_final = isinstance(error, NotOffered) or error.reason in (*JUDGED, "WrongSigner")  # of another account
+            # Else somebody's transaction may be pending that finalizes it, and fail.
+            self._late_from[address] = NEVER if is_final else head + SOON
+            log.debug("the contract is not finalized by its result: %s", error)
+            if isinstance(error, Reverted) and error.reason in JUDGED:
+                facts = log_event("verdict-late", code=error.reason)
+                log.warning("the validator has not judged the result, and the cost can be refunded soon", extra=facts)
+        except ChainError as error:
+            facts = log_event("late-result-waits", code=error.code)
+            log.warning("no provider finalized the contract, and finalizing it failed: %s", error, extra=facts)
+        else:
+            self._late_from[address] = NEVER
+            facts = log_event("late-result-finalized", success=result.success, gas=settled.gas_used)
+            log.warning("finalized without a provider, because none did in time", extra=facts)
+
+
+class AgentRuntime(Lifecycle):
+    """The working side of an agent: `async with AgentRuntime(components, handlers) as runtime`, then its `tasks`."""
+
+    title = "agent"
+
+    def __init__(
+        self,
+        parts: AgentComponents,
+        handlers: Handlers,
+        models: Models,
+        description: ModelDescription | None = None,
+        *,
+        model: str = "",
+    ) -> None:
+        topics = handlers.topics or None
+        self.parts = parts
+        self._account = parts.signer.address
+        self.models = models
+        self.validators = ValidatorDirectory(parts.network.session, parts.channel, parts.chain)
+        self.reports = ContractReports(parts, self._on_report if handlers.reports else None)
+        self.trader = Trader(parts, self.reports)
+        self.objectives = Objectives(parts.store, parts.exchange, parts.settings, topics, description)
+        self.executor = Executor(parts, objectives=self.objectives, handlers=topics, on_phase=self._on_phase)
+        self.token_events = TokenEvents(parts.channel.put, parts.signer.address)
+        self.status = AgentStatus(parts, self.executor, model=model)
+        self._handlers = handlers
+        self._new: Created | None = None
+        """The only contract that was created in the blocks that were read last."""
+        self._model = model
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        await stack.enter_async_context(self.reports)
+        await stack.enter_async_context(self.trader)
+        if self._handlers.topics or Demand in self._handlers.market:  # else it may run beside the account's robot
+            await self.trader.withdraw_earlier_offers()
+        await stack.enter_async_context(answering_phases(self.parts, self.executor))
+        services = self.parts.services
+        offer_services(self.parts, self.executor, has_handlers=bool(self._handlers.topics))
+        services.offer("logs", LogService("agent", self.parts.signer.address).logs)
+        services.offer("status", self.status.status)
+
+    def tasks(self) -> Iterator[tuple[str, Coroutine[Any, Any, object]]]:
+        """What it does until it is cancelled."""
+        if self.parts.settings.enable_executor:
+            yield "executor", self._do_jobs()
+        yield "outbox", self.parts.outbox.run()
+        yield "listener", self._follow_chain()
+        yield "late results", LateResults(self.parts).run()
+        yield "reports on earlier contracts", self._follow_earlier()
+
+    async def _do_jobs(self) -> None:
+        await self.finalize_ended()
+        await self.executor.run()
+
+    async def _follow_chain(self) -> None:
+        """Read the chain from where the account's agent stopped. Raises `ChainWentBack` and `UnknownName`."""
+        parts, chain, token = self.parts, self.parts.chain, ""
+        if parts.settings.erc20_token:
+            find_token = partial(chain.names.address, parts.settings.erc20_token)
+            token = await chain.retrying(find_token, outages=parts.outages)
+        await follow_chain(
+            self,
+            chain,
+            parts.chain_head,
+            parts.outages,
+            store=parts.ledger,
+            token=token,
+            parties=[self._account],
+            choose=self._choose,
+            read=self._read_created,
+        )
+
+    async def on_event(self, event: ChainEvent, created: Created | None, block: int) -> None:
+        """Act on an event of the chain."""
+        match event:
+            case NewLiability():
+                assert created is not None
+                liability, orders = created
+                with liability_context(event.liability):
+                    if self._account in (liability.promisor, liability.promisee):
+                        await self.new_liability(liability, demand_hash=orders[0], offer_hash=orders[1])
+                    if self._account != liability.promisor:
+                        await self.trader.taken(liability, orders[0])
+            case Finalized():
+                await self.finalized(event.liability, success=event.success, result=event.result)
+            case Transfer() | Approval():
+                self.token_events.publish(event)
+
+    async def on_revert(self, event: ChainEvent) -> None:
+        """Undo an event that a reorganisation has reverted."""
+        match event:
+            case NewLiability():
+                await self.liability_reverted(event.liability)
+            case Finalized():
+                await self.finalization_reverted(event.liability)
+            case Transfer() | Approval():
+                self.token_events.revert(event)
+
+    async def on_reorganised(self, block: int) -> None:
+        """Allowances and withdrawals may be reverted, too."""
+        self.trader.reorganised()
+
+    async def on_head(self, block: int) -> None:
+        """All of `block` has been handled. After a reorganisation it may be lower than before."""
+        await self.parts.outbox.expire(block)
+        await self.trader.new_head(block)
+
+    async def finalize_ended(self) -> None:
+        """Finalize the jobs that ended while the agent was away, before any of them is played to the device again."""
+        for job in await self.parts.ledger.jobs(TO_BE_DONE):
+            read = partial(self.parts.chain.liabilities.get, job.liability.address)
+            try:
+                now = await self.parts.chain.retrying(read, outages=self.parts.outages)
+            except (NotALiability, NoContracts):  # reverted, which the listener will find
+                continue
+            if now.is_finalized:
+                await self.finalized(now.address, success=now.is_success, result=now.result)
+
+    async def _choose(self, created: Sequence[str], ended: Sequence[str]) -> set[str]:
+        """Of the liabilities that were created or ended in some blocks, those that may concern this agent."""
+        chosen: set[str] = set()
+        self._new = None
+        if len(created) == 1:  # the same call reads all that is needed of it
+            new = await self.parts.chain.liabilities.get_with_orders(created[0])
+            if self._concerns(new[0].promisee, new[0].promisor):
+                self._new, chosen = new, set(created)
+        elif created:  # one call for all, because most are between others
+            parties = await self.parts.chain.liabilities.parties(created)
+            chosen = {one for one, named in zip(created, parties, strict=True) if self._concerns(*named)}
+        if ended:
+            held = await self.parts.ledger.holds([*ended, *map(result_identity, ended)])
+            watched = self.trader.contracts
+            chosen |= {one for one in ended if one in held or result_identity(one) in held or one in watched}
+        return chosen
+
+    async def _read_created(self, addresses: Sequence[str]) -> Sequence[Created]:
+        """The records of new contracts that were chosen; the only one of the blocks that were read was read then."""
+        new, self._new = self._new, None
+        if new is not None and addresses == [new[0].address]:
+            return [new]
+        return await self.parts.chain.liabilities.get_all_with_orders(addresses)
+
+    def _concerns(self, promisee: str, promisor: str) -> bool:
+        """Whether a new contract is this account's, or may be of a demand that it has answered."""
+        return self._account in (promisee, promisor) or promisee in self.trader.answered
+
+    @with_liability_context
+    async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
+        """A contract was created that names this account: as promisee, as promisor, or as both."""
+        await self.trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
+        if liability.promisor != self._account:
+            return
+        if not self.parts.settings.enable_executor:
+            if not liability.is_finalized:  # for the account's next run that does jobs, or one beside this
+                await self.parts.ledger.add_job(liability)
+            return
+        await self.executor.wait_until_open()
+        if liability.is_finalized:
+            if await self.parts.ledger.bring_back(liability.address):
+                await self.finalized(liability.address, success=liability.is_success, result=liability.result)
+            return
+        address, is_known = liability.address, not await self.parts.ledger.add_job(liability)
+        job = await self.parts.ledger.job(address)
+        # Another program of the account may have added it, and left it to this one.
+        if job is None or (is_known and (job.phase is not Phase.INCOMING or address in self.executor.preparing)):
+            return
+        if job.result is not None:
+            await self._owe_result(job)
+            return
+        facts = log_event("job-accepted", model=liability.model, objective=liability.objective, cost=liability.cost)
+        log.info("new job, model %s, objective %s", liability.model, liability.objective, extra=facts)
+        await self._on_phase(Phase.INCOMING, liability)
+        self.executor.prepare(liability)
+
+    @with_liability_context
+    async def liability_reverted(self, address: str) -> None:
+        """A reorganisation reverted a contract: its job is set aside, and our order is sent again."""
+        async with self.executor.halted(address) as job:
+            if job is not None:
+                await self.parts.ledger.set_aside(address)
+                await self.parts.outbox.settle(result_identity(address))
+                log.warning("the liability was reverted; its job waits", extra=log_event("job-set-aside"))
+        await self.trader.liability_reverted(address)
+
+    @with_liability_context
+    async def finalized(self, address: str, *, success: bool, result: str) -> None:
+        """A contract has paid (`success`) or refunded. `result` is the CID of its recording."""
+        async with self.executor.halted(address) as job:
+            # In this order: after a crash in between, the block is handled again and finds the job unfinished.
+            await self.parts.outbox.settle(result_identity(address))  # also one that was signed by request
+            if job is not None and job.phase is not Phase.FINALIZED:
+                await self.parts.ledger.set_phase(address, advance(address, job.phase, Phase.FINALIZED))
+        if job is not None and job.phase is not Phase.FINALIZED:
+            facts = log_event("job-finalized", success=success)
+            log.info("finalized, %s", "paid" if success else "refunded", extra=facts)
+            ended = replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
+            await self._on_phase(Phase.FINALIZED, ended)
+        self.trader.contracts.finalized(address, Outcome(success=success, result=result))
+
+    @with_liability_context
+    async def finalization_reverted(self, address: str) -> None:
+        """A reorganisation reverted the end of a contract: the Result of its job, if it has one, is sent again."""
+        async with self.executor.halted(address) as job:
+            if job is not None and job.result is not None:
+                log.warning("the finalization was reverted", extra=log_event("finalization-reverted"))
+                await self._owe_result(job)
+
+    async def _owe_result(self, job: JobRecord) -> None:
+        """Send the Result of a complete job again."""
+        assert job.result is not None
+        address, success = job.liability.address, bool(job.success)
+        await self.executor.owe_result(address, success=success, result=job.result, note=job.note)
+        await self.parts.outbox.send_new()
+
+    async def handle_demands(self, subscription: Subscription[Demand], handlers: Sequence[Handler]) -> None:
+        """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
+        parts, names = self.parts, self.parts.chain.names
+        token = await parts.chain.retrying(partial(names.address, parts.settings.erc20_token), outages=parts.outages)
+        dispatcher = DemandDispatcher(subscription, handlers, parts, self.trader, token=token)
+        async with parts.channel.subscribe(Withdrawal) as withdrawals, asyncio.TaskGroup() as tasks:
+            tasks.create_task(dispatcher.run(), name="demands")
+            with self._hearing_of_contracts():
+                async for withdrawal in withdrawals:
+                    await self.trader.demand_withdrawn(withdrawal)
+
+    def _hearing_of_contracts(self) -> AbstractContextManager[None]:
+        """Meanwhile look at the chain when a provider says that it has a new contract of the model.
+
+        Until the next poll, an offer for a demand that another robot got would match the next one. Anybody may say it,
+        so this is limited, and done only while there are demands that the agent has answered.
+        """
+        loop, session, limiter = (
+            asyncio.get_running_loop(),
+            self.parts.network.session,
+            RateLimiter(per_sender=Rate(per_second=5.0, burst=10)),
+        )
+        heads = self.parts.chain.node.heads
+
+        def look() -> None:
+            if len(self.trader.answered) and heads.latest is not None and limiter.allow(""):
+                heads.expect(heads.latest.number + 1)
+
+        model = self._model if is_cid(self._model) else "*"
+        selector = market_selector(self.parts.channel.lighthouse, "created", model)
+        return declared(session, session.declare_subscriber(selector, lambda _sample: call_in_loop(loop, look)))
+
+    async def require_fit(self, objective: str, model: str) -> None:
+        """Raise `ObjectiveUnfit` if an objective does not fit the model's description, as far as both are available."""
+        description = await self.models.find(model)
+        if description is not None:
+            await self.objectives.require_fit(objective, description)
+
+    async def _follow_earlier(self) -> None:
+        """Ask for the reports on contracts of earlier runs that have not ended."""
+        parts = self.parts
+        for job in await parts.ledger.jobs(UNFINISHED):
+            self.reports.follow(job.liability)
+        for payload, address in await parts.ledger.contracts("demand"):
+            demand = decode(payload)
+            if isinstance(demand, Demand) and demand.validator != ZERO_ADDRESS:
+                read = partial(parts.chain.liabilities.get, address)
+                with suppress(NotALiability):
+                    liability = await parts.chain.retrying(read, outages=parts.outages)
+                    if not liability.is_finalized:
+                        self.reports.follow(liability)
+
+    async def _on_report(self, report: ValidatorReport) -> None:
+        for handler in self._handlers.reports:
+            await call(handler, report)
+
+    async def _on_phase(self, phase: Phase, liability: Liability) -> None:
+        if phase in PUBLISHED:
+            key = str(EventKey(self.parts.signer.address, liability.address, PUBLISHED[phase]))
+            self.parts.channel.put(key, liability.encode())
+        for handler in self._handlers.liabilities:
+            await call(handler, phase, liability)

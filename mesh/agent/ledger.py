@@ -1,0 +1,351 @@
+"""The ledger: an agent's jobs and their phases, its unsent messages and its orders, in one SQLite file.
+
+Every write survives `kill -9` once the call has returned, and a power loss unless it can be repeated: see "What
+survives a crash" in docs/architecture.md. Writes are idempotent.
+"""
+
+from __future__ import annotations
+
+import time
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+from msgspec.json import encode as json_encode
+from msgspec.structs import astuple
+
+from mesh.errors import AiraError
+from mesh.role.database import RoleLedger
+from schemas import Liability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+
+class Phase(StrEnum):
+    """Where a job is. The ledger keeps it, and a restarted agent continues from it."""
+
+    INCOMING = "incoming"
+    """The liability exists and names this agent; its objective has not been fetched yet."""
+    READY = "ready"
+    """The objective was fetched and can be played; the job waits for `start`."""
+    RUNNING = "running"
+    """The objective is being played and the device recorded."""
+    COMPLETE = "complete"
+    """The recording is closed and the Result signed; it is sent until the contract has it."""
+    FINALIZED = "finalized"
+    """The contract has paid or refunded. Nothing is left to do."""
+
+
+NEXT: Final = {
+    Phase.INCOMING: frozenset({Phase.READY, Phase.COMPLETE, Phase.FINALIZED}),
+    Phase.READY: frozenset({Phase.RUNNING, Phase.COMPLETE, Phase.FINALIZED}),
+    Phase.RUNNING: frozenset({Phase.COMPLETE, Phase.FINALIZED}),
+    Phase.COMPLETE: frozenset({Phase.FINALIZED}),
+    Phase.FINALIZED: frozenset(),
+}
+"""The phases that may follow each phase. A job that fails moves to COMPLETE without success, which refunds."""
+
+UNFINISHED: Final = (Phase.INCOMING, Phase.READY, Phase.RUNNING, Phase.COMPLETE)
+
+TO_BE_DONE: Final = (Phase.INCOMING, Phase.READY, Phase.RUNNING)
+"""Phases of a job whose work is not done yet."""
+
+STARTABLE: Final = (Phase.READY, Phase.RUNNING)
+"""Phases in which a job's playback may begin, continue or be restarted."""
+
+
+class WrongPhase(AiraError, code="wrong-phase"):
+    """The job's phase does not allow the operation. `phase` is its phase, None if the agent has no such job."""
+
+    def __init__(self, liability: str, *, asked: str, phase: Phase | None) -> None:
+        where = f"is {phase.value}" if phase else "is not a job of this agent"
+        super().__init__(f"can't {asked} {liability}: it {where}")
+        self.liability = liability
+        self.asked = asked
+        self.phase = phase
+
+
+def advance(liability: str, phase: Phase, to: Phase) -> Phase:
+    """`to`, if a job may move there from `phase`. Raises `WrongPhase` otherwise."""
+    if to not in NEXT[phase]:
+        raise WrongPhase(liability, asked=f"move to {to.value}", phase=phase)
+    return to
+
+
+SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS jobs (
+    liability TEXT PRIMARY KEY,
+    phase TEXT NOT NULL,
+    record BLOB NOT NULL,
+    success INTEGER,
+    result TEXT,
+    position INTEGER NOT NULL DEFAULT 0,
+    recorded INTEGER NOT NULL DEFAULT 0,
+    note TEXT NOT NULL DEFAULT '',
+    aside INTEGER NOT NULL DEFAULT 0,
+    changed REAL NOT NULL
+);
+CREATE INDEX IF NOT EXISTS jobs_by_phase ON jobs (phase, changed) WHERE NOT aside;
+CREATE TABLE IF NOT EXISTS outbox (
+    identity TEXT PRIMARY KEY,
+    kind TEXT NOT NULL,
+    payload BLOB NOT NULL,
+    deadline INTEGER,
+    posted REAL NOT NULL,
+    withdrawn INTEGER NOT NULL DEFAULT 0,
+    tx TEXT NOT NULL DEFAULT ''
+);
+CREATE TABLE IF NOT EXISTS spent (
+    identity TEXT PRIMARY KEY,
+    kind TEXT NOT NULL,
+    payload BLOB NOT NULL,
+    deadline INTEGER,
+    posted REAL NOT NULL,
+    withdrawn INTEGER NOT NULL,
+    liability TEXT NOT NULL
+);
+"""
+"""A withdrawn order is not sent, but may become a contract all the same, unless the transaction `tx` prevents that. The
+orders that became contracts are in `spent`."""
+COLUMNS: Final = "identity, kind, payload, deadline, posted, withdrawn"
+POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
+
+
+class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """A job as the ledger holds it.
+
+    `success` and `result` (CIDv0 of the recording) are set from COMPLETE on. `position` counts the objective's messages
+    that were played; its recording had `recorded` messages on the disk then. `note` says why a job failed.
+    """
+
+    liability: Liability
+    phase: Phase
+    success: bool | None
+    result: str | None
+    position: int
+    recorded: int
+    note: str
+
+
+class Outgoing(msgspec.Struct, frozen=True):
+    """A signed message that is sent until its effect is seen, or until block `deadline` (None: without end)."""
+
+    identity: str
+    kind: str
+    payload: bytes
+    deadline: int | None
+
+
+class StoredOrder(msgspec.Struct, frozen=True):
+    """An order of ours that is no contract. `posted` is Unix time; `tx` is the transaction that withdrew it, if any."""
+
+    identity: str
+    payload: bytes
+    posted: float
+    is_withdrawn: bool
+    tx: str
+
+
+class Ledger(RoleLedger):
+    """The ledger in the file at `path`, created if missing: `async with Ledger(path) as ledger`.
+
+    For contracts that a reorganisation takes back, or brings back, it remembers the last `spent_kept` spent orders, and
+    expired orders for `reorg_depth` blocks.
+    """
+
+    schema = SCHEMA
+
+    def __init__(self, path: Path, *, spent_kept: int = 4096, reorg_depth: int = 0) -> None:
+        super().__init__(path)
+        self._spent_kept = spent_kept
+        self._reorg_depth = reorg_depth
+
+    async def add_job(self, liability: Liability) -> bool:
+        """Add a job as INCOMING, or bring back one that was set aside. False if it was known already."""
+        return await self._database.run(
+            "INSERT INTO jobs (liability, phase, record, changed) VALUES (?, ?, ?, ?)"
+            " ON CONFLICT (liability) DO UPDATE SET aside = 0 WHERE aside",
+            (liability.address, Phase.INCOMING, liability.encode(), time.time()),
+            sync=False,
+        )
+
+    async def set_aside(self, liability: str) -> None:
+        """Hide a job, with everything that is known of it, until `add_job` or `bring_back` shows it again."""
+        await self._database.run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,), sync=False)
+
+    async def bring_back(self, liability: str) -> bool:
+        """Show a job that was set aside. False if there is none."""
+        statement = "UPDATE jobs SET aside = 0 WHERE liability = ? AND aside"
+        return await self._database.run(statement, (liability,), sync=False)
+
+    async def set_phase(self, liability: str, phase: Phase, *, position: int | None = None) -> None:
+        """Set the phase of the job at `liability` (address) and, if given, how many messages it has played."""
+        await self._database.run(
+            "UPDATE jobs SET phase = ?, position = COALESCE(?, position), changed = ? WHERE liability = ?",
+            (phase, position, time.time(), liability),
+            sync=False,
+        )
+
+    async def set_position(self, liability: str, position: int, *, recorded: int) -> None:
+        """Set how many messages the job at `liability` (address) has played.
+
+        Its recording must already have `recorded` messages on the disk, and with them all that were played.
+        """
+        await self._database.run(
+            "UPDATE jobs SET position = ?, recorded = ? WHERE liability = ?", (position, recorded, liability)
+        )
+
+    async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
+        """Set the job's outcome and keep its signed Result for sending: both or neither."""
+        ended = "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?"
+        await self._database.run_together(
+            (ended, (Phase.COMPLETE, success, result, note, time.time(), liability)), (POST, _posted(outgoing))
+        )
+
+    async def job(self, liability: str) -> JobRecord | None:
+        """The job at `liability` (EIP-55 address), if there is one."""
+        rows = await self._database.rows("SELECT * FROM jobs WHERE liability = ? AND NOT aside", (liability,))
+        return _job(rows[0]) if rows else None
+
+    async def jobs(self, phases: Iterable[Phase] = UNFINISHED) -> list[JobRecord]:
+        """The jobs in the given phases, oldest first."""
+        wanted = (json_encode(tuple(phases)),)
+        statement = "SELECT * FROM jobs WHERE phase IN (SELECT value FROM json_each(?)) AND NOT aside ORDER BY rowid"
+        return [_job(row) for row in await self._database.rows(statement, wanted)]
+
+    async def promisees(self, limit: int) -> list[str]:
+        """The promisees of the latest jobs, of `limit` jobs at most, the latest last."""
+        rows = await self._database.rows("SELECT record FROM jobs ORDER BY rowid DESC LIMIT ?", (limit,))
+        return [Liability.decode(row[0]).promisee for row in reversed(rows)]
+
+    async def holds(self, names: Sequence[str]) -> set[str]:
+        """Those of some names that are a job's liability (address), or the identity of a message in the outbox."""
+        statement = (
+            "WITH names AS (SELECT value FROM json_each(?)) SELECT liability FROM jobs WHERE liability IN names"
+            " UNION SELECT identity FROM outbox WHERE identity IN names"
+        )
+        return {row[0] for row in await self._database.rows(statement, (json_encode(names),))}
+
+    async def jobs_by_phase(self) -> dict[str, int]:
+        """The number of jobs in each phase that has any."""
+        return {phase: count for phase, count, _ in await self.phases()}
+
+    async def phases(self) -> list[tuple[str, int, float]]:
+        """Each phase that has jobs: how many, and when (Unix time) the first of them entered it."""
+        statement = "SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase"
+        return await self._database.rows(statement)
+
+    async def post(self, outgoing: Outgoing) -> None:
+        """Keep a signed message for sending, until `settle`."""
+        await self._database.run(POST, _posted(outgoing))
+
+    async def settle(self, identity: str) -> bool:
+        """Remove a message whose effect was seen. False if it was not in the outbox."""
+        statement = "DELETE FROM outbox WHERE identity = ? AND NOT withdrawn"
+        return await self._database.run(statement, (identity,), sync=False)
+
+    async def spend(self, identity: str, liability: str) -> None:
+        """Take an order out of the outbox that became the contract at `liability`, and keep it for `unspend`."""
+        keep = f"INSERT OR REPLACE INTO spent SELECT {COLUMNS}, ? FROM outbox WHERE identity = ?"
+        await self._database.run_together(
+            (keep, (liability, identity)),
+            ("DELETE FROM outbox WHERE identity = ?", (identity,)),
+            ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (self._spent_kept,)),
+            sync=False,
+        )
+
+    async def spent(self, liability: str) -> list[Outgoing]:
+        """The orders that became the contract at this address, withdrawn ones included."""
+        statement = "SELECT identity, kind, payload, deadline FROM spent WHERE liability = ?"
+        return [Outgoing(*row) for row in await self._database.rows(statement, (liability,))]
+
+    async def contracts(self, kind: str) -> list[tuple[bytes, str]]:
+        """The 64 latest orders of a kind, also withdrawn, that became contracts: payload, contract's address."""
+        statement = "SELECT payload, liability FROM spent WHERE kind = ? ORDER BY posted DESC LIMIT 64"
+        return await self._database.rows(statement, (kind,))
+
+    async def unspend(self, liability: str) -> None:
+        """Move the orders of a reverted contract back into the outbox. Withdrawn ones stay withdrawn."""
+        back = f"INSERT OR IGNORE INTO outbox ({COLUMNS}) SELECT {COLUMNS} FROM spent WHERE liability = ?"
+        remove = "DELETE FROM spent WHERE liability = ?"
+        await self._database.run_together((back, (liability,)), (remove, (liability,)), sync=False)
+
+    async def withdraw(self, withdrawals: Mapping[str, Outgoing]) -> None:
+        """Send their signed withdrawals instead of orders, which are remembered while they may become contracts."""
+        await self._database.run_together(
+            *(
+                step
+                for identity, withdrawal in withdrawals.items()
+                for step in (
+                    ("UPDATE outbox SET withdrawn = 1 WHERE identity = ?", (identity,)),
+                    (POST, _posted(withdrawal)),
+                )
+            )
+        )
+
+    async def use_up(self, identity: str, tx: str) -> None:
+        """The transaction `tx` has made sure that a withdrawn order can't become a contract any more."""
+        await self._database.run("UPDATE outbox SET tx = ? WHERE identity = ?", (tx, identity))
+
+    async def withdrawn_on_chain(self, *, head: int) -> list[StoredOrder]:
+        """The orders that transactions of ours withdrew, with a deadline after block `head`, the oldest first."""
+        return await self._stored("tx != '' AND deadline > ? ORDER BY posted", (head,))
+
+    async def replace(self, identity: str, outgoing: Outgoing) -> None:
+        """Keep a message for sending instead of the one called `identity`."""
+        remove = ("DELETE FROM outbox WHERE identity = ?", (identity,))
+        await self._database.run_together(remove, (POST, _posted(outgoing)))
+
+    async def orders(self) -> list[StoredOrder]:
+        """The orders that may still become contracts, oldest first, the withdrawn ones behind the others.
+
+        Check their deadlines: expired ones are among them.
+        """
+        return await self._stored("kind IN ('demand', 'offer') AND tx = '' ORDER BY withdrawn, posted")
+
+    async def _stored(self, condition: str, values: tuple[Any, ...] = ()) -> list[StoredOrder]:
+        columns = "identity, payload, posted, withdrawn, tx"
+        rows = await self._database.rows(f"SELECT {columns} FROM outbox WHERE {condition}", values)
+        return [
+            StoredOrder(identity, payload, posted, bool(withdrawn), tx)
+            for identity, payload, posted, withdrawn, tx in rows
+        ]
+
+    async def outbox(self, *, head: int) -> list[Outgoing]:
+        """The messages to send, oldest first: not those whose deadline block `head` has reached.
+
+        Deletes the latter `reorg_depth` blocks after their deadline.
+        """
+        last = head - self._reorg_depth
+        rows = await self._database.rows(
+            "SELECT identity, kind, payload, deadline, withdrawn FROM outbox WHERE NOT withdrawn OR deadline <= ?"
+            " ORDER BY rowid",
+            (last,),
+        )
+        if any(row[3] is not None and row[3] <= last for row in rows):
+            await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (last,), sync=False)
+        return [Outgoing(*row[:4]) for row in rows if not row[4] and (row[3] is None or row[3] > head)]
+
+    async def waiting_by_kind(self, *, head: int) -> dict[str, int]:
+        """The messages to send of each kind (`demand`, `offer`, `withdrawal`, `result`) that has any."""
+        condition = "NOT withdrawn AND (deadline IS NULL OR deadline > ?)"
+        statement = f"SELECT kind, COUNT(*) FROM outbox WHERE {condition} GROUP BY kind"
+        return dict(await self._database.rows(statement, (head,)))
+
+
+def _job(row: Any) -> JobRecord:
+    return JobRecord(
+        liability=Liability.decode(row[2]),
+        phase=Phase(row[1]),
+        success=None if row[3] is None else bool(row[3]),
+        result=row[4],
+        position=row[5],
+        recorded=row[6],
+        note=row[7],
+    )
+
+
+def _posted(outgoing: Outgoing) -> tuple[Any, ...]:
+    return (*astuple(outgoing), time.time())

@@ -1,0 +1,129 @@
+"""A file that must outlive a crash: SQLite, synced once for all that was written before.
+
+A write takes tens of microseconds and runs where it is called. A process that is killed takes none back; a machine that
+loses power takes those back that were not synced.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+from mesh.base.private_files import make_private_database, make_private_folder, sync_directory, sync_file
+from mesh.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
+
+DISK_ERRORS: Final = (OSError, sqlite3.Error)
+"""What the methods of a `SyncedDatabase` raise when the disk refuses, or the file is no database."""
+WAIT: Final = 2.0
+
+
+class SyncedDatabase:
+    """The database in the file at `path` with the tables of `schema`, between `open` and `close`.
+
+    Without a path nothing is kept, and everything counts as written. Use it in one event loop; without `sync`, in any
+    threads that take turns. A write waits up to `patience` seconds for that of another process.
+    """
+
+    def __init__(self, path: Path | None, schema: str, *, patience: float = WAIT) -> None:
+        self.path = path
+        self.written = self.synced = 0
+        """The number of the last write, and of the last one that no power failure takes back."""
+        self._schema = schema
+        self._patience = patience
+        self._database: sqlite3.Connection | None = None
+        self._syncing = asyncio.Lock()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a file, and it is open."""
+        return self._database is not None
+
+    def open(self) -> None:
+        """Open the file, or create it, and sync it: an earlier process may have been killed before it did."""
+        if self.path is None:
+            return
+        make_private_folder(self.path.parent)
+        make_private_database(self.path)
+        opened = sqlite3.connect(self.path, timeout=self._patience, isolation_level=None, check_same_thread=False)
+        try:
+            opened.executescript("PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL;")
+            self._prepare(opened)
+            self._sync(self.path)
+            sync_directory(self.path.parent)
+        except BaseException:
+            opened.close()
+            raise
+        self._database = opened
+        self.synced = self.written
+
+    def _prepare(self, database: sqlite3.Connection) -> None:
+        """Create the tables where they are missing."""
+        database.executescript(self._schema)
+
+    def close(self) -> None:
+        """Close the file if it is open."""
+        if self._database is not None:
+            self._database.close()
+            self._database = None
+
+    def rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
+        """The rows that a statement returns."""
+        return [] if self._database is None else self._database.execute(statement, values).fetchall()
+
+    def write(self, *statements: tuple[str, Iterable[tuple[object, ...]]]) -> int:
+        """Run each statement with each of its rows of values: all of them have an effect or, if one fails, none.
+
+        Returns how many rows of the database were changed.
+        """
+        if self.path is None:
+            self.written += 1
+            return 0
+        with self.transaction() as database:
+            before = database.total_changes
+            for statement, rows in statements:
+                database.executemany(statement, rows)
+            return database.total_changes - before
+
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """A transaction for the body, which is taken back if that fails."""
+        if self._database is None:
+            raise OSError("it is not open")
+        self._database.execute("BEGIN IMMEDIATE")
+        try:
+            yield self._database
+            self._database.execute("COMMIT")
+        except BaseException:
+            if self._database.in_transaction:
+                self._database.execute("ROLLBACK")
+            raise
+        self.written += 1
+
+    async def sync(self) -> None:
+        """Wait until all that was written so far is on the disk, also after a power failure."""
+        number = self.written
+        async with self._syncing:
+            if self.synced < number:
+                number = self.written
+                if self.path is not None:
+                    await asyncio.to_thread(self._sync, self.path)
+                self.synced = number
+
+    def _sync(self, path: Path) -> None:
+        """What was committed is in SQLite's log, or was synced when it left that."""
+        sync_file(path.with_name(f"{path.name}-wal"))
+
+
+def transactions_not_kept(place: Path | None, error: Exception) -> ConfigurationError:
+    """The error of a disk that refuses sent transactions, or the orders in them."""
+    return ConfigurationError(
+        f"can't keep sent transactions in {place}: {getattr(error, 'strerror', None) or error}",
+        hint="make room on that disk, let this user write there, or name another folder with --data-dir",
+        code="transactions-not-kept",
+    )

@@ -1,0 +1,136 @@
+"""State on the disk is readable by its own user only, whatever the umask: files 600, folders 700.
+
+State that an older version or another program left more open is tightened when it is opened.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import stat
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, BinaryIO, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+PRIVATE_FILE: Final = 0o600
+PRIVATE_FOLDER: Final = 0o700
+_OTHERS: Final = 0o077
+_DATABASE_SUFFIXES: Final = ("", "-wal", "-shm")
+
+
+def make_private_folder(folder: Path) -> None:
+    """Create a folder for state, and parents that are missing, for this user only. Raises `OSError`.
+
+    An existing folder that is more open is tightened with all that is in it; its parents stay as they are.
+    """
+    make_missing_folders(folder)
+    if tighten(folder):
+        for path in folder.rglob("*"):
+            with suppress(FileNotFoundError):  # temporary files go away
+                tighten(path)
+
+
+def make_missing_folders(folder: Path) -> None:
+    """Create the folder and its parents for this user only where they are missing. Raises `OSError`."""
+    for missing in reversed([folder, *folder.parents]):
+        if not missing.exists():
+            missing.mkdir(mode=PRIVATE_FOLDER, exist_ok=True)
+    if not folder.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
+
+
+def open_private(path: Path | str, flags: int) -> int:
+    """Open a file as `os.open` does, creating it for this user only (an `opener` for `open`). Raises `OSError`."""
+    descriptor = os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE)
+    status = os.fstat(descriptor)
+    if status.st_mode & _OTHERS and status.st_uid == os.geteuid() and stat.S_ISREG(status.st_mode):
+        os.fchmod(descriptor, stat.S_IMODE(status.st_mode) & ~_OTHERS)
+    return descriptor
+
+
+def make_private_database(path: Path) -> None:
+    """Create the empty file of an SQLite database, or tighten an existing one with its log. Raises `OSError`.
+
+    SQLite gives the files beside it the mode of the database.
+    """
+    os.close(open_private(path, os.O_RDWR | os.O_CREAT))
+    for suffix in _DATABASE_SUFFIXES[1:]:
+        beside = path.with_name(path.name + suffix)
+        if beside.exists():
+            tighten(beside)
+
+
+def tighten(path: Path) -> bool:
+    """Take all rights of others from this user's file or folder; whether there were any.
+
+    Folders that users share, as /tmp, and links stay as they are.
+    """
+    status = path.lstat()
+    is_ours = status.st_uid == os.geteuid() and not status.st_mode & stat.S_ISVTX and not stat.S_ISLNK(status.st_mode)
+    if not (status.st_mode & _OTHERS and is_ours):
+        return False
+    path.chmod(stat.S_IMODE(status.st_mode) & ~_OTHERS)
+    return True
+
+
+def is_locked(path: Path, *, lock: int = fcntl.LOCK_EX) -> bool:
+    """Whether this process or another has the file at `path` locked, so that it could not have the `lock` as well."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def write_new(path: Path | str, content: bytes, *, mode: int = PRIVATE_FILE) -> None:
+    """Write and sync a file that does not exist yet. Raises `OSError`, `FileExistsError` among them."""
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def atomic_file(final: Path, *, private: bool = False) -> Iterator[BinaryIO]:
+    """A stream to a file that appears at `final`, complete and synced, if the `with` block ends without error.
+
+    Only this user can read it if it is `private`.
+    """
+    temporary = final.with_name(f"{final.name}.new")
+    try:
+        with open(temporary, "wb", opener=open_private if private else None) as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.rename(final)
+        sync_directory(final.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sync_directory(directory: Path) -> None:
+    """Sync the names of the directory to the disk: a rename is durable only after this."""
+    _sync(directory, os.O_DIRECTORY)
+
+
+def sync_file(path: Path) -> None:
+    """Sync what was written to a file, by whomever."""
+    _sync(path, 0)
+
+
+def _sync(path: Path, flags: int) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | flags)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,267 @@
+"""`Chain`: liabilities, lighthouses, tokens, names and events of one chain, for one account."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar
+
+from mesh.chain._abi import is_code_of
+from mesh.chain._contracts import Contracts, contract_version
+from mesh.chain._lighthouses import Lighthouses
+from mesh.chain._names import Names, find_registry
+from mesh.chain._node import Node
+from mesh.chain._tokens import Funds, Tokens
+from mesh.chain._validators import Validators
+from mesh.chain.errors import NoContracts, UnknownName
+from mesh.chain.following import NODE_ERRORS, EventSources, follow, history_at, read_events, retrying
+from mesh.chain.liabilities import Liabilities
+from mesh.chain.metrics import CachedMetrics
+from mesh.chain.transactions import TransactionSender
+from mesh.errors import ClosedError
+from mesh.telemetry.metrics import gauge
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Sequence
+    from pathlib import Path
+    from typing import Self
+
+    from web3 import AsyncWeb3
+    from web3.providers.async_base import AsyncBaseProvider
+
+    from mesh.base.outage_log import OutageLog
+    from mesh.chain._accounts import Account
+    from mesh.chain._contracts import ContractKind
+    from mesh.chain._policy import FeePolicy, Timing
+    from mesh.chain.following import BlockEvents, Choose, History
+    from mesh.chain.rpc import Endpoint
+    from mesh.errors import AiraError
+    from mesh.telemetry.metrics import MetricFamily
+
+T = TypeVar("T")
+
+
+class Chain:
+    """The contracts of the network on the chain at `endpoint` (see `Node`), for one `account` or for reading only.
+
+    `contracts` says whether they are this project's (`"mesh"`, which read both generations of orders) or the
+    originals (`"original"`) of a `generation`; the generation also names the root under which names are looked up.
+    `ens` is the address of the ENS registry (empty: the public or a development chain's); `factory` and `xrt` are
+    names or addresses, empty for those under that root. `timing`, `fees` and `transactions` are for the node (see
+    `Node`), unless a node is given.
+
+    Amounts are ints: wei for ETH, wn for XRT, a token's smallest unit otherwise. Addresses are EIP-55; an ENS name
+    works wherever a lighthouse, token or account is expected.
+
+    Used with `async with`, which raises `NodeUnreachable`, `NoContracts` and `UnknownName`. Every method raises
+    `NodeUnreachable` when the node is lost, except those that wait for something. Methods that send a transaction wait
+    until it is mined; they raise `Reverted` (also without sending, when the simulation fails), `InsufficientFunds`,
+    `TransactionTimeout`, and `ConfigurationError` (`no-account`). Its methods are grouped in parts: `liabilities`,
+    `lighthouses`, `validators`, `funds`, `tokens`, `names`; `follow` yields events; `web3` talks to any other
+    contract.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint | Node,
+        *,
+        account: Account | None = None,
+        ens: str = "",
+        factory: str = "",
+        xrt: str = "",
+        generation: int = 3,
+        contracts: ContractKind = "mesh",
+        timing: Timing | None = None,
+        fees: FeePolicy | None = None,
+        transactions: Path | None = None,
+        known_validators: Sequence[str] = (),
+    ) -> None:
+        self.account = account
+        self._known_validators = known_validators
+        self.generation = generation
+        self._owns_node = not isinstance(endpoint, Node)
+        self.node = (
+            endpoint
+            if isinstance(endpoint, Node)
+            else Node(endpoint, timing=timing, fees=fees, transactions=transactions)
+        )
+        self._ens = ens
+        self._factory_name = factory or f"factory.{generation}.robonomics.eth"
+        self._xrt_name = xrt or f"xrt.{generation}.robonomics.eth"
+        self._kind = contracts
+        self._stack = AsyncExitStack()
+        self._contracts: Contracts | None = None
+        self._web3: AsyncWeb3[AsyncBaseProvider] | None = None
+        self._balances = CachedMetrics(self._ask_balances, max_age=self.node.timing.metrics_age)
+
+    async def __aenter__(self) -> Self:
+        async with AsyncExitStack() as stack:
+            if self._owns_node:
+                await stack.enter_async_context(self.node)
+            self._contracts = await self._find_contracts()
+            self._validators = Validators(self._contracts, listed=self._known_validators)
+            self._funds = Funds(self._contracts)
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        self._contracts = self._web3 = None
+        await self._stack.aclose()
+
+    @property
+    def chain_id(self) -> int:
+        """EIP-155 number of the chain."""
+        return self.node.chain_id
+
+    @property
+    def ens(self) -> str:
+        """Address of the ENS registry in use."""
+        return self._opened().names.registry
+
+    @property
+    def factory(self) -> str:
+        """Address of the factory, which is the spender to approve for costs and fees."""
+        return self._opened().factory
+
+    @property
+    def xrt(self) -> str:
+        """Address of the token XRT."""
+        return self._opened().xrt
+
+    @property
+    def names(self) -> Names:
+        """ENS names."""
+        return self._opened().names
+
+    @property
+    def tokens(self) -> Tokens:
+        """Ether, XRT and other tokens."""
+        return Tokens(self._opened())
+
+    @property
+    def funds(self) -> Funds:
+        """What accounts have and let the factory take; what orders cost, and whether it can be paid."""
+        self._opened()
+        return self._funds
+
+    @property
+    def lighthouses(self) -> Lighthouses:
+        """Lighthouses, stakes and turns."""
+        return Lighthouses(self._opened())
+
+    @property
+    def liabilities(self) -> Liabilities:
+        """Liabilities, and the orders that they are created from."""
+        return Liabilities(self._opened())
+
+    @property
+    def validators(self) -> Validators:
+        """Which validators orders may name."""
+        self._opened()
+        return self._validators
+
+    @property
+    def web3(self) -> AsyncWeb3[AsyncBaseProvider]:
+        """web3's client of the same nodes, to talk to any other contract: `chain.web3.eth.contract(…)`.
+
+        Its requests are repeated, limited and checked as all others here. With an account, that is its
+        `eth.default_account`, and what `transact` and `eth.send_transaction` send is priced, numbered, signed and sent
+        again as every transaction of the account: they return when it is mined, and raise as `TransactionSender.send`
+        does, whatever gas and fees they were given. web3 looks names up in the public network's ENS only:
+        `chain.names` knows this chain's.
+        """
+        contracts = self._opened()
+        if self._web3 is None:
+            from mesh.chain._web3_client import web3_of  # takes 20 MB, which few programs need
+
+            self._web3 = web3_of(self.node.rpc, contracts.sender)
+        return self._web3
+
+    async def has_mesh_contracts(self) -> bool:
+        """Whether factory and token have the code that this project's sources compile to."""
+        for name, address in (("Factory", self.factory), ("XRT", self.xrt)):
+            if not is_code_of(name, await self.node.code(address)):
+                return False
+        return True
+
+    async def block_number(self) -> int:
+        """Number of the latest block."""
+        return await self.node.block_number()
+
+    async def history_at(self, block_number: int) -> History:
+        """The history of a consumer that has read nothing yet and begins after a block: see `following`."""
+        return await history_at(self.node, block_number)
+
+    def follow(
+        self,
+        cursor: int,
+        *,
+        history: History | None = None,
+        token: str = "",
+        parties: Iterable[str] | None = None,
+        choose: Choose | None = None,
+        outages: OutageLog | None = None,
+    ) -> AsyncGenerator[BlockEvents, None]:
+        """Blocks with their events from the block `cursor` on, and reorganisations, without end: see `following`.
+
+        Transfers and approvals are those of `token` (an address; XRT by default), all or those that concern one of
+        `parties` (addresses). `choose` says which liabilities' events are read; all by default. Outages of the node are
+        logged to `outages` and survived. Raises `ChainWentBack`.
+        """
+        contracts = self._opened()
+        sources = EventSources(
+            factory=contracts.factory,
+            token=token or contracts.xrt,
+            parties=None if parties is None else frozenset(parties),
+            choose=choose,
+            version=contracts.version,
+        )
+        read = partial(read_events, self.node, sources)
+        return follow(self.node, read, cursor, history=history, outages=outages)
+
+    async def retrying(
+        self,
+        question: Callable[[], Awaitable[T]],
+        *,
+        outages: OutageLog | None = None,
+        errors: tuple[type[AiraError], ...] = NODE_ERRORS,
+    ) -> T:
+        """The answer to a question to the chain: see `following.retrying`."""
+        return await retrying(self.node, question, outages=outages, errors=errors)
+
+    async def measure(self) -> tuple[MetricFamily, ...]:
+        """The metrics of the node, and of the account if there is one."""
+        return (*self.node.metrics.families(), *await self._balances.measure())
+
+    async def _ask_balances(self) -> Iterable[MetricFamily]:
+        if self.account is None:
+            return ()
+        eth, xrt = await asyncio.gather(self.tokens.eth_balance(), self.tokens.balance())
+        return (
+            gauge("aira_account_eth_wei", "What the account has to pay gas with, wei", eth),
+            gauge("aira_account_xrt_wn", "What the account has of XRT, wn", xrt),
+        )
+
+    async def _find_contracts(self) -> Contracts:
+        names = Names(self.node, await find_registry(self.node, self._ens), self.generation)
+        try:
+            factory = await names.address(self._factory_name)
+            xrt = await names.address(self._xrt_name)
+        except UnknownName as error:
+            raise NoContracts(f"contract named {error.name}", self.node.chain_id) from None
+        if not await self.node.code(factory):
+            raise NoContracts(f"factory at {factory}", self.node.chain_id)
+        return Contracts(
+            node=self.node,
+            names=names,
+            version=contract_version(self._kind, self.node, factory, self.generation),
+            factory=factory,
+            xrt=xrt,
+            sender=None if self.account is None else TransactionSender(self.node, self.account),
+        )
+
+    def _opened(self) -> Contracts:
+        if self._contracts is None:
+            raise ClosedError("the chain is not open: use it with `async with`")
+        return self._contracts

@@ -1,0 +1,793 @@
+"""A connection to an Ethereum node: what is the same whatever contracts the chain holds.
+
+**The latest block** is looked for once for all who wait (`Heads`): pushed by the node, or polled when it is expected.
+Where blocks come at a steady pace that is slower than the poll interval (a slot every 12 s), the next one is looked for
+when it is due. The pace is that of the blocks' timestamps; when a block of some timestamp is there, by our clock, is
+learned: a look that finds the block makes the next one a little earlier, a look that comes too soon makes it later.
+Everywhere else, and until the pace is known, the node is asked each poll interval.
+
+**Many functions of contracts** are read in one call: the node runs code that is never deployed, the constructor of
+`contracts/src/Multicall.sol`, which makes the calls and returns the answers instead of code. What a node does not
+answer that way is asked one by one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from contextlib import suppress
+from functools import partial
+from itertools import product
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from mesh.base.log_context import log_event
+from mesh.chain._abi import ContractFunctions, SpoiledAnswer, decode, encode, load_artifact, our_functions
+from mesh.chain._pending import PendingTransactions, TransactionStore
+from mesh.chain._policy import GWEI, FeePolicy, Fees, GasMarket, Timing
+from mesh.chain.answers import (
+    ANSWERS,
+    BEHIND,
+    BlockBody,
+    BlockHeader,
+    BlockReceipt,
+    InvalidAnswer,
+)
+from mesh.chain.errors import (
+    METHOD_NOT_FOUND,
+    NoContracts,
+    NodeUnreachable,
+    RequestRefused,
+    Reverted,
+)
+from mesh.chain.metrics import NodeMetrics
+from mesh.chain.rpc import RpcClient
+from mesh.errors import ClosedError, ConfigurationError
+from schemas.address import address_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+    from pathlib import Path
+    from typing import Self
+
+    from mesh.chain._abi import ContractCall
+    from mesh.chain.answers import Log, MinedTransaction
+    from mesh.chain.rpc import Endpoint
+    from mesh.errors import AiraError
+
+    Call: TypeAlias = tuple[str, bytes]
+    "An address and data."
+
+
+SAMPLES: Final = 5
+"""The latest times between two blocks that are compared."""
+STEADY: Final = 4
+"""How many of them must be equal, to within a second: slots may be missed."""
+QUICKEST: Final = 2
+"""Seconds between two blocks below which there is nothing to gain."""
+EARLIER: Final = 0.005
+LATER: Final = 0.05
+"""Parts of the time between two blocks by which the next look comes earlier after a hit, or later after a miss."""
+LONGEST_PAUSE: Final = 0.25
+"""The same: between two looks for a block that is late."""
+SILENCE: Final = 60.0
+"""Seconds without a block after which a node that pushes blocks is asked all the same, at the latest."""
+MISSED: Final = 3
+"""The same: the longest of the latest times between two blocks, so often."""
+
+
+class Pace:
+    """When the next block is due, by the timestamps of those before it. Pure: times are passed."""
+
+    def __init__(self, interval: float) -> None:
+        self._interval = interval
+        self._gaps: deque[int] = deque(maxlen=SAMPLES)
+        self._offset: float | None = None
+        """By our clock: how long after its timestamp a block is there."""
+        self._misses = 0
+
+    @property
+    def seconds(self) -> int | None:
+        """Seconds between two blocks; None where they come irregularly, or faster than is worth waiting for."""
+        for gap in set(self._gaps):
+            steady = sum(abs(gap - other) <= 1 for other in self._gaps)
+            if gap > max(QUICKEST, self._interval) and steady >= min(STEADY, len(self._gaps)) >= STEADY - 1:
+                return gap
+        return None
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether it is known when the next block is due."""
+        return self.seconds is not None and self._offset is not None
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether enough blocks were seen to know."""
+        return len(self._gaps) >= STEADY - 1 or any(gap <= max(QUICKEST, self._interval) for gap in self._gaps)
+
+    @property
+    def silence(self) -> float:
+        """Seconds without a pushed block after which the node is asked all the same."""
+        return min(SILENCE, 5.0 + MISSED * max(self._gaps)) if self.is_sampled and self._gaps else SILENCE
+
+    def add(self, earlier: BlockHeader, later: BlockHeader) -> None:
+        """Count the time between two blocks, of which the second follows the first."""
+        if later.number == earlier.number + 1:
+            self._gaps.append(later.timestamp - earlier.timestamp)
+
+    def found(self, block: BlockHeader, now: float, *, waited: float) -> None:
+        """A look found a new block, `waited` seconds after the look before."""
+        seconds, delay = self.seconds, now - block.timestamp
+        if seconds is None:
+            self._offset = None
+        elif self._offset is None:
+            self._offset = delay if waited <= 2 * self._interval else None
+        else:
+            self._offset = min(self._offset, delay) - (0 if self._misses else EARLIER * seconds)
+        self._misses = 0
+
+    def missed(self) -> None:
+        """A look at the time when a block was due found none."""
+        self._misses = min(self._misses + 1, 10)
+        if self._misses == 1 and self._offset is not None:
+            self._offset += LATER * (self.seconds or 0)
+
+    def is_early(self, latest: BlockHeader, now: float) -> bool:
+        """Whether it is too early for the block after the latest."""
+        return self.is_learned and not self._misses and self.pause(latest, now) > 0
+
+    def pause(self, latest: BlockHeader | None, now: float) -> float:
+        """Seconds until the next look."""
+        seconds = self.seconds
+        if latest is None or seconds is None or self._offset is None:
+            return self._interval
+        if self._misses:
+            return min(LATER * (1 << self._misses - 1), LONGEST_PAUSE) * seconds
+        return min(max(latest.timestamp + seconds + self._offset - now, 0.0), float(seconds))
+
+
+class Heads:
+    """The latest block: `look` asks for it now, and `next` waits for one that the caller has not seen.
+
+    `ask` asks the node; `header` asks for the block of a number. Both raise the errors of the node, to one of those who
+    wait; the others then ask themselves. `request_pushes` asks the node, when somebody waits, to call `pushed`; it is
+    called often.
+    """
+
+    def __init__(
+        self,
+        ask: Callable[[], Awaitable[BlockHeader]],
+        header: Callable[[int], Awaitable[BlockHeader | None]],
+        *,
+        interval: float,
+        request_pushes: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.latest: BlockHeader | None = None
+        """The latest block that the node has returned or pushed, if any."""
+        self.is_pushed = False
+        """Whether the node pushes new blocks."""
+        self.pace = Pace(interval)
+        self._ask = ask
+        self._header = header
+        self._interval = interval
+        self._request_pushes = request_pushes
+        self._seen_at = 0.0
+        self._expected = 0
+        self._measured: BlockHeader | None = None
+        self._looking = asyncio.Lock()
+        self._news = asyncio.Event()
+
+    @property
+    def are_timely(self) -> bool:
+        """Whether `next` returns soon after a block is there, so that nothing is gained by asking meanwhile."""
+        return self.is_pushed or self.pace.is_learned
+
+    async def look(self) -> BlockHeader:
+        """The latest block, asked for now."""
+        head = await self._ask()
+        self._take(head)
+        return head
+
+    async def recent(self) -> BlockHeader:
+        """The latest block, as it was a poll interval ago or later; the node is asked only if it is not known."""
+        if self.latest is not None:
+            now = self._now()
+            if now - self._seen_at <= self._interval or self.is_pushed or self.pace.is_early(self.latest, now):
+                return self.latest
+        return await self.look()
+
+    async def block_time(self, blocks: int) -> float | None:
+        """Seconds between two of the last `blocks` blocks, measured at times; None if the chain does not tell."""
+        last = await self.recent()
+        if self._measured is None or not 0 <= last.number - self._measured.number <= 2 * blocks:
+            self._measured = await self._header(max(1, last.number - blocks))
+        first = self._measured
+        if first is None or first.number >= last.number or first.timestamp >= last.timestamp:
+            self._measured = None
+            return None
+        return (last.timestamp - first.timestamp) / (last.number - first.number)
+
+    async def next(self, seen: bytes) -> BlockHeader:
+        """The latest block as soon as its hash is not `seen`."""
+        while self.latest is None or self.latest.hash == seen:
+            async with self._looking:
+                if self.latest is None:
+                    await self.look()
+                elif self.latest.hash == seen:
+                    await self._wait_and_look(self.latest)
+        return self.latest
+
+    def expect(self, number: int) -> None:
+        """The chain has a block of this number, as a receipt says: it is looked for at once if somebody waits."""
+        if self.latest is not None and self.latest.number < number:
+            self._expected = number
+            self._announce()
+
+    def pushed(self, head: BlockHeader | None) -> None:
+        """The node has pushed a block; None means that it pushes no more."""
+        self.is_pushed = head is not None
+        if head is None:
+            self._announce()  # who waits for a push looks itself
+        else:
+            self._take(head)
+
+    def _take(self, head: BlockHeader) -> None:
+        before, self.latest, self._seen_at = self.latest, head, self._now()
+        if before is None or before.hash != head.hash:
+            if before is not None and before.hash == head.parent_hash:
+                self.pace.add(before, head)
+            self._announce()
+
+    def _announce(self) -> None:
+        self._news.set()
+        self._news = asyncio.Event()
+
+    async def _wait_and_look(self, latest: BlockHeader) -> None:
+        """Wait until the next block is due, or pushed; then look for it."""
+        self._request_pushes()
+        news, is_due, asked_at = self._news, self.pace.is_learned, self._seen_at
+        pause = self.pace.silence if self.is_pushed else self.pace.pause(latest, self._now())
+        if self._expected > latest.number:
+            self._expected, pause = 0, 0.0
+        with suppress(TimeoutError):
+            async with asyncio.timeout(pause):
+                await news.wait()
+                return
+        if not self.pace.is_sampled:
+            await self._sample(latest)
+        if (head := await self.look()).hash != latest.hash:
+            self.pace.found(head, self._now(), waited=self._now() - asked_at)
+        elif is_due:
+            self.pace.missed()
+
+    async def _sample(self, later: BlockHeader) -> None:
+        """Learn the pace from the blocks before the latest one."""
+        while not self.pace.is_sampled and later.number > 0:
+            earlier = await self._header(later.number - 1)
+            if earlier is None or earlier.hash != later.parent_hash:
+                return
+            self.pace.add(earlier, later)
+            later = earlier
+
+    @staticmethod
+    def _now() -> float:
+        return asyncio.get_running_loop().time()
+
+
+log = logging.getLogger(__name__)
+
+READ_ATTEMPTS: Final = 3
+"""How often a contract's function is called while what it returns does not decode."""
+
+CALLS_AT_ONCE: Final = 100
+"""Most calls in one: the creation code has 49,152 bytes at most (EIP-3860), and what it returns 24,576 (EIP-170)."""
+UNLIMITED_GAS: Final = 2**256 - 1
+LONGEST: Final = 0xFFFF
+"""Bytes of an answer."""
+
+
+def getters(contract: str, address: str, names: Iterable[str]) -> list[ContractCall]:
+    """Calls of the getters `names` at an address that holds one of our contracts (`artifacts.NAMES`)."""
+    functions = our_functions(contract)
+    return [functions[name].at(address) for name in names]
+
+
+def _values(call: ContractCall, returned: bytes | None) -> Any:
+    """What a contract's function returned, several values as a tuple. Raises `SpoiledAnswer`."""
+    if returned is None:
+        raise SpoiledAnswer(f"{call.fn_name} failed")
+    values = decode(call.outputs, returned)
+    return values[0] if len(values) == 1 else values
+
+
+def encode_calls(calls: Sequence[Call], *, gas: int, most: int) -> bytes:
+    """The creation code that makes the calls, each with at most `gas`, for at most `most` bytes of its answer."""
+    packed = b"".join([bytes.fromhex(to[2:]) + len(data).to_bytes(2) + data for to, data in calls])
+    words = b"".join([number.to_bytes(32) for number in (gas, most, 96, len(packed))])  # 96: where the length is
+    return load_artifact("Multicall").bytecode + words + packed + bytes(-len(packed) % 32)
+
+
+def decode_calls(code: bytes) -> list[Call] | None:
+    """The calls that `encode_calls` encoded; None for other code. For nodes that imitate it."""
+    known = load_artifact("Multicall").bytecode
+    if not code.startswith(known):
+        return None
+    packed, calls, at = decode(["uint256", "uint256", "bytes"], code[len(known) :])[2], [], 0
+    while at < len(packed):
+        data = at + 22
+        end = data + int.from_bytes(packed[at + 20 : data])
+        calls.append(("0x" + packed[at : at + 20].hex(), packed[data:end]))
+        at = end
+    return calls
+
+
+def encode_answers(answers: Sequence[bytes | None]) -> bytes:
+    """What the code returns: of each call what it returned, or None if it failed."""
+    return b"".join([bytes([one is not None]) + len(one or b"").to_bytes(2) + (one or b"") for one in answers])
+
+
+def decode_answers(returned: bytes, *, number: int) -> list[bytes | None]:
+    """The reverse of `encode_answers`, for that many answers. Raises `SpoiledAnswer`."""
+    answers: list[bytes | None] = []
+    at = 0
+    while at < len(returned):
+        data = at + 3
+        end = data + int.from_bytes(returned[at + 1 : data])
+        if end > len(returned) or returned[at] > 1:
+            raise SpoiledAnswer("the answers to many calls are cut off")
+        answers.append(returned[data:end] if returned[at] else None)
+        at = end
+    if len(answers) != number:
+        raise SpoiledAnswer(f"there are {len(answers)} answers to {number} calls")
+    return answers
+
+
+LOGS_REFUSED: Final = 5
+"""Refusals of `eth_getLogs` for blocks whose receipts the node has, after which only receipts are asked for."""
+
+DOUBTS: Final = 8
+"""Empty answers for a block, against its Bloom filter and without receipts, of which the last one is believed."""
+
+LONGEST_QUANTITY: Final = 66
+"""Characters of a number of a node: 0x and 64 digits."""
+
+USUAL_PRIORITY: Final = GWEI
+"""The priority fee where the node suggests none in any way, wei."""
+
+PRIORITY_SECONDS: Final = 60.0
+"""How long the priority fee that the node suggests is used; the base fee is that of the latest block."""
+
+
+class Node:
+    """A node reached at `endpoint`: `http(s)://…`, `ws(s)://…` or a `Transport` (which stays open).
+
+    Several endpoints (a sequence, or one text with commas) are nodes of one chain: when one does not answer, the next
+    is asked, and stays in use until it fails in turn.
+
+    `fees` is what its accounts pay at most. Transactions are recorded in the folder `transactions`, if given: then
+    several processes of one account never use the same nonce, and one that is restarted continues what it began.
+
+    Used with `async with`, which connects: raises `NodeUnreachable` when nobody answers, `ConfigurationError` when one
+    of several is on another chain. Creating it raises `ConfigurationError` for a text that is not an endpoint. Its
+    methods raise `NodeUnreachable` when the node is lost, after bounded retries, and `RequestRefused`.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        *,
+        timing: Timing | None = None,
+        fees: FeePolicy | None = None,
+        transactions: Path | None = None,
+    ) -> None:
+        self.timing = timing or Timing()
+        self.fees = fees or FeePolicy()
+        self.metrics = NodeMetrics()
+        self._transactions = transactions
+        self._chain_folder: Path | None = None
+        self.rpc = RpcClient(endpoint, timing=self.timing, metrics=self.metrics)
+        """The requests to the node."""
+        self.heads = Heads(
+            self._ask_latest, self.header, interval=self.timing.poll_interval, request_pushes=self._request_pushes
+        )
+        """The latest block, for all who wait for the next one."""
+        self._logs_refused = 0
+        self._doubted = b"", 0
+        """The block of the last empty answer that could not be proven, and how many there were for it."""
+        self._is_doubt_told = False
+        self._has_block_receipts = True
+        self._has_pending = True
+        self._priority = 0.0, 0
+        self._chain_id: int | None = None
+        self._pending: dict[str, PendingTransactions] = {}
+
+    @property
+    def endpoint(self) -> str:
+        """Where the node is, for people to read."""
+        return self.rpc.endpoint
+
+    @property
+    def chain_id(self) -> int:
+        """EIP-155 number of the chain. Raises `ClosedError` before the connection."""
+        if self._chain_id is None:
+            raise ClosedError("the node is not connected: use it with `async with`")
+        return self._chain_id
+
+    async def __aenter__(self) -> Self:
+        self._pending.clear()
+        self.rpc.open()
+        try:
+            self._chain_id = int(await self._ask("eth_chainId"))
+            await self.rpc.check_chains(self._chain_id)
+            if self._transactions is not None:  # a development chain that was restarted has another first block
+                self._chain_folder = self._transactions / f"{self._chain_id}-{(await self.block_hash(0)).hex()[:16]}"
+        except BaseException:
+            await self.rpc.close()
+            raise
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        self._chain_id = None
+        for pending in self._pending.values():
+            pending.close()
+        await self.rpc.close()
+
+    async def request(self, method: str, *params: Any) -> Any:
+        """The result of any JSON-RPC method, as JSON."""
+        return await self.rpc.request(method, list(params))
+
+    async def client_version(self) -> str:
+        """The name and version of the node's program."""
+        return str(await self._ask("web3_clientVersion"))
+
+    async def is_syncing(self) -> bool:
+        """Whether the node says that it has not all blocks yet."""
+        return bool(await self._ask("eth_syncing"))
+
+    async def block_number(self) -> int:
+        """Number of the latest block."""
+        return int(await self._ask("eth_blockNumber"))
+
+    async def header(self, block: int | str) -> BlockHeader | None:
+        """A block, by its number or `latest`; None if the chain does not have it."""
+        header: BlockHeader | None = await self._ask("eth_getBlockByNumber", _block(block), False)
+        if header is not None and block not in ("latest", header.number):
+            raise InvalidAnswer(f"eth_getBlockByNumber for {block}", f"it is block {header.number}")
+        return header
+
+    async def _ask_latest(self) -> BlockHeader:
+        """A null is asked again like any other spoiled answer: every chain has a latest block."""
+        found: BlockHeader = await self.rpc.request("eth_getBlockByNumber", ["latest", False], kind=BlockHeader)
+        return found
+
+    async def block_hash(self, number: int) -> bytes:
+        """The 32-byte hash of a block. Raises `NodeUnreachable` if the node does not have the block."""
+        header: BlockHeader = await self.rpc.request(
+            "eth_getBlockByNumber", [hex(number), False], kind=BlockHeader
+        )  # not null: another machine, or another node, may have it
+        return header.hash
+
+    async def logs(
+        self, first: int, last: int, *, addresses: Collection[str], topics: Sequence[str], about: str = ""
+    ) -> list[Log]:
+        """The logs of the blocks from `first` to `last`, both included, whose first topic is one of `topics`.
+
+        Those of all contracts, unless `addresses` are given; with `about`, those whose second topic is this address.
+        """
+        query: dict[str, Any] = {"fromBlock": hex(first), "toBlock": hex(last), "topics": [list(topics)]}
+        if about:
+            query["topics"].append("0x" + (bytes(12) + address_bytes(about)).hex())
+        if addresses:
+            query["address"] = list(addresses)
+        logs: list[Log] = await self._ask("eth_getLogs", query)
+        if any(not first <= log.block_number <= last for log in logs):
+            raise InvalidAnswer(f"eth_getLogs for the blocks {first} to {last}", "a log is of another block")
+        return logs
+
+    async def block_logs(self, block: BlockHeader, *, addresses: Collection[str], topics: Sequence[str]) -> list[Log]:
+        """The logs of one block, as `logs` returns them, from a machine that has the block.
+
+        An empty answer that the header's Bloom filter contradicts, and a refusal, are checked with the block's
+        receipts: nodes that want an address, or have no `eth_getLogs`, have these. Raises `NodeUnreachable` if the node
+        can't prove its answer; who reads asks again. A filter can also claim logs that the block lacks, and a node may
+        keep no receipts: after `DOUBTS` empty answers for a block that the node has, it is believed.
+        """
+        query: dict[str, Any] = {"blockHash": "0x" + block.hash.hex(), "topics": [list(topics)]}
+        if addresses:
+            query["address"] = list(addresses)
+        wanted = [bytes.fromhex(topic[2:]) for topic in topics]
+        emitters = [address_bytes(address) for address in addresses]
+        refused: RequestRefused | None = None
+        if self._logs_refused < LOGS_REFUSED:
+            try:
+                logs: list[Log] = await self._ask("eth_getLogs", query)
+            except RequestRefused as error:
+                refused = error
+            else:
+                if any((log.block_hash, log.block_number) != (block.hash, block.number) for log in logs):
+                    raise InvalidAnswer(f"eth_getLogs for block {block.number}", "a log is of another block")
+                alternatives = product(emitters, wanted) if emitters else product(wanted)
+                if logs or not block.has_bloom or not block.may_log(*alternatives):
+                    return logs
+        found = await self._logs_by_receipts(block)
+        if found is None and refused is None and await self._is_empty(block):
+            return []
+        if found is None:
+            why = f"a machine behind it lacks the logs of block {block.number}"
+            raise refused or NodeUnreachable(self.endpoint, why, code="missing-logs")
+        if refused is not None and not BEHIND.search(refused.detail):
+            self._logs_refused += 1
+        return [
+            log
+            for log in found
+            if log.topics and log.topics[0] in wanted and (not addresses or log.address in addresses)
+        ]
+
+    async def _is_empty(self, block: BlockHeader) -> bool:
+        """Whether to believe one more empty answer for a block whose receipts the node lacks."""
+        doubted, times = self._doubted
+        self._doubted = block.hash, times + 1 if doubted == block.hash else 1
+        if self._doubted[1] < DOUBTS or await self._body(block) is None:
+            return False
+        if not self._is_doubt_told:
+            self._is_doubt_told = True
+            facts = log_event("logs-unproven", block=block.number, node=self.endpoint)
+            lacks = "the node %s has no receipts for block %d, so what it says of the logs of blocks can't be checked"
+            log.warning(lacks, self.endpoint, block.number, extra=facts)
+        return True
+
+    async def _body(self, block: BlockHeader) -> BlockBody | None:
+        body: BlockBody | None = await self._ask("eth_getBlockByHash", "0x" + block.hash.hex(), False)
+        return None if body is None or body.hash != block.hash else body
+
+    async def _logs_by_receipts(self, block: BlockHeader) -> list[Log] | None:
+        """All logs of a block by its receipts; None if the node lacks one of them."""
+        try:
+            body = await self._body(block)
+            if body is None:
+                return None
+            receipts = await self._block_receipts(body)
+        except RequestRefused:
+            return None
+        if len(receipts) != len(body.transactions) or any(
+            receipt is None or receipt.block_hash != block.hash for receipt in receipts
+        ):
+            return None
+        return [log for receipt in receipts if receipt is not None for log in receipt.logs]
+
+    async def _block_receipts(self, body: BlockBody) -> Sequence[BlockReceipt | None]:
+        if self._has_block_receipts:
+            try:
+                return await self._ask("eth_getBlockReceipts", "0x" + body.hash.hex()) or []
+            except RequestRefused as refused:
+                self._has_block_receipts = refused.rpc_code != METHOD_NOT_FOUND
+        ask = partial(self.rpc.request, "eth_getTransactionReceipt", kind=BlockReceipt | None)
+        return [await ask(["0x" + tx.hex()]) for tx in body.transactions]
+
+    async def check_logs(self) -> None:
+        """Raise `ConfigurationError` if the node can't say what contracts have logged, so that events can't be read."""
+        last: AiraError | None = None
+        for _ in range(self.timing.attempts):
+            try:
+                await self.block_logs(await self.heads.look(), addresses=(), topics=["0x" + "00" * 32])
+                return
+            except (RequestRefused, NodeUnreachable) as error:
+                if isinstance(error, NodeUnreachable) and error.code != "missing-logs":
+                    raise
+                last = error
+                await asyncio.sleep(self.timing.retry_delay)
+        if isinstance(last, RequestRefused):
+            raise ConfigurationError(
+                f"the node refuses eth_getLogs and the receipts of blocks, so nothing can be followed: {last.detail}",
+                hint="name a node that answers eth_getLogs with web3_http_provider",
+                code="node-lacks-logs",
+            ) from last
+
+    async def check_calls(self, address: str) -> None:
+        """Raise for a node that lacks a call which roles need, with the call in the error.
+
+        For `address` a transaction is prepared, and not sent. Raises `ConfigurationError`, `RequestRefused`.
+        """
+        await self.check_logs()
+        await self.gas_market()
+        await self.transaction_count(address, block="pending")
+        try:
+            await self.estimate_gas({"from": address, "to": address, "data": "0x", "value": 0})
+            await self.receipt("0x" + "00" * 32)
+        except Reverted:
+            return  # it answers
+        except RequestRefused as refused:
+            if refused.rpc_code == METHOD_NOT_FOUND:
+                raise
+
+    async def eth_balance(self, address: str) -> int:
+        """Wei of an account."""
+        return int(await self._ask("eth_getBalance", address, "latest"))
+
+    async def transaction_count(self, address: str, *, block: int | str = "latest") -> int:
+        """How many transactions an account has up to a block; for "pending" also those that wait to be mined."""
+        return int(await self._ask_at(block, "eth_getTransactionCount", address))
+
+    async def code(self, address: str, *, block: int | str = "latest") -> bytes:
+        """The code of the contract at an address, in the state after a block; empty if there is none."""
+        return bytes(await self._ask("eth_getCode", address, _block(block)))
+
+    async def gas_price(self) -> int:
+        """The price of a unit of gas that the node suggests, wei."""
+        return int(await self._ask("eth_gasPrice"))
+
+    async def gas_market(self) -> GasMarket:
+        """The price of gas in the latest block, with the priority fee that the node suggested of late."""
+        head = await self.heads.recent()
+        if head.base_fee is None:
+            price = await self.gas_price()
+            return GasMarket(price, Fees(price, None))
+        until, priority = self._priority
+        if time.monotonic() >= until:
+            priority = await self._suggested_priority(head.base_fee)
+            self._priority = time.monotonic() + PRIORITY_SECONDS, priority
+        return GasMarket(head.base_fee + priority, Fees(2 * head.base_fee + priority, priority))
+
+    async def estimate_gas(self, call: Mapping[str, Any]) -> int:
+        """Gas of a transaction in the state that pending ones leave, where the node has that. Raises `Reverted`."""
+        return int(await self._ask_at("pending", "eth_estimateGas", _call(call)))
+
+    async def call(self, call: Mapping[str, Any], *, block: int | str = "latest") -> bytes:
+        """What a call (`from`, `to`, `data`, `value`) returns in the state after a block. Raises `Reverted`."""
+        return bytes(await self._ask_at(block, "eth_call", _call(call)))
+
+    async def send_raw(self, raw: bytes) -> None:
+        """Give a signed transaction to the node, once."""
+        await self._ask("eth_sendRawTransaction", "0x" + raw.hex())
+
+    async def has_transaction(self, tx: str) -> bool:
+        """Whether the node has a transaction, mined or waiting."""
+        try:
+            return await self._ask("eth_getTransactionByHash", tx) is not None
+        except RequestRefused:
+            return False
+
+    async def has_mined(self, tx: str) -> bool:
+        """Whether the node has a transaction that waits, or was mined with success."""
+        receipt = await self.receipt(tx)
+        return await self.has_transaction(tx) if receipt is None else receipt.status == 1
+
+    async def receipt(self, tx: str) -> MinedTransaction | None:
+        """The receipt of a transaction; None if it is not mined."""
+        receipt: MinedTransaction | None = await self._ask("eth_getTransactionReceipt", tx)
+        return receipt
+
+    async def read(self, call: ContractCall, *, block: int | str = "latest") -> Any:
+        """What a contract's function returns, several values as a tuple; asked again if it does not decode.
+
+        Raises `Reverted`, `NoContracts` if there is no such contract, `InvalidAnswer` for other data.
+        """
+        request = {"to": call.address, "data": "0x" + call.data.hex()}
+        for attempt in range(READ_ATTEMPTS):
+            returned = await self.call(request, block=block)
+            try:
+                return _values(call, returned)
+            except SpoiledAnswer as error:
+                failure = error
+            if not attempt and not returned and not await self.code(call.address, block=block):
+                raise NoContracts(f"contract with {call.fn_name} at {call.address}", self.chain_id)
+        raise InvalidAnswer(f"{call.fn_name} of {call.address}", str(failure))
+
+    async def read_all(self, calls: Iterable[ContractCall], *, block: int | str) -> list[Any]:
+        """What several functions return in the state of one block, asked for in one call. Raises as `read` does."""
+        calls = list(calls)
+        if block == "latest" and len(calls) > CALLS_AT_ONCE:
+            block = await self.block_number()
+        found: list[Any] = []
+        for start in range(0, len(calls), CALLS_AT_ONCE):
+            some = calls[start : start + CALLS_AT_ONCE]
+            try:
+                answers = await self._call_together([(call.address, call.data) for call in some], block)
+                found += [_values(call, answer) for call, answer in zip(some, answers, strict=True)]
+            except (RequestRefused, Reverted, ValueError) as error:
+                log.debug("%d functions are read one by one: %s", len(some), error)
+                found += await self._read_each(some, block)
+        return found
+
+    async def _read_each(self, calls: Sequence[ContractCall], block: int | str) -> list[Any]:
+        number = await self.block_number() if block == "latest" and len(calls) > 1 else block
+        answers = await asyncio.gather(*(self.read(call, block=number) for call in calls), return_exceptions=True)
+        for answer in answers:
+            if isinstance(answer, BaseException):
+                raise answer
+        return answers
+
+    async def call_all(self, calls: Sequence[Call], *, gas: int, most: int) -> list[bytes | None]:
+        """What each call returns, `most` bytes of it, and None if it fails, also because it needs more than `gas`.
+
+        Raises `Reverted` and `RequestRefused`, as when all calls together are too much for the node.
+        """
+        try:
+            return await self._call_together(calls, "latest", gas=gas, most=most)
+        except SpoiledAnswer as error:
+            raise InvalidAnswer(f"{len(calls)} calls in one", str(error)) from None
+
+    async def _call_together(
+        self, calls: Sequence[Call], block: int | str, *, gas: int = UNLIMITED_GAS, most: int = LONGEST
+    ) -> list[bytes | None]:
+        code = encode_calls(calls, gas=gas, most=most)
+        return decode_answers(await self.call({"data": "0x" + code.hex()}, block=block), number=len(calls))
+
+    def creation_code(self, name: str, *arguments: Any) -> bytes:
+        """The data of a transaction that deploys one of our contracts (`artifacts.NAMES`)."""
+        artifact = load_artifact(name)
+        inputs = next((entry["inputs"] for entry in artifact.abi if entry["type"] == "constructor"), ())
+        return artifact.bytecode + encode([member["type"] for member in inputs], arguments)
+
+    def pending_transactions(self, address: str) -> PendingTransactions:
+        """What all senders of one account through this node share. Raises `ConfigurationError` for the folder."""
+        if address not in self._pending:
+            folder = self._chain_folder
+            store = None if folder is None else TransactionStore(folder / address.lower())
+            self._pending[address] = PendingTransactions(store)
+        return self._pending[address]
+
+    async def _ask(self, method: str, *params: Any) -> Any:
+        """What the node answers to one of the methods in `ANSWERS`, with the type that is declared there."""
+        return await self.rpc.request(method, list(params), kind=ANSWERS[method])
+
+    async def _ask_at(self, block: int | str, method: str, *params: Any) -> Any:
+        """The answer in the state of a block. Nodes without a pending state answer in that of the latest block."""
+        if block != "pending":
+            return await self._ask(method, *params, _block(block))
+        refused: AiraError | None = None
+        if self._has_pending:
+            try:
+                return await self._ask(method, *params, block)
+            except (RequestRefused, NodeUnreachable) as error:
+                if isinstance(error, NodeUnreachable) and not isinstance(error.__cause__, SpoiledAnswer):
+                    raise
+                refused = error
+        try:
+            answer = await self._ask(method, *params, "latest")  # raises the request's own fault, if that is why
+        except RequestRefused as error:
+            if method != "eth_estimateGas" or "argument" not in error.detail.lower():
+                raise
+            answer = await self._ask(method, *params)  # some take no block
+        self._has_pending = self._has_pending and refused is None
+        return answer
+
+    async def _suggested_priority(self, base: int) -> int:
+        """The priority fee that the node suggests, or how far its gas price is above the base fee, or the usual one."""
+        suggested = await self._quantity_or_none("eth_maxPriorityFeePerGas")
+        if suggested is not None:
+            return suggested
+        price = await self._quantity_or_none("eth_gasPrice")
+        if price is not None:
+            return max(price - base, 0)
+        try:
+            history = await self.rpc.request("eth_feeHistory", ["0x5", "latest", [50]])
+            return max(int(rewards[0], 16) for rewards in history["reward"])
+        except (RequestRefused, TypeError, KeyError, ValueError, IndexError):
+            return USUAL_PRIORITY
+
+    async def _quantity_or_none(self, method: str) -> int | None:
+        """A node's suggestion; None where the node lacks the method, in whatever words, or answers nothing."""
+        try:
+            found = await self.rpc.request(method, [])
+            return int(found, 16) if isinstance(found, str) and len(found) <= LONGEST_QUANTITY else None
+        except (RequestRefused, ValueError):
+            return None
+
+    def _request_pushes(self) -> None:
+        self.rpc.push_heads(self.heads.pushed)
+
+    def contract(self, name: str, address: str) -> ContractFunctions:
+        """The functions of the contract at an address with the ABI of one of ours (`artifacts.NAMES`)."""
+        return ContractFunctions(address, our_functions(name))
+
+
+def _block(identifier: int | str) -> str:
+    """A block as JSON-RPC has it: its number as a quantity, or a tag."""
+    return identifier if isinstance(identifier, str) else hex(identifier)
+
+
+def _call(call: Mapping[str, Any]) -> dict[str, Any]:
+    """A call as JSON-RPC has it."""
+    return {name: hex(member) if isinstance(member, int) else member for name, member in call.items()}

@@ -1,0 +1,408 @@
+"""Ether, XRT and other ERC-20 tokens: `chain.tokens`; and who can pay for orders: `chain.funds`, `Allowances`.
+
+What accounts have and let the factory take is asked of the chain in batches and remembered for a short time.
+Anybody can sign orders with fresh keys, so hundreds of accounts are asked for in one request to the node. A token is
+code of a stranger: each question has `TOKEN_GAS`, and one that fails says nothing about the others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from mesh.amounts import XRT, Unit
+from mesh.base.clock import SYSTEM_CLOCK
+from mesh.base.flood import BoundedDict
+from mesh.base.log_context import log_event
+from mesh.chain._abi import decode
+from mesh.chain.errors import InsufficientTokens, NoContracts, RequestRefused, Reverted
+from mesh.chain.following import Approval, decode_log, topics_of
+from mesh.errors import ChainError
+from schemas.messages import Offer
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Iterable, Mapping, Sequence
+
+    from mesh.base.clock import Clock
+    from mesh.chain._abi import ContractCall, ContractFunctions
+    from mesh.chain._contracts import Contracts
+    from schemas import Liability, Verified
+    from schemas.messages import Order
+
+
+log = logging.getLogger(__name__)
+
+BATCH: Final = 256
+"""Accounts in one request: the answers are 18 KB, of 24 that a node returns (EIP-170)."""
+AT_ONCE: Final = 4
+"""Requests at a time."""
+TOKEN_GAS: Final = 100_000
+"""Gas for each question to a token."""
+KEPT_POLLS: Final = 3
+"""Intervals between polls of the chain for which an answer is used."""
+SHORT_POLLS: Final = 0.25
+"""The same for an answer that there is too little: the maker may have paid in and sent its order at once."""
+KEPT: Final = 8192
+"""Answers that are remembered."""
+
+_BALANCE, _ALLOWANCE = (bytes.fromhex(selector) + bytes(12) for selector in ("70a08231", "dd62ed3e"))
+_WORD: Final = 32
+
+
+class Holding(NamedTuple):
+    """A token and its holder, both addresses."""
+
+    token: str
+    account: str
+
+
+class Funding(NamedTuple):
+    """What an account has of a token, and what the factory may take of it, in the token's smallest unit."""
+
+    balance: int
+    allowance: int
+
+
+NO_TOKEN: Final = Funding(-1, -1)
+"""What anybody has of a contract that does not say what somebody has, as a token does: it can't be paid with."""
+
+
+class _KnownFunding(NamedTuple):
+    asked_at: float
+    block: bytes | None
+    """The latest block that was known then."""
+    funding: Funding | None
+
+
+class Funds:
+    """What accounts have of tokens, and let the factory take; what orders cost, and whether their makers can pay it.
+
+    Used in one event loop.
+    """
+
+    def __init__(self, contracts: Contracts, *, clock: Clock = SYSTEM_CLOCK, kept: int = KEPT) -> None:
+        self._contracts = contracts
+        self._clock = clock
+        self._known: BoundedDict[Holding, _KnownFunding] = BoundedDict(kept)
+        self._places = asyncio.Semaphore(AT_ONCE)
+        self.requests = 0
+        """Requests to the node so far."""
+
+    async def of(
+        self, holdings: Iterable[Holding], *, within: float = KEPT_POLLS, fresh: bool = False
+    ) -> Mapping[Holding, Funding | None]:
+        """What is known of holdings, read `within` that many poll intervals, in the latest block, or now.
+
+        `NO_TOKEN` for what is no token, None if the node refuses to answer. Raises `NodeUnreachable`.
+        """
+        found: dict[Holding, Funding | None] = {}
+        asked: list[Holding] = []
+        latest = self._contracts.node.heads.latest
+        now, block = self._clock.monotonic(), None if latest is None else latest.hash
+        for holding in dict.fromkeys(holdings):
+            known = self._known.get(holding)
+            if known is not None and not fresh and self._is_current(known, now, block, within):
+                found[holding] = known.funding
+            else:
+                asked.append(holding)
+        parts = [asked[start : start + BATCH] for start in range(0, len(asked), BATCH)]
+        for answers in await asyncio.gather(*map(self._ask, parts)):
+            for holding, funding in answers:
+                self._known[holding] = _KnownFunding(now, block, funding)
+                found[holding] = funding
+        return found
+
+    def _is_current(self, known: _KnownFunding, now: float, block: bytes | None, within: float) -> bool:
+        """Nothing changes between two blocks. But who is in a hurry may know of a block before we do."""
+        node = self._contracts.node
+        if within >= KEPT_POLLS and block is not None and block == known.block and node.heads.are_timely:
+            return True
+        return now < known.asked_at + within * node.timing.poll_interval
+
+    def cost_of(self, order: Order) -> Mapping[str, int]:
+        """What the factory may take from the maker of an order, by token, in the token's smallest unit."""
+        if isinstance(order, Offer):
+            return {self._contracts.xrt: order.lighthouse_fee}
+        costs = {order.token: order.cost}
+        costs[self._contracts.xrt] = costs.get(self._contracts.xrt, 0) + order.validator_fee
+        return costs
+
+    async def shortages(self, orders: Sequence[Verified[Order]], *, fresh: bool = False) -> list[str]:
+        """What each order's maker lacks to pay what the order costs it, as the contracts call it; empty if nothing.
+
+        Without `fresh`, the answers may be a few poll intervals old. They are empty, too, if the node refuses them.
+        Raises `NodeUnreachable`.
+        """
+        costs = [
+            {Holding(token, order.signer): amount for token, amount in self.cost_of(order.message).items() if amount}
+            for order in orders
+        ]
+        known = await self.of((holding for one in costs for holding in one), fresh=fresh)
+        short = {holding for one in costs for holding, amount in one.items() if _lacks(known[holding], amount)}
+        if short and not fresh:
+            known = {**known, **await self.of(short, within=SHORT_POLLS)}  # they may have paid in since
+        return [
+            next(filter(None, (_lacks(known[holding], amount) for holding, amount in one.items())), "") for one in costs
+        ]
+
+    def worth(self, order: Order | Liability, *, token: str = "") -> int:
+        """The priority of an order, or of its liability, where there are too many: the magnitude of its cost.
+
+        It is 0 unless the cost is in `token` (an address; XRT by default): anybody can make a token, and have any
+        number of it.
+        """
+        return order.cost.bit_length() if order.token == (token or self._contracts.xrt) else 0
+
+    async def _ask(self, batch: Sequence[Holding]) -> Iterable[tuple[Holding, Funding | None]]:
+        async with self._places:
+            return zip(batch, await self._read(batch), strict=True)
+
+    async def _read(self, batch: Sequence[Holding]) -> list[Funding | None]:
+        """What the node says; of half the batch at a time if it refuses, as when some tokens use up their gas."""
+        spender = bytes.fromhex(self._contracts.factory[2:])
+        calls = []
+        for token, holder in batch:
+            account = bytes.fromhex(holder[2:])
+            calls += [(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)]
+        self.requests += 1
+        try:
+            answers = await self._contracts.node.call_all(calls, gas=TOKEN_GAS, most=_WORD)
+        except (Reverted, RequestRefused) as error:
+            if len(batch) == 1:
+                log.debug("the funds of %s can't be read: %s", batch[0], error)
+                return [None]
+            half = len(batch) // 2
+            return [*await self._read(batch[:half]), *await self._read(batch[half:])]
+        return [_funding(*answers[at : at + 2]) for at in range(0, len(answers), 2)]
+
+
+def _funding(balance: bytes | None, allowance: bytes | None) -> Funding:
+    if balance is None or allowance is None or len(balance) != _WORD or len(allowance) != _WORD:
+        return NO_TOKEN
+    return Funding(int.from_bytes(balance), int.from_bytes(allowance))
+
+
+TOKEN_UNREADABLE: Final = "TokenUnreadable"
+"""The reason of a rejection when a contract does not tell balances and allowances, so that it can't be paid with."""
+LEAST_AHEAD: Final = 4
+MOST_AHEAD: Final = 16
+"""An allowance that contracts have used up is approved for so many times what the open orders need, growing."""
+
+
+def _lacks(funding: Funding | None, amount: int) -> str:
+    """What is missing to pay an amount; empty if nothing is, or nothing is known."""
+    if funding is None or min(funding) >= amount:
+        return ""
+    if funding == NO_TOKEN:
+        return TOKEN_UNREADABLE
+    return "ERC20InsufficientAllowance" if funding.allowance < amount else "ERC20InsufficientBalance"
+
+
+class Allowances:
+    """The allowance of the factory: what the orders of `account` may cost, by order and token (smallest unit)."""
+
+    def __init__(self, tokens: Tokens, factory: str, account: str) -> None:
+        self._tokens = tokens
+        self._factory = factory
+        self._account = account
+        self._open: dict[Hashable, Mapping[str, int]] = {}
+        self._withdrawn: dict[Hashable, Mapping[str, int]] = {}
+        self._approved: dict[str, int] = {}
+        """By token: what this agent approved last."""
+        self._ahead: dict[str, int] = {}
+        self._approving = asyncio.Lock()
+
+    async def ensure(self, order: Hashable, amounts: Mapping[str, int]) -> None:
+        """Make sure that the factory may take `amounts` (by token) for `order` and what the other orders may cost.
+
+        The account must own what its open orders cost; withdrawn ones only need the allowance. Raises
+        `InsufficientTokens`; a new order is then not counted.
+        """
+        async with self._approving:
+            for token, amount in amounts.items():
+                if amount:
+                    others = (costs for key, costs in self._open.items() if key != order)
+                    funds = amount + _sum(others, token)
+                    needed = funds + _sum(self._withdrawn.values(), token)
+                    await self._ensure(token, funds=funds, needed=needed)
+            if order not in self._withdrawn:
+                self._open[order] = amounts
+
+    def count(self, order: Hashable, amounts: Mapping[str, int]) -> None:
+        """Count an order of an earlier run, whose allowance was approved then."""
+        self._open[order] = amounts
+
+    def withdraw(self, order: Hashable) -> None:
+        """Count an order that is withdrawn, but may become a contract all the same."""
+        if order in self._open:
+            self._withdrawn[order] = self._open.pop(order)
+
+    def release(self, order: Hashable) -> None:
+        """Stop counting an order that can't become a contract any more. Unknown ones are ignored."""
+        self._open.pop(order, None)
+        self._withdrawn.pop(order, None)
+
+    async def _ensure(self, token: str, *, funds: int, needed: int) -> None:
+        factory, tokens = self._factory, self._tokens
+        balance, allowed = await tokens.balance_and_allowance(self._account, factory, token=token)
+        if balance < funds:
+            raise InsufficientTokens(self._account, token, balance=balance, needed=funds)
+        while allowed < needed:
+            allowance = max(needed, min(self._times(token, allowed) * needed, balance))
+            facts = log_event("allowance-approved", token=token, amount=allowance)
+            log.info("approving an allowance of %d of token %s for the factory", allowance, token, extra=facts)
+            try:
+                await tokens.approve(factory, allowance, token=token)
+                self._approved[token] = allowance
+            except Reverted as error:
+                if error.reason != "OutOfGas":
+                    raise
+                # An order became a contract between estimate and block: setting a used-up allowance costs more gas.
+                facts = log_event("allowance-retried", token=token, amount=allowance)
+                log.info("approving the allowance again: %s", error, extra=facts)
+            allowed = await tokens.allowance(self._account, factory, token=token)
+
+    def _times(self, token: str, allowed: int) -> int:
+        """How many times what is needed is approved: more and more, when contracts have used up what was approved.
+
+        A transaction for each order would cost more than the order.
+        """
+        if allowed < self._approved.get(token, 0):
+            self._ahead[token] = min(max(LEAST_AHEAD, 2 * self._ahead.get(token, 0)), MOST_AHEAD)
+        return self._ahead.get(token, 1)
+
+
+def _sum(orders: Iterable[Mapping[str, int]], token: str) -> int:
+    return sum(costs.get(token, 0) for costs in orders)
+
+
+LONGEST_LABEL: Final = 64
+"""Characters of a token's name or symbol that are shown; anybody can deploy a token with any name."""
+
+MAX_DECIMALS: Final = 255
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Token:
+    """An ERC-20 token as it describes itself; only the address can be trusted.
+
+    `symbol` and `name` are empty and `decimals` is 0 if it has none. `total_supply` is in its smallest unit, of
+    which 10^`decimals` are one token.
+    """
+
+    address: str
+    symbol: str
+    name: str
+    decimals: int
+    total_supply: int
+
+
+class Tokens:
+    """Balances, allowances and transfers. The default token is XRT, the default account one's own."""
+
+    def __init__(self, contracts: Contracts) -> None:
+        self._contracts, self._node, self._address = contracts, contracts.node, contracts.names.address
+
+    async def eth_balance(self, address: str | None = None) -> int:
+        """Wei of an account; of one's own by default."""
+        return await self._node.eth_balance(await self._contracts.address_or_own(address))
+
+    async def send_eth(self, to: str, value: int) -> str:
+        """Send `value` wei; the transaction's hash."""
+        return (await self._contracts.signing().send(to=await self._address(to), data=b"", value=value)).tx
+
+    async def info(self, token: str | None = None) -> Token:
+        """A token's description (XRT by default). Raises `NoContracts` for an address without an ERC-20 token."""
+        functions = await self._token(token)
+        total_supply = int(await self._node.read(functions.totalSupply()))
+        return Token(
+            address=functions.address,
+            symbol=_label(await self._ask(functions.symbol())),
+            name=_label(await self._ask(functions.name())),
+            decimals=_decimals(await self._ask(functions.decimals())),
+            total_supply=total_supply,
+        )
+
+    async def unit(self, token: str | None = None) -> Unit:
+        """The unit that a token is counted in (an address or ENS name; XRT by default). Raises `ChainError`."""
+        try:
+            info = await self.info(token)
+        except (NoContracts, Reverted):
+            if token is None:
+                raise
+            raise ChainError(
+                f"{token} is not a token", hint="name an ERC-20 by its address or ENS name", code="not-a-token"
+            ) from None
+        if info.address == self._contracts.xrt:
+            return Unit(info.symbol or XRT.symbol, info.decimals, XRT.smallest)
+        return Unit(info.symbol or "tokens", info.decimals)
+
+    async def balance(self, address: str | None = None, *, token: str | None = None) -> int:
+        """Units of a token (XRT by default) that an account holds."""
+        account = await self._contracts.address_or_own(address)
+        return int(await self._node.read((await self._token(token)).balanceOf(account)))
+
+    async def allowance(self, owner: str, spender: str, *, token: str | None = None) -> int:
+        """Units of a token (XRT by default) that `spender` may take from `owner`."""
+        functions, owner = await self._token(token), await self._address(owner)
+        return int(await self._node.read(functions.allowance(owner, await self._address(spender))))
+
+    async def balance_and_allowance(self, owner: str, spender: str, *, token: str | None = None) -> tuple[int, int]:
+        """The same as `balance` and `allowance`, in one call."""
+        functions, owner = await self._token(token), await self._address(owner)
+        calls = (functions.balanceOf(owner), functions.allowance(owner, await self._address(spender)))
+        balance, allowance = await self._node.read_all(calls, block="latest")
+        return int(balance), int(allowance)
+
+    async def approved(self, owner: str, first: int, last: int, *, token: str | None = None) -> set[str]:
+        """Whom an owner allowed, in the blocks from `first` to `last`, to take units of a token (XRT by default).
+
+        They may have taken all since, or the owner may have taken it back. A machine of the node that is behind leaves
+        the last ones out. Raises `RequestRefused`, also because these are too many blocks for the node.
+        """
+        address, owner = (await self._token(token)).address, await self._address(owner)
+        logs = await self._node.logs(first, last, addresses=[address], topics=topics_of("XRT"), about=owner)
+        events = [decode_log(log) for log in logs if log.address == address]
+        return {event.spender for event in events if isinstance(event, Approval) and event.owner == owner}
+
+    async def approve(self, spender: str, value: int, *, token: str | None = None) -> str:
+        """Let `spender` take up to `value` units of a token (XRT by default); the transaction's hash."""
+        call = (await self._token(token)).approve(await self._address(spender), value)
+        return (await self._contracts.send(call)).tx
+
+    async def transfer(self, to: str, value: int, *, token: str | None = None) -> str:
+        """Send units of a token (XRT by default); the transaction's hash."""
+        call = (await self._token(token)).transfer(await self._address(to), value)
+        return (await self._contracts.send(call)).tx
+
+    async def transfer_from(self, owner: str, to: str, value: int, *, token: str | None = None) -> str:
+        """Send what `owner` approved for this account; the transaction's hash."""
+        functions, owner = await self._token(token), await self._address(owner)
+        return (await self._contracts.send(functions.transferFrom(owner, await self._address(to), value))).tx
+
+    async def _token(self, token: str | None) -> ContractFunctions:
+        address = self._contracts.xrt if token is None else await self._address(token)
+        return self._node.contract("XRT", address)
+
+    async def _ask(self, call: ContractCall) -> bytes:
+        """The bytes that an optional function of a token returns; empty if the token lacks it."""
+        try:
+            return await self._node.call({"to": call.address, "data": "0x" + call.data.hex()})
+        except (Reverted, NoContracts):
+            return b""
+
+
+def _label(answer: bytes) -> str:
+    """A printable text. Old tokens return 32 bytes instead of a string."""
+    try:
+        text = answer.rstrip(b"\0").decode() if len(answer) == 32 else decode(["string"], answer)[0]
+    except ValueError:
+        return ""
+    return "".join(character for character in text if character.isprintable())[:LONGEST_LABEL].strip()
+
+
+def _decimals(answer: bytes) -> int:
+    value = int.from_bytes(answer, "big") if len(answer) == 32 else 0
+    return value if value <= MAX_DECIMALS else 0

@@ -1,1 +1,0 @@
-"""`aira demo`: a whole market in one process, and one job on it."""

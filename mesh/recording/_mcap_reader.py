@@ -1,0 +1,477 @@
+"""Reading MCAP files of unknown origin: everything is checked before it is used, and no length in them is trusted.
+
+A file is read twice: first only the headers of its records, so that a file that is too large is refused before any of
+it is expanded; then completely, chunk by chunk. What the end of the file says (`read_summary`) is used for damaged
+files only, since it may contain anything.
+
+Source: the MCAP specification, version 0. The `mcap` package's reader can't be used here: it allocates what a length
+field asks for, and accepts a text that is shorter than stated.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field, replace
+from struct import Struct
+from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple, TypeVar
+
+from mcap import records
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+
+from mesh.recording._source import (
+    Attachment,
+    ChunkReader,
+    CorruptRecording,
+    Cursor,
+    ExpansionCounter,
+    NotARecording,
+    RecordedMessage,
+    RecordingBlock,
+    RecordingChannel,
+    RecordingSource,
+    RecordingStatistics,
+    check_window,
+    load_block,
+)
+from schemas.payloads import PayloadType
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
+
+    from mesh.content import Progress
+    from mesh.recording._source import Limits, OnMessage
+
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+LIBRARY: Final = "aira-mesh"
+
+_PREFIX: Final = Struct("<BQ")
+_MESSAGE: Final = Struct("<HIQQ")
+_CHUNK_HEAD: Final = 40
+"""Bytes of a chunk record, without the name of its compression and its data."""
+_LONGEST_COMPRESSION: Final = 32
+_ATTACHMENT_HEAD: Final = 64 << 10
+"""Bytes at the start of an attachment that must contain its names and times."""
+_PIECE: Final = 1 << 20
+
+
+class McapRecordHeader(NamedTuple):
+    """The header of a record: its opcode, and the offset and length of its content."""
+
+    opcode: int
+    offset: int
+    length: int
+
+
+def mcap_records(
+    file: BinaryIO, size: int, *, begin: int = 0, end: int | None = None, cut: bool = False
+) -> Iterator[McapRecordHeader]:
+    """The headers of all records of a file of `size` bytes. Raises `CorruptRecording` if the file is cut or mutated.
+
+    `begin` and `end` are where a part of it begins and ends, at records. With `cut`, a chunk that goes beyond the end
+    is yielded before the error, as one that ends there.
+    """
+    position, last = begin or _check_magic(file), size if end is None else end
+    while position != end:
+        file.seek(position)
+        prefix = file.read(min(_PREFIX.size, last - position))
+        if len(prefix) < _PREFIX.size:
+            raise CorruptRecording("it is cut off")
+        opcode, length = _PREFIX.unpack(prefix)
+        position += _PREFIX.size
+        if length > last - position:
+            if cut and opcode == Opcode.CHUNK:
+                yield McapRecordHeader(opcode, position, last - position)
+            where = "the end of the file" if end is None else "the beginning of a chunk"
+            raise CorruptRecording(f"a record at byte {position} goes beyond {where}")
+        if not opcode:
+            raise CorruptRecording(f"a record at byte {position} has no opcode")
+        yield McapRecordHeader(opcode, position, length)
+        position += length
+        if opcode == Opcode.FOOTER and end is None:
+            break
+    else:
+        return
+    file.seek(position)
+    if position + len(MAGIC) != size or file.read() != MAGIC:
+        raise CorruptRecording("it does not end as an MCAP file does")
+
+
+def _check_magic(file: BinaryIO) -> int:
+    """Where the first record is. Raises `NotARecording`."""
+    file.seek(0)
+    if file.read(len(MAGIC)) != MAGIC:
+        raise NotARecording("it does not begin as an MCAP file does")
+    return len(MAGIC)
+
+
+def read_record(file: BinaryIO, header: McapRecordHeader, *, limits: Limits) -> bytes:
+    """The content of a record. Raises `RecordingError` over `limits.record`."""
+    limits.check(record=header.length)
+    file.seek(header.offset)
+    return file.read(header.length)
+
+
+def chunk_header(
+    file: BinaryIO, header: McapRecordHeader, limits: Limits, *, cut: bool = False
+) -> tuple[RecordingBlock, int]:
+    """Where the data of a chunk is, and its checksum. Raises `RecordingError` if it is over `limits.record`.
+
+    With `cut`, the data may be cut, and what the chunk says of it wrong.
+    """
+    file.seek(header.offset)
+    fields = Cursor(file.read(min(header.length, _CHUNK_HEAD + _LONGEST_COMPRESSION)))
+    fields.take(16)
+    size, crc, compression, stored = fields.u64(), fields.u32(), fields.text(), fields.u64()
+    begin = _CHUNK_HEAD + len(compression.encode())
+    room = header.length - begin
+    if cut:
+        stored = min(stored, room)
+    elif stored > room:
+        raise CorruptRecording(f"a chunk of {header.length} bytes can't hold {stored} bytes of data")
+    else:
+        limits.check(record=max(size, stored))
+    return RecordingBlock(header.offset + begin, stored, size, compression), crc
+
+
+def schema_of(data: bytes) -> tuple[int, tuple[str, str, bytes]]:
+    """The number of a schema record, and its name, encoding and data. The data is never parsed."""
+    cursor = Cursor(data)
+    return cursor.u16(), (cursor.text(), cursor.text(), cursor.data())
+
+
+def channel_of(data: bytes, schemas: dict[int, tuple[str, str, bytes]]) -> tuple[int, RecordingChannel]:
+    """The number of a channel record, and the channel. Raises `CorruptRecording` if its schema is not in `schemas`."""
+    cursor = Cursor(data)
+    number, schema, topic, encoding, metadata = cursor.u16(), cursor.u16(), cursor.text(), cursor.text(), cursor.pairs()
+    if schema and schema not in schemas:
+        raise CorruptRecording(f"channel {number} has an undefined schema")
+    described = schemas[schema] if schema else ("", "", b"")
+    return number, RecordingChannel(topic, PayloadType(encoding, *described), metadata)
+
+
+def statistics_of(data: bytes) -> RecordingStatistics:
+    """The content of a statistics record."""
+    cursor = Cursor(data)
+    messages, _schemas, channels = cursor.u64(), cursor.u16(), cursor.u32()
+    attachments, metadata, chunks, start, end = cursor.u32(), cursor.u32(), cursor.u32(), cursor.u64(), cursor.u64()
+    counts = Cursor(cursor.data())
+    by_channel = {}
+    while counts.left:
+        number = counts.u16()
+        by_channel[number] = counts.u64()
+    return RecordingStatistics(messages, channels, attachments, chunks, start, end, by_channel, metadata)
+
+
+def attachment_of(file: BinaryIO, header: McapRecordHeader) -> Attachment:
+    """The attachment with that header. Its checksum is verified, its data is not kept."""
+    file.seek(header.offset)
+    fields = Cursor(file.read(min(header.length, _ATTACHMENT_HEAD)))
+    before = fields.left
+    log_time, create_time, name, media_type = fields.u64(), fields.u64(), fields.text(), fields.text()
+    size = fields.u64()
+    begin = before - fields.left
+    if begin + size + 4 > header.length:
+        raise CorruptRecording(f"an attachment of {header.length} bytes can't hold {size} bytes of data")
+    end = header.offset + begin + size
+    file.seek(end)
+    check_range_crc(file, start=header.offset, end=end, crc=Cursor(file.read(4)).u32())
+    return Attachment(name, media_type, log_time, create_time, header.offset + begin, size)
+
+
+def check_crc(data: bytes, crc: int) -> None:
+    """Raise `CorruptRecording` unless the data of a chunk has this CRC-32; 0 means that its writer computed none."""
+    if crc and zlib.crc32(data) != crc:
+        raise CorruptRecording("the checksum of a chunk is wrong")
+
+
+def check_range_crc(file: BinaryIO, *, start: int, end: int, crc: int) -> None:
+    """Raise `CorruptRecording` unless the bytes from `start` to `end` have this CRC-32; 0 means that there is none."""
+    if not crc:
+        return
+    found, left = 0, end - start
+    file.seek(min(start, end))
+    while left > 0:
+        piece = file.read(min(left, _PIECE))
+        if not piece:
+            break
+        found, left = zlib.crc32(piece, found), left - len(piece)
+    if found != crc:
+        raise CorruptRecording("a checksum is wrong")
+
+
+def header_of(profile: str, *, room: int = 0) -> bytes:
+    """The header record, with room for a profile of so many characters: readers skip what follows its fields."""
+    header = bytes_of(records.Header(profile, LIBRARY)) + bytes(max(room - len(profile), 0))
+    return _PREFIX.pack(Opcode.HEADER, len(header) - _PREFIX.size) + header[_PREFIX.size :]
+
+
+def bytes_of(*members: records.McapRecord) -> bytes:
+    """Records as they are in a file."""
+    builder = RecordBuilder()
+    for record in members:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+_FOOTER: Final = Struct("<BQQQI")
+_DATA_END: Final = _PREFIX.pack(Opcode.DATA_END, 4)
+_DATA_END_SIZE: Final = len(_DATA_END) + 4
+_TIMES: Final = Struct("<QQ")
+
+
+class _IndexedChunk(NamedTuple):
+    """An entry of the chunk index: where the chunk begins, and its first and last log time as they are in the chunk."""
+
+    begin: int
+    times: bytes
+
+
+@dataclass(frozen=True)
+class McapSummary:
+    """The summary of a file; `definitions` are opcodes and contents of its schemas and channels."""
+
+    definitions: list[tuple[int, bytes]] = field(default_factory=list)
+    statistics: RecordingStatistics | None = None
+    chunks: list[_IndexedChunk] = field(default_factory=list)
+
+    def chunk_positions(self, file: BinaryIO) -> list[int]:
+        """Where the chunks of its index are in the file, as far as they are there."""
+        return sorted({chunk.begin for chunk in self.chunks if _is_at(file, chunk)})
+
+
+def read_summary(file: BinaryIO, size: int, limits: Limits) -> McapSummary:
+    """The summary of a file of `size` bytes; empty if it has none, or none that is whole."""
+    footer = size - len(MAGIC) - _FOOTER.size
+    file.seek(max(footer, 0))
+    end = file.read(_FOOTER.size)
+    if footer < 0 or len(end) < _FOOTER.size or file.read() != MAGIC:
+        return McapSummary()
+    opcode, length, stated, _, crc = _FOOTER.unpack(end)
+    if opcode != Opcode.FOOTER or length != _FOOTER.size - _PREFIX.size or not stated:
+        return McapSummary()
+    for begin in _possible_beginnings(file, stated, footer, limits):
+        try:
+            check_range_crc(file, start=begin, end=footer + _FOOTER.size - 4, crc=crc)
+            return _read(file, size, begin, limits)
+        except CorruptRecording:
+            continue
+    return McapSummary()
+
+
+def _possible_beginnings(file: BinaryIO, stated: int, footer: int, limits: Limits) -> Iterator[int]:
+    """Where the summary may begin: behind an end of the data. It is not where the footer says if data was lost."""
+    tail = max(footer - limits.definitions, len(MAGIC))
+    file.seek(tail)
+    data = file.read(footer - tail)
+    before = stated - _DATA_END_SIZE - tail
+    if before >= 0 and data.startswith(_DATA_END, before):
+        yield stated
+    found = len(data)
+    while (found := data.rfind(_DATA_END, 0, found)) >= 0:
+        yield tail + found + _DATA_END_SIZE
+
+
+def _read(file: BinaryIO, size: int, begin: int, limits: Limits) -> McapSummary:
+    definitions, chunks, statistics = [], [], None
+    for header in mcap_records(file, size, begin=begin):
+        match header.opcode:
+            case Opcode.SCHEMA | Opcode.CHANNEL:
+                definitions.append((header.opcode, read_record(file, header, limits=limits)))
+            case Opcode.STATISTICS:
+                statistics = statistics_of(read_record(file, header, limits=limits))
+            case Opcode.CHUNK_INDEX:
+                entry = Cursor(read_record(file, header, limits=limits))
+                times = entry.take(_TIMES.size)
+                chunks.append(_IndexedChunk(entry.u64(), times))
+    return McapSummary(definitions, statistics, chunks)
+
+
+def _is_at(file: BinaryIO, chunk: _IndexedChunk) -> bool:
+    """Whether a chunk with the same times is where the index says."""
+    if chunk.begin >= 1 << 63:
+        return False
+    file.seek(chunk.begin)
+    found = file.read(_PREFIX.size + _TIMES.size)
+    return found[:1] == bytes([Opcode.CHUNK]) and found[_PREFIX.size :] == chunk.times
+
+
+T = TypeVar("T")
+
+_RUN: Final = 1 << 20
+"""Bytes of messages outside chunks that are read as one block."""
+_DEFINITIONS: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA})
+_PRIVATE: Final = 0x80
+"""Opcodes from here on are for private use."""
+
+
+def open_mcap(
+    path: Path, size: int, limits: Limits, *, on_message: OnMessage | None = None, progress: Progress | None = None
+) -> RecordingSource:
+    """Check the whole of an MCAP file of `size` bytes. `on_message` is called for each message, `progress` with bytes.
+
+    Raises `RecordingError`.
+    """
+    with path.open("rb") as file:
+        reader = McapReader(path, file, size, limits, on_message)
+        reader.statistics, checked = _check_outline(file, size, limits)
+        for header in _joined_messages(mcap_records(file, size)):
+            if header.opcode == Opcode.DATA_END:
+                break
+            reader.read(header)
+            if progress is not None:
+                progress(header.offset + header.length, size)
+    check_window(reader.segments, limits)
+    if checked:
+        reader.unchecked = 0
+    return reader.source()
+
+
+@dataclass
+class McapReader(ChunkReader):
+    """Reads an MCAP file record by record."""
+
+    format = "mcap"
+
+    _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
+    _definitions_seen: dict[tuple[int, bytes], bytes] = field(default_factory=dict)
+    """The bytes of the last definition of each kind and number."""
+
+    def read(self, header: McapRecordHeader) -> None:
+        """Read one record of the file. Messages are checked and counted; only their position is kept."""
+        match header.opcode:
+            case Opcode.CHUNK:
+                block, crc = chunk_header(self.file, header, self.limits)
+                data = load_block(self.file, block)
+                check_crc(data, crc)
+                self.unchecked += not crc
+                self._read_block(block, data)
+            case Opcode.MESSAGE:
+                size = header.length + _PREFIX.size
+                block = RecordingBlock(header.offset - _PREFIX.size, size, size)
+                self.limits.check(record=size)
+                self.unchecked += 1
+                self._read_block(block, load_block(self.file, block))
+            case opcode if opcode in _DEFINITIONS:
+                self.define(opcode, read_record(self.file, header, limits=self.limits))
+            case Opcode.ATTACHMENT:
+                attachment = attachment_of(self.file, header)
+                self.attachments.append(attachment)
+                self._blocks += 1
+                self._count(len(attachment.name) + len(attachment.media_type))
+                self._check_counts()
+
+    def read_damaged_chunk(self, header: McapRecordHeader) -> None:
+        """Read the whole records at the beginning of a chunk that is cut or damaged.
+
+        Raises `CorruptRecording` if all of its data is there and has another checksum: any of it may be wrong.
+        """
+        block, crc = chunk_header(self.file, header, self.limits, cut=True)
+        data = load_block(self.file, replace(block, whole=self.limits.record))
+        if len(data) == block.size:
+            check_crc(data, crc)
+        self.unchecked += 1
+        self._read_beginning(block, data)
+
+    @staticmethod
+    def records_in(data: bytes) -> Iterator[McapRecordHeader]:
+        """See `ChunkReader`."""
+        position, end = 0, len(data)
+        while position < end:
+            if end - position < _PREFIX.size:
+                raise CorruptRecording("a chunk ends within a record")
+            opcode, length = _PREFIX.unpack_from(data, position)
+            position += _PREFIX.size
+            if length > end - position:
+                raise CorruptRecording("a record goes beyond the end of its chunk")
+            yield McapRecordHeader(opcode, position, length)
+            position += length
+
+    @staticmethod
+    def message_of(record: McapRecordHeader, data: bytes) -> RecordedMessage | None:
+        """See `ChunkReader`."""
+        opcode, offset, length = record
+        if opcode != Opcode.MESSAGE:
+            return None
+        if length < _MESSAGE.size:
+            raise CorruptRecording(f"a message of {length} bytes")
+        channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, offset)
+        payload = data[offset + _MESSAGE.size : offset + length]
+        return RecordedMessage(channel, sequence, log_time, publish_time, payload)
+
+    def _define(self, record: McapRecordHeader, data: bytes) -> None:
+        if record.opcode in _DEFINITIONS:
+            self.define(record.opcode, data[record.offset : record.offset + record.length])
+        elif record.opcode < _PRIVATE:
+            raise CorruptRecording(f"a chunk holds a record with opcode {record.opcode}")
+
+    def define(self, opcode: int, data: bytes) -> None:
+        """Read the content of a schema, a channel or a metadata record."""
+        if opcode == Opcode.METADATA:
+            self._count(len(data))
+            cursor = Cursor(data)
+            self.metadata.append((cursor.text(), cursor.pairs()))
+            return
+        definition = opcode, data[:2]
+        if self._definitions_seen.get(definition) == data:  # each chunk may repeat them
+            return
+        self._count(len(data))
+        self._definitions_seen[definition] = data
+        if opcode == Opcode.SCHEMA:
+            self._define_once(self._schemas, *schema_of(data))
+        else:
+            self._define_once(self.channels, *channel_of(data, self._schemas))
+            self._count(0)
+
+    def _define_once(self, known: dict[int, T], number: int, item: T) -> None:
+        """Add a definition. Raises `CorruptRecording` if the number is already defined differently."""
+        if known.setdefault(number, item) != item:
+            raise CorruptRecording(f"two different definitions have the number {number}")
+
+
+def _check_outline(file: BinaryIO, size: int, limits: Limits) -> tuple[RecordingStatistics | None, bool]:
+    """Check sizes and the checksums of data and summary, without expanding anything.
+
+    Returns the file's own statistics, and whether its data as a whole has a checksum.
+    """
+    expansion, data_end, footer, statistics = ExpansionCounter(limits), None, None, None
+    for number, header in enumerate(mcap_records(file, size)):
+        if number > 2 * limits.messages:
+            limits.check(messages=number)
+        if header.opcode == Opcode.CHUNK:
+            expansion.add(chunk_header(file, header, limits)[0])
+        elif header.opcode == Opcode.DATA_END and data_end is None:
+            data_end = header
+        elif header.opcode == Opcode.FOOTER:
+            footer = header
+        elif header.opcode == Opcode.STATISTICS:
+            statistics = header
+    if data_end is None or footer is None:
+        raise CorruptRecording("its data has no end")
+    data_crc = Cursor(read_record(file, data_end, limits=limits)).u32()
+    check_range_crc(file, start=0, end=data_end.offset - _PREFIX.size, crc=data_crc)
+    end = Cursor(read_record(file, footer, limits=limits))
+    summary, _, crc = end.u64(), end.u64(), end.u32()
+    check_range_crc(file, start=summary or footer.offset - _PREFIX.size, end=footer.offset + 16, crc=crc)
+    if statistics is None:
+        return None, bool(data_crc)
+    limits.check(definitions=statistics.length)
+    return statistics_of(read_record(file, statistics, limits=limits)), bool(data_crc)
+
+
+def _joined_messages(found: Iterable[McapRecordHeader]) -> Iterator[McapRecordHeader]:
+    """The same records, with adjacent messages outside chunks joined to one."""
+    run: McapRecordHeader | None = None
+    for header in found:
+        if run and header.opcode == Opcode.MESSAGE and run.length + header.length + _PREFIX.size <= _RUN:
+            run = run._replace(length=run.length + header.length + _PREFIX.size)
+            continue
+        if run:
+            yield run
+        run = header if header.opcode == Opcode.MESSAGE else None
+        if run is None:
+            yield header
+    if run:
+        yield run

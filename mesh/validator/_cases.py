@@ -1,0 +1,454 @@
+"""The cases of a validator: liabilities that name it, from the promisor's Result to the end on the chain.
+
+Each case has a task. It waits for the Result, has it decided (its files are fetched, its recording is judged, and the
+juror reports what it found), signs in the ledger, and sends what it signed until the chain has the end. The ledger
+keeps each step, so a restarted validator continues there. Files and time are shared fairly: one promisor's cases can't
+keep those of others waiting, whatever they consist of.
+
+Recordings must have been made between the liability and its Result, by the chain's clock and this machine's. If the two
+differ, the longer time counts: a wrong clock of the validator must not fail honest work.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Final, NamedTuple
+from weakref import WeakValueDictionary
+
+from mesh.amounts import XRT
+from mesh.base.background import in_daemon_thread
+from mesh.base.flood import BoundedDict, FairQueue, Rate, RateLimiter
+from mesh.base.log_context import liability_context, log_event
+from mesh.base.retry import Backoff, RetryPolicy
+from mesh.chain import NoContracts, NodeUnreachable, NotALiability, NotOffered, RequestRefused, Reverted
+from mesh.content import ContentCorrupt, ContentTooLarge, ContentUnavailable, StoreFull
+from mesh.errors import ChainError
+from mesh.recording import Limits
+from mesh.role.models import Models
+from mesh.role.program import RESEND
+from mesh.validator.judging import Case, Judgement, judge
+from mesh.validator.ledger import signed_result
+from mesh.validator.policies import COMPLETE
+from schemas import ReportKey, Result, decode
+from schemas.model import InvalidDescription
+from schemas.verdicts import ReportFinding, ValidatorReport
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.base.background import Background
+    from mesh.chain import BlockHeader, Chain
+    from mesh.validator.components import ValidatorComponents
+    from mesh.validator.ledger import StoredVerdict
+    from schemas import Liability, Verified
+    from schemas.model import ModelDescription
+
+
+async def created_ns(chain: Chain, block: int) -> int:
+    """When a block was made, in nanoseconds of Unix time, never in the future.
+
+    The clock of a development chain may be ahead, because each block is a second later than the one before.
+    """
+    now, header, head = time.time_ns(), await _header(chain, block), await _header(chain, "latest")
+    if header is None or head is None:
+        return now
+    ahead = max(0, head.timestamp * 10**9 - now)
+    return min(now, header.timestamp * 10**9 - ahead)
+
+
+async def arrived_ns(chain: Chain) -> int:
+    """What time it is now, in nanoseconds of Unix time: the later of the two clocks."""
+    head = await _header(chain, "latest")
+    return time.time_ns() if head is None else max(time.time_ns(), head.timestamp * 10**9)
+
+
+async def _header(chain: Chain, block: int | str) -> BlockHeader | None:
+    """A block; None if the node does not say."""
+    with suppress(NodeUnreachable, RequestRefused):
+        return await chain.node.header(block)
+    return None
+
+
+log = logging.getLogger(__name__)
+
+FETCHES: Final = 16
+"""Cases whose files are fetched at once."""
+JUDGED_OF_PROMISOR: Final = 512
+"""Recordings of one promisor that wait to be judged."""
+CLOCK_TOLERANCE: Final = 60 * 10**9
+"""Nanoseconds by which the clocks of robot, chain and validator may differ."""
+
+
+class _Judging(NamedTuple):
+    """A recording that waits to be judged."""
+
+    case: Case
+    objective: Path
+    recording: Path
+    outcome: asyncio.Future[Judgement | None]
+
+
+class CaseJudge:
+    """Decides the cases of a validator, one recording at a time: `run`, and `decide` for each case."""
+
+    def __init__(self, parts: ValidatorComponents) -> None:
+        self._parts = parts
+        self._fetching = asyncio.Semaphore(FETCHES)
+        self._fetching_of: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
+        self._waiting: FairQueue[_Judging] = FairQueue(
+            per_sender=JUDGED_OF_PROMISOR, total=JUDGED_OF_PROMISOR * FETCHES
+        )
+        self._succeeded: BoundedDict[str, str] = BoundedDict(JUDGED_OF_PROMISOR * FETCHES)
+        """The liabilities of successes by the marks of their recordings, before the ledger has them."""
+        self._models = Models(parts.store, parts.exchange)
+        self.verdicts: Counter[str] = Counter()
+        """What was decided since the start: `success`, `no-success`; `none` for cases given up until a restart."""
+        self.seconds = 0.0
+        """Seconds that judging took since the start."""
+
+    async def run(self) -> None:
+        """Judge one recording after another, one of each promisor before the second of any, until cancelled."""
+        while True:
+            work = await self._waiting.get()
+            if not work.outcome.done():
+                await self._judge(work)
+
+    def underpaid(self, liability: Liability) -> str:
+        """Why the liability is not judged because of the fee that it pays; empty if it pays enough."""
+        pays, asks = liability.validator_fee, self._parts.fee
+        if pays >= asks:
+            return ""
+        return f"not judged: the liability pays {XRT.show(pays)}, and this validator asks for {XRT.show(asks)}"
+
+    async def decide(self, stored: StoredVerdict) -> tuple[ValidatorReport, tuple[str, ...]] | None:
+        """The report on a case whose Result has arrived, and the marks of its recording if it is a success.
+
+        None if its files or the judgement never came, or if an own check took too long.
+        """
+        claim = decode(stored.result)
+        assert isinstance(claim, Result)
+        judgement = await self._judgement(stored, claim)
+        if judgement is None:
+            return None
+        if not judgement.is_decided:
+            policies = ", ".join(judgement.overdue)
+            facts = log_event("case-not-judged", policies=policies)
+            log.error("not judged until a restart: the check of %s took too long", policies, extra=facts)
+            return None
+        report = self._report(stored, claim, judgement)
+        return report, judgement.marks if report.success else ()
+
+    async def _judgement(self, stored: StoredVerdict, claim: Result) -> Judgement | None:
+        """The judgement on a claim. A failure that is certain needs no files."""
+        if not claim.success:
+            return _failed(COMPLETE.name, "claimed", "the promisor does not claim success")
+        if why := self.underpaid(stored.liability):
+            return _failed("fee", "fee-too-low", why)
+        try:
+            files = await self._fetch(stored, claim.result)
+        except ContentTooLarge as error:
+            return _failed(COMPLETE.name, error.code, "a file is larger than this validator takes")
+        return None if files is None else await self._judged_in_turn(stored, claim, *files)
+
+    async def _judged_in_turn(
+        self, stored: StoredVerdict, claim: Result, objective: Path, recording: Path
+    ) -> Judgement | None:
+        loop, address = asyncio.get_running_loop(), stored.liability.address
+        case = Case(
+            liability=stored.liability,
+            claimed=claim.success,
+            message=stored.result,
+            since_ns=stored.since_ns - CLOCK_TOLERANCE,
+            until_ns=stored.seen_ns + CLOCK_TOLERANCE,
+            owner_of=lambda mark: asyncio.run_coroutine_threadsafe(self._owner_of(mark, address), loop).result(),
+            model=await self._model(stored.liability.model),
+            objective_cid=stored.liability.objective,
+            recording_cid=claim.result,
+        )
+        outcome: asyncio.Future[Judgement | None] = loop.create_future()
+        if self._waiting.put(stored.liability.promisor, _Judging(case, objective, recording, outcome)):
+            self._parts.drops.count("judgements", stored.liability.promisor)
+            return None
+        return await outcome
+
+    async def _owner_of(self, mark: str, liability: str) -> str:
+        """Another liability that a recording with this mark succeeded for; its verdict may not be signed yet."""
+        owner = self._succeeded.get(mark, liability)
+        return await self._parts.ledger.owner_of(mark, other_than=liability) if owner == liability else owner
+
+    async def _model(self, cid: str) -> ModelDescription | None:
+        with suppress(InvalidDescription):
+            return await self._models.find(cid)
+        return None
+
+    async def _judge(self, work: _Judging) -> None:
+        settings, began, found = self._parts.settings, time.monotonic(), None
+        judge_in_thread = partial(
+            judge,
+            work.case,
+            objective=work.objective,
+            recording=work.recording,
+            policies=self._parts.policies,
+            bags=settings.validator_bags,
+            limits=Limits.of(settings),
+        )
+        address = work.case.liability.address
+        try:
+            found = await asyncio.wrap_future(in_daemon_thread(judge_in_thread, "judge"))
+        except Exception as error:
+            facts = log_event("judging-failed", liability=address, error=type(error).__name__)
+            log.exception("judging failed; the liability is judged again after a restart", extra=facts)
+        self.seconds += time.monotonic() - began
+        if found is not None and found.success:
+            for mark in found.marks:
+                self._succeeded[mark] = address
+        if not work.outcome.done():
+            work.outcome.set_result(found)
+
+    async def _fetch(self, stored: StoredVerdict, recording: str) -> tuple[Path, Path] | None:
+        """The files of objective and recording; None if nobody served them until the liability can be refunded.
+
+        Raises `ContentTooLarge`.
+        """
+        liability, backoff = stored.liability, Backoff(RetryPolicy(initial=1.0, ceiling=60.0))
+        until = await self._refundable_from(liability.address)
+        # of one promisor: files that nobody serves must not delay the cases of others
+        of_promisor = self._fetching_of.setdefault(liability.promisor, asyncio.Semaphore(4))
+        while True:
+            try:
+                async with of_promisor, self._fetching, asyncio.timeout(600.0):
+                    return (
+                        await self._file(liability.objective, liability.address),
+                        await self._file(recording, liability.address),
+                    )
+            except (ContentUnavailable, ContentCorrupt, StoreFull, TimeoutError) as error:
+                if until is not None and self._parts.chain_head.head >= until:
+                    facts = log_event("files-missing", error=type(error).__name__)
+                    log.warning("not judged, it can be refunded now: %s", error, extra=facts)
+                    return None
+                level = logging.WARNING if not backoff.failures else logging.DEBUG
+                log.log(level, "looking for the files again: %s", error, extra=log_event("files-awaited"))
+            await backoff.wait()
+
+    async def _file(self, cid: str, label: str) -> Path:
+        """A file from the store or from others, pinned with the label."""
+        settings, store = self._parts.settings, self._parts.store
+        await asyncio.to_thread(store.pin, cid, label, sync=False)
+        limit, timeout = settings.objective_size_limit, settings.fetch_timeout
+        return await self._parts.exchange.fetch(cid, size_limit=limit, timeout=timeout, sync=False)
+
+    async def _refundable_from(self, address: str) -> int | None:
+        """The block from which anybody may refund the liability; None if the contracts don't say."""
+        chain = self._parts.chain
+        with suppress(NotOffered, NotALiability, NoContracts):
+            ask = partial(chain.liabilities.refundable_from, address)
+            return await chain.retrying(ask, outages=self._parts.outages)
+        return None
+
+    def _report(self, stored: StoredVerdict, claim: Result, judgement: Judgement) -> ValidatorReport:
+        signer = self._parts.signer
+        return ValidatorReport(
+            liability=stored.liability.address,
+            objective=stored.liability.objective,
+            result=claim.result,
+            validator=stored.liability.validator,
+            juror=signer.address,
+            claimed=claim.success,
+            success=claim.success and judgement.success,
+            findings=judgement.findings,
+            judged_at=int(time.time()),
+        ).signed_by(signer)
+
+
+def _failed(policy: str, code: str, detail: str) -> Judgement:
+    """A judgement without a look into the recording."""
+    finding = ReportFinding(policy=policy, code=code, holds=False, detail=detail)
+    return Judgement(success=False, findings=(finding,))
+
+
+OPEN_CASES: Final = 4096
+"""Cases that are open at once; liabilities beyond them are not judged."""
+OPEN_OF_PROMISOR: Final = 512
+"""The same for one promisor."""
+RESEND_RATE: Final = Rate(per_second=50.0, burst=250)
+"""Verdicts that are sent again, in all: strangers can appear as providers."""
+
+
+@dataclass(eq=False)
+class OpenCase:
+    """A case at work. `changed` is set when its Result arrives, and when it should be sent again."""
+
+    stored: StoredVerdict
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+    task: asyncio.Task[None] | None = None
+    is_settling: bool = False
+    """Whether a transaction is being sent, which is never cancelled halfway."""
+    has_ended: bool = False
+
+    async def wait(self, seconds: float | None = None) -> bool:
+        """Wait for a change, `seconds` at most; whether there was one."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self.changed.wait()
+                self.changed.clear()
+                return True
+        return False
+
+
+class Cases:
+    """The open cases of a validator. `resend` is how often verdicts are sent again; `judge` decides them."""
+
+    def __init__(
+        self,
+        parts: ValidatorComponents,
+        judge: CaseJudge,
+        tasks: Background,
+        *,
+        resend: RetryPolicy = RESEND,
+    ) -> None:
+        self._parts = parts
+        self._judge = judge
+        self._tasks = tasks
+        self._resend = resend
+        self._open: dict[str, OpenCase] = {}
+        self._of_promisor: Counter[str] = Counter()
+        self._rate = RateLimiter(per_sender=RESEND_RATE)
+
+    async def open(self, liability: Liability, *, since_ns: int) -> None:
+        """A liability names this validator: begin, or continue with what the ledger has of it."""
+        promisor = liability.promisor
+        if liability.address in self._open:
+            return
+        if len(self._open) >= OPEN_CASES or self._of_promisor[promisor] >= OPEN_OF_PROMISOR:
+            self._parts.drops.count("cases", promisor)
+            return
+        case = OpenCase(await self._parts.ledger.open(liability, since_ns=since_ns))
+        self._open[liability.address] = case
+        self._of_promisor[promisor] += 1
+        facts = log_event("case-opened", liability=liability.address, validator=liability.validator)
+        log.info("it names this validator", extra=facts)
+        case.task = self._tasks.start(self._work(case), f"case {liability.address}")
+
+    async def take(self, result: Verified[Result]) -> bool:
+        """Take the Result of a case's promisor. False if no case waits for it: it may come before its liability."""
+        case = self._open.get(result.message.liability)
+        if case is None:
+            return False
+        address, ledger = case.stored.liability.address, self._parts.ledger
+        is_promisors = result.signer == case.stored.liability.promisor
+        if is_promisors and not case.stored.result:
+            await ledger.take(address, result.message, seen_ns=await arrived_ns(self._parts.chain))
+            case.stored = await ledger.verdict(address) or case.stored
+            case.changed.set()
+        return True
+
+    async def end(self, liability: str, *, success: bool) -> None:
+        """The chain has the end of a case."""
+        if self._close(liability):
+            await self._parts.ledger.end(liability)
+            await asyncio.to_thread(self._parts.store.release, liability)
+            facts = log_event("case-ended", liability=liability, success=success)
+            log.info("it has ended: %s", "paid" if success else "refunded", extra=facts)
+
+    async def reopen(self, liability: str) -> None:
+        """A reorganisation reverted the end of a case: what was signed is sent again."""
+        await self._parts.ledger.end(liability, ended=False)
+        if (stored := await self._parts.ledger.verdict(liability)) is not None:
+            log.warning("its end was reverted", extra=log_event("case-reopened", liability=liability))
+            await self.open(stored.liability, since_ns=stored.since_ns)
+
+    async def set_aside(self, liability: str) -> None:
+        """A reorganisation reverted a case's liability; it may come back at the same address."""
+        if self._close(liability):
+            log.warning("the liability was reverted", extra=log_event("case-set-aside", liability=liability))
+            await asyncio.to_thread(self._parts.store.release, liability)
+        await self._parts.ledger.set_aside(liability)
+
+    def send_again(self) -> None:
+        """Send what is signed now: a provider appeared, or the network is back."""
+        for case in self._open.values():
+            case.changed.set()
+
+    def _close(self, liability: str) -> bool:
+        """Stop working on a case; False if it is not open."""
+        case = self._open.pop(liability, None)
+        if case is None or case.task is None:
+            return False
+        self._of_promisor[case.stored.liability.promisor] -= 1
+        self._of_promisor += Counter()  # forgets zeros
+        case.has_ended = True
+        case.changed.set()
+        if not case.is_settling:
+            case.task.cancel()
+        return True
+
+    async def _work(self, case: OpenCase) -> None:
+        """Do what is left to do for a case, until it ends."""
+        address = case.stored.liability.address
+        with liability_context(address):
+            if not case.stored.signed and not await self._decide(case):
+                return
+            backoff = Backoff(self._resend)
+            while not case.has_ended:
+                if backoff.failures == 0 or self._rate.allow(""):
+                    await self._send(case)
+                if await case.wait(backoff.next_delay()):
+                    backoff.reset()
+
+    async def _decide(self, case: OpenCase) -> bool:
+        """Sign what was decided. False if the case can't be decided."""
+        ledger, address = self._parts.ledger, case.stored.liability.address
+        if why := self._judge.underpaid(case.stored.liability):
+            facts = log_event("case-underpaid", fee=case.stored.liability.validator_fee)
+            log.warning("%s; its result will not count", why, extra=facts)
+        while not case.stored.result:
+            await case.wait()
+        if (decision := await self._judge.decide(case.stored)) is None:
+            self._judge.verdicts["none"] += 1
+            return False
+        report, marks = decision
+        signed = Result(liability=address, result=report.result, success=report.success)
+        case.stored = await ledger.sign(signed, report=report.encode(), marks=marks)
+        self._judge.verdicts["success" if report.success else "no-success"] += 1
+        codes = ",".join(finding.code for finding in report.failures)
+        facts = log_event("verdict-signed", success=report.success, result=report.result, findings=codes)
+        log.info("judged: %s", "success" if report.success else f"no success ({codes})", extra=facts)
+        return True
+
+    async def _send(self, case: OpenCase) -> None:
+        """Send the report to both parties, and the verdict to the providers or, in generation 3, to the chain."""
+        stored, channel = case.stored, self._parts.channel
+        with suppress(StoreFull):
+            await asyncio.to_thread(self._parts.store.put_bytes, stored.report, pin=stored.liability.address)
+        for party in {stored.liability.promisee, stored.liability.promisor}:
+            channel.put(str(ReportKey(channel.lighthouse, party)), stored.report)
+        if stored.liability.validator != self._parts.signer.address:
+            channel.publish(signed_result(stored))
+            return
+        case.is_settling = True
+        try:
+            await self._settle(stored)
+        finally:
+            case.is_settling = False
+
+    async def _settle(self, stored: StoredVerdict) -> None:
+        """Finalize a generation-3 liability, which names the account itself. One that has ended refuses it."""
+        claim = decode(stored.result)
+        assert isinstance(claim, Result)
+        try:
+            settled = await self._parts.chain.liabilities.validate(claim, agree=signed_result(stored).success)
+        except (NodeUnreachable, RequestRefused, NotALiability, NoContracts) as error:
+            log.debug("the verdict is sent to the chain again: %s", error)
+        except Reverted as error:  # it has ended, which the chain's events will say
+            log.info("the chain refuses the verdict: %s", error, extra=log_event("verdict-refused", code=error.code))
+        except ChainError as error:
+            log.warning("the verdict waits: %s", error, extra=log_event("verdict-waits", code=error.code))
+        else:
+            facts = log_event("verdict-settled", tx=settled.tx, gas=settled.gas_used)
+            log.info("finalized, gas %d", settled.gas_used, extra=facts)

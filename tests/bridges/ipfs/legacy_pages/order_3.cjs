@@ -1,0 +1,44 @@
+// Run by node: order a job with robonomics-js 0.3.0 and its own IPFS provider, as a page of 2018 did.
+//
+//     NODE_PATH=… node order_3.cjs NODE_URL ENS IPFS_URL MODEL OBJECTIVE_TEXT
+const [url, ens, ipfsUrl, model, content] = process.argv.slice(2)
+
+// The client waits 3 to 10 s between two looks at the chain.
+const later = global.setTimeout
+const again = global.setInterval
+global.setTimeout = (work, ms, ...rest) => later(work, ms / 20, ...rest)
+global.setInterval = (work, ms, ...rest) => again(work, ms / 20, ...rest)
+
+require('regenerator-runtime/runtime')
+const Web3 = require('web3')
+const IPFS = require('ipfs-api')
+Promise.join = require('bluebird').join
+const { default: Robonomics, MessageProviderIpfsApi } = require('robonomics-js')
+
+const report = (name, value) => console.log(JSON.stringify({ name, value }))
+
+async function main() {
+  const web3 = new Web3(new Web3.providers.HttpProvider(url))
+  const account = web3.eth.accounts[2]
+  const { hostname, port } = new URL(ipfsUrl)
+  const ipfs = new IPFS(hostname, port)
+  report('daemon', [(await ipfs.version()).version, (await ipfs.id()).id])
+  const [{ hash }] = await ipfs.add(Buffer.from(content, 'base64'))
+  for (const bytes of [await ipfs.cat(hash), (await ipfs.get(hash))[0].content]) {
+    if (!bytes.equals(Buffer.from(content, 'base64'))) throw new Error('other bytes came back')
+  }
+  const provider = new MessageProviderIpfsApi(ipfs)
+  const robonomics = new Robonomics({ web3, account, provider, signPrefix: false, ens })
+  await robonomics.ready()
+  await robonomics.setLighthouse('airalab')
+  await new Promise((resolve, reject) =>
+    robonomics.xrt.send('approve', [robonomics.factory.address, 42], { from: account }).then(resolve, reject))
+  robonomics.getOffer(model, (offer) => report('offer', offer.account))
+  robonomics.getResult((message) => report('result message', message.result))
+  const terms = { objective: hash, token: robonomics.xrt.address, cost: 42, deadline: web3.eth.blockNumber + 1000 }
+  const liability = await robonomics.postDemand(model, terms)
+  report('liability', liability.address)
+  report('result', await new Promise((resolve) => liability.watchResult(resolve)))
+}
+
+main().then(() => process.exit(0), (error) => { console.error(error); process.exit(1) })

@@ -1,0 +1,139 @@
+"""The RPC of an IPFS daemon, served from the mesh: with the IPFS client and the pages of 2018, and without IPFS."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+from base64 import b64encode
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import aiohttp
+import pytest
+
+from bridges.ipfs._serving import IpfsApi
+from bridges.ipfs.daemon import Daemon, IpfsError
+from mesh.base.background import Background
+from mesh.content import Exchange, Store
+from mesh.dev import JsonRpcServer
+from mesh.market.provider import Provider
+from mesh.network import Endpoints, Network
+from schemas import Demand, Empty, cid_of_bytes, decode, encode
+from tests.support.market import MODEL, founded, offering, place
+from tests.support.objectives import objective
+from tests.support.peers import require
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from mesh.agent.handlers import Job
+    from tests.support.market import Place
+
+__all__ = ["founded", "place"]
+
+SCRIPTS: Final = Path(__file__).parent / "legacy_pages"
+
+
+@asynccontextmanager
+async def served(place: Place, *, size_limit: int = 1 << 20) -> AsyncIterator[IpfsApi]:
+    """The RPC on a free port."""
+    async with Network(Endpoints(connect=(place.endpoint,))) as network:
+        store = Store(place.folder / "ipfs-api")
+        async with (
+            Exchange(network.session, store) as exchange,
+            IpfsApi(network.session, store, exchange, port=0, size_limit=size_limit, timeout=3.0) as api,
+        ):
+            yield api
+        store.close()
+
+
+async def run(client: str, *arguments: str) -> dict[str, Any]:
+    """What a page with that client reports, by name."""
+    folders, script = f"{require(client)}:{require('ipfs-api')}", f"order_{client[-1]}.cjs"
+    process = await asyncio.create_subprocess_exec(
+        "node", SCRIPTS / script, *arguments,
+        env=os.environ | {"NODE_PATH": folders}, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        async with asyncio.timeout(100):
+            output, errors = await process.communicate()
+    finally:
+        if process.returncode is None:
+            process.kill()
+    assert process.returncode == 0, (output.decode(), errors.decode())
+    return {found["name"]: found["value"] for found in map(json.loads, output.splitlines())}
+
+
+@pytest.mark.parametrize(("client", "generation"), [("robonomics-3", 3), ("robonomics-5", 5)])
+async def test_a_legacy_page_orders_a_job_without_ipfs(place: Place, client: str, generation: Literal[3, 5]) -> None:
+    """robonomics-js with its own IPFS provider and the IPFS client of its time: order, offer, result."""
+    lighthouse = f"airalab.lighthouse.{generation}.robonomics.eth"
+    robot = offering(place.agent("robot", generation=generation, lighthouse_contract=lighthouse))
+
+    @robot.on("/blink")
+    async def blink(job: Job, _message: Empty) -> None:
+        job.publish("/led", "on")
+
+    content = b64encode(objective(("/blink", None))).decode()
+    async with (
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+        Provider(network.session, place.chains["provider"], lighthouse) as provider,
+        robot,
+        served(place) as api,
+        JsonRpcServer(place.node.provider) as node,
+        Background() as tasks,
+    ):
+        tasks.start(provider.run(), "provider of the test")
+        found = await run(client, node.url, place.market.deployment.ens, api.url, MODEL, content)
+    assert found["offer"] == place.address("robot")
+    assert found["result"] == found["result message"]
+
+
+async def test_our_own_client_of_daemons_understands_it(place: Place) -> None:
+    """In the dialect of its version: published messages come back, files by their CIDs."""
+    async with place.agent("person") as person, served(place) as api, Daemon(api.url) as daemon:
+        await daemon.detect_version()
+        topic = place.market.deployment.lighthouse_name
+        demand = person.parts.signer.sign(
+            Demand(
+                model=MODEL, objective=cid_of_bytes(b"x"), token=place.address("robot"), cost=2**60,
+                lighthouse=place.market.deployment.lighthouse, validator="0x" + "0" * 40, validator_fee=0,
+                deadline=2**40, nonce="5a" * 32,
+            )
+        )  # fmt: skip
+        heard = list[bytes]()
+        async with daemon.subscribe(topic) as messages:
+
+            async def hear() -> None:
+                async for message in messages:
+                    if message is not None:
+                        heard.append(message.data)
+
+            hearing = asyncio.create_task(hear())
+            while not heard:
+                await daemon.publish(topic, encode(demand))
+                await asyncio.sleep(0.1)
+            hearing.cancel()
+        assert decode(heard[0]) == demand
+        (place.folder / "file").write_bytes(b"content")
+        assert await daemon.add(place.folder / "file") == cid_of_bytes(b"content")
+        with pytest.raises(IpfsError):
+            await daemon.publish(topic, encode(demand)[:-9] + b'0000"}')
+
+
+async def test_pages_from_elsewhere_are_refused(place: Place) -> None:
+    """A page of a stranger would publish in its visitor's name."""
+    async with served(place, size_limit=10) as api, aiohttp.ClientSession() as http:
+        for origin, status in (("https://evil.example", 403), ("http://localhost:8080", 200), ("", 200)):
+            headers = {"Origin": origin} if origin else {}
+            async with http.post(f"{api.url}/api/v0/version", headers=headers) as answer:
+                assert answer.status == status
+                allowed = answer.headers.get("Access-Control-Allow-Origin")
+                assert allowed == (origin if origin and status == 200 else None)
+        form = aiohttp.FormData()
+        form.add_field("file", b"x" * 11, filename="f")
+        async with http.post(f"{api.url}/api/v0/add", data=form) as answer:
+            assert answer.status == 500
+            assert "more than 10 bytes" in await answer.text()
