@@ -1,0 +1,206 @@
+"""The bridge: a ROS 1 system as a device and a control surface of an agent.
+
+The legacy stack's nodes, topics and services are in the graph (`control`, `files`); what objectives play is published
+below `/liability/eth_ADDRESS`, and what nodes publish there is recorded (`jobs`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from bridges.devices import ABOUT, DeviceAbout, DeviceTopic
+from bridges.ros1._control import NODES, LegacyGraph
+from bridges.ros1._definitions import md5_of, message_types
+from bridges.ros1._files import FILES_NODE, PLAYER_NODE, LegacyFiles
+from bridges.ros1._jobs import GONE_SECONDS, RosJobs
+from bridges.ros1._wire import Ros1Error
+from bridges.ros1.node import Ros1Graph, Ros1Node
+from mesh.base.background import Background, call_in_loop
+from mesh.base.lifecycle import Role
+from mesh.base.log_context import log_event
+from mesh.network.metrics import drop_family
+from mesh.telemetry.metrics import MetricFamily, by_label
+from schemas.keys import IDLE, PRESENT, DeviceTopicKey
+from schemas.status import ALIVE
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from contextlib import AsyncExitStack
+
+    import zenoh
+
+    from mesh.content import Exchange, Store
+    from mesh.network import Channel
+
+log = logging.getLogger(__name__)
+
+ROSOUT: Final = "/rosout"
+LOG: Final = "rosgraph_msgs/Log"
+
+
+class NodeShutDown(Ros1Error, code="ros1-shut-down"):
+    """Somebody shut one of the bridge's nodes down: by `rosnode kill`, or with a new node of its name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RosBridgeOptions:
+    """How a bridge serves its graph.
+
+    `recording_topics` are recorded besides those of jobs. With `as_original` topics are published after a second,
+    whether anybody subscribes or not. `folders` are those that the services for files may read and write. `generation`
+    is the version of messages for those who take any. With `is_alone`, our master is the only one: it has /rosout.
+    A job whose node has disappeared for `gone_seconds` fails.
+    """
+
+    recording_topics: frozenset[str] = frozenset()
+    as_original: bool = False
+    folders: tuple[Path, ...] = (Path(tempfile.gettempdir()),)
+    generation: str = "3"
+    is_alone: bool = False
+    size_limit: int = 256 << 20
+    gone_seconds: float = GONE_SECONDS
+
+
+class Ros1Bridge(Role):
+    """A ROS 1 system as the device `name` of the agent with the address `agent`, and its control surface.
+
+    `channel` is that of the agent's market; files are those of `store` and `exchange`; recordings of the player of
+    bags are made in `directory`. Raises `InvalidKey` for an invalid name.
+    """
+
+    title = "bridge to ROS 1"
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        channel: Channel,
+        graph: Ros1Graph,
+        store: Store,
+        exchange: Exchange,
+        *,
+        agent: str,
+        directory: Path,
+        name: str = "ros1",
+        options: RosBridgeOptions = RosBridgeOptions(),
+    ) -> None:
+        self._session = session
+        self._channel = channel
+        self._graph = graph
+        self._store = store
+        self._exchange = exchange
+        self._agent = agent
+        self._name = name
+        self._directory = directory
+        self._options = options
+        self._key(PRESENT)
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        options, loop = self._options, asyncio.get_running_loop()
+        nodes = {
+            name: await stack.enter_async_context(Ros1Node(self._graph, name))
+            for name in (*NODES, FILES_NODE, PLAYER_NODE)
+        }
+        self._tasks = await stack.enter_async_context(Background())
+        if options.is_alone:
+            await self._serve_rosout(stack)
+        executor = next(iter(nodes.values()))
+        self.jobs = await stack.enter_async_context(
+            RosJobs(
+                self._session,
+                self._agent,
+                executor,
+                also_recorded=options.recording_topics,
+                as_original=options.as_original,
+                gone_seconds=options.gone_seconds,
+            )
+        )
+        files = LegacyFiles(
+            nodes[FILES_NODE],
+            nodes[PLAYER_NODE],
+            self._store,
+            self._exchange,
+            folders=options.folders,
+            directory=self._directory,
+            generation=options.generation,
+            size_limit=options.size_limit,
+        )
+        await stack.enter_async_context(files)
+        legacy = LegacyGraph(
+            self._session, self._channel, nodes, self.jobs, agent=self._agent, generation=options.generation
+        )
+        await stack.enter_async_context(legacy)
+        declared: list[Any] = [
+            self._session.liveliness().declare_token(self._key(PRESENT)),
+            self._session.declare_queryable(
+                self._key(ABOUT), lambda query: call_in_loop(loop, self._reply_about, query)
+            ),
+            self._session.declare_queryable(self._key(IDLE), lambda query: call_in_loop(loop, self._ask_idle, query)),
+        ]
+        stack.callback(lambda: None if self._session.is_closed() else [each.undeclare() for each in declared])
+        self._tasks.start(self._graph.watch(), "registrations")
+        self._tasks.start(self._graph.drops.run(), "drops")
+
+    async def _work(self) -> None:
+        """Serve until one of our nodes is shut down. Raises `NodeShutDown`."""
+        await self._graph.ended.wait()
+        raise NodeShutDown(
+            self._graph.ended_by, hint="is another bridge, or the legacy stack, on this ROS master? Stop one of them"
+        )
+
+    def families(self) -> tuple[MetricFamily, ...]:
+        """The metrics now."""
+        counts = {"in": self.jobs.received, "out": self.jobs.published}
+        help_text = "Messages of jobs from the ROS 1 system (in) and to it (out)"
+        families = by_label("aira_ros1_messages_total", "counter", help_text, "direction", counts)
+        return families, drop_family(self._graph.drops)
+
+    def parts(self) -> Mapping[str, str]:
+        """The state of each part now: the router, and the ROS master."""
+        is_linked = not self._session.is_closed() and bool(self._session.info.routers_zid())
+        return {
+            "channel": ALIVE if is_linked else "waits for a router",
+            "master": "waits for the ROS master" if self._graph.outage.is_down else ALIVE,
+        }
+
+    async def _serve_rosout(self, stack: AsyncExitStack) -> None:
+        """The node that collects the logs of a graph: they go to our log, and to `/rosout_agg`."""
+        node = await stack.enter_async_context(Ros1Node(self._graph, ROSOUT))
+        versions = message_types()[LOG]
+        everything = await node.advertise("/rosout_agg", versions, md5_of(LOG, "3"))
+        kind = versions[md5_of(LOG, "3")]
+
+        def received(payload: bytes, _header: Mapping[str, str]) -> None:
+            everything.publish(payload)
+            if log.isEnabledFor(logging.DEBUG):
+                values = kind.decode(payload)
+                facts = log_event("ros1-log", node=values["name"])
+                log.debug("%s: %s", values["name"], values["msg"][:1000], extra=facts)
+
+        await node.subscribe(ROSOUT, LOG, received)
+
+    def _ask_idle(self, query: zenoh.Query) -> None:
+        self._tasks.start(self._reply_when_idle(query), "question whether ROS is idle")
+
+    async def _reply_when_idle(self, query: zenoh.Query) -> None:
+        with query:
+            await self.jobs.wait_until_idle()
+            query.reply(str(query.key_expr), b"")
+
+    def _reply_about(self, query: zenoh.Query) -> None:
+        topics = {topic for job in self.jobs.open for topic in self.jobs.topics(job)}
+        DeviceAbout(
+            name=self._name,
+            present=True,
+            port=self._graph.master,
+            job=next(iter(self.jobs.open), ""),
+            topics=tuple(DeviceTopic(topic, "hears") for topic in sorted(topics)),
+            counters={"published": self.jobs.published, "received": self.jobs.received},
+        ).reply(query)
+
+    def _key(self, topic: str) -> str:
+        return str(DeviceTopicKey(self._agent, self._name, topic))

@@ -1,0 +1,356 @@
+"""The nodes, topics and services of the legacy stack in front of an agent, as its documentation and programs know them.
+
+Whoever is on the ROS graph is a local operator, as ROS 1 has no access control. What signs or spends goes through the
+agent's own services: it is refused unless the agent's `open_services` allows it, and their limits and deadlines hold.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import suppress
+from decimal import Decimal
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, get_args
+
+import msgspec
+import zenoh
+
+from bridges.ros1._definitions import md5_of, message_types, service_types
+from bridges.ros1.messages import plain
+from mesh.base.background import Background, call_in_loop
+from mesh.base.flood import BoundedDict
+from mesh.base.lifecycle import Lifecycle
+from mesh.base.log_context import log_event
+from mesh.errors import AiraError, InputError
+from mesh.network import Channel, call
+from schemas import ZERO_ADDRESS, Demand, Liability, Offer, Result, parse_address
+from schemas.keys import EthEvent, EthEventKey, EventKey, event_selector, parse_agent_key
+from schemas.rpc import SERVICES, ApprovalEvent, Nothing, TransferEvent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from contextlib import AsyncExitStack
+
+    from bridges.ros1._jobs import RosJobs
+    from bridges.ros1.node import Handler, Ros1Node, Ros1Publisher
+    from schemas import Record
+
+log = logging.getLogger(__name__)
+
+EXECUTOR: Final = "/liability/executor"
+LISTENER: Final = "/liability/listener"
+CHANNEL: Final = "/liability/infochan/ipfs_channel"
+SIGNER: Final = "/liability/infochan/eth/signer"
+CHANNEL_OF_OCTOBER: Final = "/liability/infochan/channel"
+SIGNER_OF_OCTOBER: Final = "/liability/infochan/signer"
+TOKEN: Final = "/eth/erc20_token"
+ETH: Final = "/eth/eth_node"
+NODES: Final = (EXECUTOR, LISTENER, CHANNEL, SIGNER, CHANNEL_OF_OCTOBER, SIGNER_OF_OCTOBER, TOKEN, ETH)
+"""The nodes of the legacy stack; two were called otherwise in October 2018."""
+
+LIABILITY: Final = "robonomics_liability/Liability"
+KINDS: Final[Mapping[str, type[Demand | Offer | Result]]] = {"demand": Demand, "offer": Offer, "result": Result}
+AMOUNTS: Final = ("cost", "deadline", "validatorFee", "lighthouseFee")
+ETHER: Final = 18
+XRT: Final = 9
+"""Decimal places."""
+WAITING: Final = 256
+"""Messages to be signed or sent that wait."""
+REMEMBERED: Final = 1024
+"""Jobs whose result is still to be published, at most."""
+KEPT_SECONDS: Final = 5.0
+"""For which the market's messages are kept for nodes that subscribe just then."""
+MOST_KEPT: Final = 64
+"""Messages of one kind that are kept so."""
+START_SECONDS: Final = 5.0
+"""For the agent's answer which jobs it has."""
+
+
+class Nonce(bytes):
+    """The nonce of an order: 32 bytes up to generation 4, and decimal digits after that."""
+
+    def __str__(self) -> str:
+        return str(int.from_bytes(self, "big"))
+
+
+class LegacyGraph(Lifecycle):
+    """The legacy stack's names for the agent with the address `agent`: `async with LegacyGraph(...)`.
+
+    `channel` is that of its market. `generation` is the version of messages for those who take any.
+    """
+
+    title = "legacy names on ROS 1"
+
+    def __init__(
+        self, session: zenoh.Session, channel: Channel, nodes: Mapping[str, Ros1Node], jobs: RosJobs, *,
+        agent: str, generation: str,
+    ) -> None:  # fmt: skip
+        self._session = session
+        self._channel = channel
+        self._nodes = nodes
+        self._jobs = jobs
+        self._agent = parse_address(agent)
+        self._generation = generation
+        self._requests: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue(WAITING)
+        self._complete: BoundedDict[str, bool] = BoundedDict(REMEMBERED)
+        self._topics: dict[str, Ros1Publisher] = {}
+        self._phases: BoundedDict[str, str] = BoundedDict(REMEMBERED)
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        loop = asyncio.get_running_loop()
+        self._tasks = await stack.enter_async_context(Background())
+        await self._advertise_all()
+        await self._serve_all()
+        self._tasks.start(self._send_requests(), "messages of ROS nodes")
+        for kind in KINDS.values():
+            self._tasks.start(self._show_market(kind), f"{kind.__name__}s to ROS")
+        heard = {event_selector(self._agent): self._handle_event}
+        heard |= {str(EthEventKey(self._agent, event)): self._handle_token_event for event in get_args(EthEvent)}
+
+        def declare(selector: str, handler: Callable[[str, bytes], None]) -> Any:
+            def received(sample: zenoh.Sample) -> None:
+                call_in_loop(loop, handler, str(sample.key_expr), sample.payload.to_bytes())
+
+            return self._session.declare_subscriber(selector, received)
+
+        declared = [declare(*each) for each in heard.items()]
+        stack.callback(lambda: None if self._session.is_closed() else [each.undeclare() for each in declared])
+        # Jobs that are ready already, as after a restart of this bridge.
+        self._tasks.start(self._recall_jobs(), "jobs at the start")
+
+    async def _advertise_all(self) -> None:
+        for node, topic, type in (
+            (LISTENER, "/liability/incoming", LIABILITY),
+            (LISTENER, "/liability/finalized", "std_msgs/String"),
+            (EXECUTOR, "/liability/ready", LIABILITY),
+            (EXECUTOR, "/liability/complete", LIABILITY),
+            (EXECUTOR, "/liability/result", "robonomics_msgs/Result"),
+            (TOKEN, "/eth/event/transfer", "ethereum_common/TransferEvent"),
+            (TOKEN, "/eth/event/approval", "ethereum_common/ApprovalEvent"),
+            *((CHANNEL, f"/liability/infochan/incoming/{kind}", _type_of(kind)) for kind in KINDS),
+            *((SIGNER, f"/liability/infochan/eth/sending/{kind}", _type_of(kind)) for kind in KINDS),
+        ):
+            default = md5_of(type, self._generation)
+            self._topics[topic] = await self._nodes[node].advertise(topic, message_types()[type], default)
+        for kind in KINDS:
+            for node, topic, service in (
+                (SIGNER, "eth/signing", "sign"),
+                (CHANNEL, "eth/sending", "send"),
+                (SIGNER_OF_OCTOBER, "signing", "sign"),
+                (CHANNEL_OF_OCTOBER, "sending", "send"),
+            ):
+                received = partial(self._request, f"{service}/{kind}", _type_of(kind))
+                await self._nodes[node].subscribe(f"/liability/infochan/{topic}/{kind}", _type_of(kind), received)
+
+    async def _serve_all(self) -> None:
+        started, balance = "robonomics_liability/StartLiability", "ethereum_common/AccountBalance"
+        own, allowed = "ethereum_common/Balance", "ethereum_common/AccountToAddressAllowance"
+        own_allowed = "ethereum_common/Allowance"
+        handlers: list[tuple[str, str, str, Handler]] = [
+            (EXECUTOR, "/liability/start", started, partial(self._drive, "start")),
+            (EXECUTOR, "/liability/restart", started, partial(self._drive, "restart")),
+            (EXECUTOR, "/liability/resume", started, partial(self._drive, "resume")),
+            (EXECUTOR, "/liability/finish", "robonomics_liability/FinishLiability", self._finish),
+            (LISTENER, "/liability/read", "robonomics_liability/ReadLiability", self._read),
+            (ETH, "/eth/accounts", "ethereum_common/Accounts", self._eth("accounts")),
+            (ETH, "/eth/current_block", "ethereum_common/BlockNumber", self._eth("current_block")),
+            (ETH, "/eth/account_eth_balance", balance, self._eth("account_eth_balance", ETHER)),
+            (ETH, "/eth/eth_balance", own, self._eth("eth_balance", ETHER)),
+            (TOKEN, "/eth/transfer", "ethereum_common/Transfer", self._eth("transfer")),
+            (TOKEN, "/eth/transfer_from", "ethereum_common/TransferFrom", self._eth("transfer_from")),
+            (TOKEN, "/eth/approve", "ethereum_common/Approve", self._eth("approve")),
+            (TOKEN, "/eth/account_xrt_balance", balance, self._eth("account_xrt_balance", XRT)),
+            (TOKEN, "/eth/xrt_balance", own, self._eth("xrt_balance", XRT)),
+            (TOKEN, "/eth/account_xrt_allowance", allowed, self._eth("account_xrt_allowance")),
+            (TOKEN, "/eth/xrt_allowance", own_allowed, self._eth("xrt_allowance")),
+            (TOKEN, "/eth/erc20_balance", balance, self._eth("account_xrt_balance", XRT)),
+            (TOKEN, "/eth/erc20_balance_of", own, self._eth("xrt_balance", XRT)),
+            (TOKEN, "/eth/erc20_allowance", allowed, self._eth("account_xrt_allowance")),
+            (TOKEN, "/eth/erc20_allowance_of", own_allowed, self._eth("xrt_allowance")),
+        ]
+        for node, name, type, handler in handlers:
+            await self._nodes[node].serve(name, service_types()[type], md5_of(type, self._generation), handler)
+
+    def _handle_event(self, key: str, payload: bytes) -> None:
+        """A job has come to a phase."""
+        try:
+            event = parse_agent_key(key)
+            if not isinstance(event, EventKey):
+                return
+            liability = Liability.decode(payload)
+        except AiraError as error:
+            log.info("%s", error, extra=log_event("key-ignored", key=key))
+            return
+        address, phase = liability.address, event.event
+        if self._phases.get(address) == phase:
+            return
+        self._phases[address] = phase
+        shown = _encoded(liability)
+        ready = self._topics["/liability/ready"]
+        if phase == "ready":
+            ready.kept[address] = shown  # also for a node that starts late
+        else:
+            ready.kept.pop(address, None)
+        if phase == "complete":
+            self._complete[address] = True
+            self._jobs.ended(address)
+        if phase == "finalized":
+            self._jobs.ended(address)
+            self._topics["/liability/finalized"].publish({"data": address})
+        else:
+            self._topics[f"/liability/{phase}"].publish(shown)
+
+    async def _recall_jobs(self) -> None:
+        """Show the jobs that are ready already, as after a restart of this bridge, and no running ones."""
+
+        def ask() -> dict[str, bytes]:
+            replies = self._session.get(event_selector(self._agent), timeout=START_SECONDS)
+            found = (reply.ok for reply in replies)
+            return {str(each.key_expr): each.payload.to_bytes() for each in found if each is not None}
+
+        with suppress(zenoh.ZError, AiraError):
+            found = await asyncio.to_thread(ask)
+            # The agent calls running jobs ready, too: it says only how many are.
+            status = await call(self._session, self._agent, "status", Nothing())
+            are_ready = status.work is not None and status.work.jobs.get("ready", 0)
+            for key, payload in found.items():
+                below, _, event = key.rpartition("/")
+                is_waiting = are_ready and event == "ready" and f"{below}/progress" not in found
+                if is_waiting or event == "complete":
+                    self._handle_event(key, payload)
+
+    def _handle_token_event(self, key: str, payload: bytes) -> None:
+        kind = key.rpartition("/")[2]
+        record: type[Record] = TransferEvent if kind == "transfer" else ApprovalEvent
+        with suppress(AiraError):
+            self._topics[f"/eth/event/{kind}"].publish(msgspec.structs.asdict(record.decode(payload)))
+
+    async def _show_market(self, kind: type[Demand | Offer | Result]) -> None:
+        """Publish the market's messages; those of the agent also as what its signer sends."""
+        name, loop = kind.__name__.lower(), asyncio.get_running_loop()
+        async with self._channel.subscribe(kind) as messages:
+            async for verified in messages:
+                values = fields_of(verified.message)
+                incoming = self._topics[f"/liability/infochan/incoming/{name}"]
+                incoming.publish(values)
+                if len(incoming.kept) < MOST_KEPT:  # nodes that have just started connect within seconds
+                    incoming.kept[verified.hash.hex()] = values
+                    loop.call_later(KEPT_SECONDS, incoming.kept.pop, verified.hash.hex(), None)
+                if verified.signer != self._agent:
+                    continue
+                self._topics[f"/liability/infochan/eth/sending/{name}"].publish(values)
+                if name == "result" and self._complete.pop(values["liability"], False):
+                    self._topics["/liability/result"].publish(values | {"signature": b""})
+
+    def _request(self, service: str, type: str, payload: bytes, header: Mapping[str, str]) -> None:
+        """A node wants a message signed, or sent."""
+        try:
+            kind = message_types()[type].get(header.get("md5sum", ""))
+            if kind is None:
+                raise InputError(f"{type} of an unknown version, {header.get('md5sum')}")
+            values = {name: plain(value) for name, value in kind.decode(payload).items()}
+            self._requests.put_nowait((service, values))
+        except (AiraError, asyncio.QueueFull) as error:
+            self._refuse(service, header.get("callerid", ""), error)
+
+    async def _send_requests(self) -> None:
+        while True:
+            service, values = await self._requests.get()
+            try:
+                request = SERVICES[service].request.decode(msgspec.json.encode(self._request_of(service, values)))
+                await call(self._session, self._agent, service, request)
+            except AiraError as error:
+                self._refuse(service, "", error)
+
+    def _request_of(self, service: str, values: dict[str, Any]) -> dict[str, Any]:
+        """The fields of a request to the agent: amounts as text, and no nonce and signature if it shall sign."""
+        fields = {name: str(value) or "0" if name in AMOUNTS else value for name, value in values.items()}
+        nonce: Any = fields.pop("nonce", b"")
+        signature: Any = fields.pop("signature", b"")
+        sender = fields.pop("sender", "")
+        if "cost" in fields:
+            fields["lighthouse"] = fields.get("lighthouse") or self._channel.lighthouse
+            fields["validator"] = fields["validator"] or ZERO_ADDRESS
+        if service.startswith("sign/"):
+            return fields
+        if "cost" in fields:
+            fields["nonce"] = nonce.hex() if isinstance(nonce, bytes) else nonce
+            fields |= {"sender": sender} if sender else {}
+        return fields | {"signature": signature.hex()}
+
+    def _refuse(self, service: str, node: str, error: Exception) -> None:
+        code = error.code if isinstance(error, AiraError) else "busy"
+        facts = log_event("ros1-message-refused", service=service, node=node, code=code)
+        hint = f"; {error.hint}" if isinstance(error, AiraError) and error.hint else ""
+        log.warning("a message of a ROS node for %s is refused: %s%s", service, error, hint, extra=facts)
+
+    async def _drive(self, service: str, request: Mapping[str, Any], caller: str) -> dict[str, Any]:
+        """Start, restart or resume a job for a node."""
+        address = plain(request)
+        try:
+            address = parse_address(address)
+            asked = SERVICES[service].request(address)
+            done = await call(self._session, self._agent, service, asked)
+        except AiraError as error:
+            return {"success": False, "msg": str(error)}
+        if done.success:
+            self._jobs.driven(address, caller)
+        return {"success": done.success, "msg": done.msg or f"Liability {address} started"}
+
+    async def _finish(self, request: Mapping[str, Any], _caller: str) -> dict[str, Any]:
+        address = parse_address(plain(request["address"]))
+        await self._jobs.settle()
+        asked = SERVICES["finish"].request(address, request["success"])
+        await call(self._session, self._agent, "finish", asked)
+        return {}
+
+    async def _read(self, request: Mapping[str, Any], _caller: str) -> dict[str, Any]:
+        asked = SERVICES["read"].request(parse_address(plain(request)))
+        found = await call(self._session, self._agent, "read", asked)
+        if found.liability is None:
+            return {"read": False}
+        return {"read": True, "liability": _encoded(found.liability)}
+
+    def _eth(self, service: str, places: int | None = None) -> Handler:
+        """A service of the agent's account; `places` says of a balance where its decimal point is."""
+
+        async def handler(request: Mapping[str, Any], _caller: str) -> dict[str, Any]:
+            kind = SERVICES[f"eth/{service}"].request
+            fields = {name: plain(value) for name, value in request.items()}
+            asked = kind.decode(msgspec.json.encode(fields))
+            reply = msgspec.structs.asdict(await call(self._session, self._agent, f"eth/{service}", asked))
+            if places is not None:
+                reply["balance"] = decimal(reply["balance"], places)
+            if "txhash" in reply:
+                reply["txhash"] = bytes.fromhex(reply["txhash"].removeprefix("0x"))
+            return reply
+
+        return handler
+
+
+def decimal(amount: int, places: int) -> str:
+    """An amount of the smallest unit as the legacy services wrote it: `997.0`."""
+    text = f"{Decimal(int(amount)).scaleb(-places):f}"
+    whole, _, part = text.partition(".")
+    return f"{whole}.{part.rstrip('0') or '0'}"
+
+
+def _encoded(message: msgspec.Struct) -> dict[str, Any]:
+    """The fields by the names that travel, as ROS has them, too."""
+    return dict(zip(message.__struct_encode_fields__, msgspec.structs.astuple(message), strict=True))
+
+
+def fields_of(message: Demand | Offer | Result) -> dict[str, Any]:
+    """The fields of a message for any generation."""
+    fields = _encoded(message)
+    fields["signature"] = bytes.fromhex(message.signature.removeprefix("0x"))
+    if isinstance(message, Demand | Offer):
+        nonce = message.nonce
+        fields["nonce"] = Nonce(nonce.to_bytes(32, "big") if isinstance(nonce, int) else bytes.fromhex(nonce))
+        fields["sender"] = message.sender or ""
+    return fields
+
+
+def _type_of(kind: str) -> str:
+    return f"robonomics_msgs/{kind.capitalize()}"

@@ -1,0 +1,244 @@
+"""`aira bridge ros1`: a ROS 1 system as a device and a control surface of an agent."""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import tempfile
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from mesh.base.log_context import LogSource, log_event
+from mesh.cli.options import with_settings
+from mesh.cli.output import announce
+from mesh.errors import InputError
+from mesh.role.running import fail, open_when_ready, run_until_stopped
+from mesh.settings import (
+    AccountSettings,
+    ChainSettings,
+    ExecutionSettings,
+    NetworkSettings,
+    Settings,
+    TelemetrySettings,
+)
+from mesh.telemetry.logs import set_process_source
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from bridges.ros1.node import Ros1Graph
+    from mesh.content import Exchange, Store
+    from mesh.network import Channel, Network
+    from mesh.telemetry.metrics import MetricFamily
+    from mesh.telemetry.serving import Telemetry
+
+log = logging.getLogger(__name__)
+
+_OF_NODES: Final = {
+    "/liability/executor": ("recording_topics", "keyfile", "keyfile_password_file"),
+    "/liability/listener": ("factory_contract", "web3_http_provider", "web3_ws_provider", "ens_contract"),
+    "/liability/infochan/ipfs_channel": ("lighthouse_contract",),
+    "/liability/infochan/eth/signer": ("keyfile", "keyfile_password_file"),
+    "/eth/erc20_token": ("factory_contract", "web3_http_provider", "web3_ws_provider", "ens_contract"),
+    "/eth/eth_node": ("web3_http_provider", "web3_ws_provider", "ens_contract"),
+}
+PARAMETERS: Final = {f"{node}/{name}": name for node, names in _OF_NODES.items() for name in names} | {
+    "/eth/erc20_token/token_contract": "erc20_token"
+}
+"""The parameters of the legacy stack's nodes, and our settings that they are."""
+WITHOUT_MEANING: Final = "/liability/executor/master_check_interval"
+PRIVATE: Final = frozenset({"keyfile", "keyfile_password_file", "web3_http_provider", "web3_ws_provider"})
+"""Settings that are read from the parameter server and never written to it: paths, and URLs of nodes."""
+OURS: Final = "/liability/executor/aira_parameters"
+"""The parameters that the bridge has set itself: names and values."""
+
+
+@click.command("ros1", short_help="connect a ROS 1 system as a device and control surface of an agent")
+@click.option("--agent", metavar="ADDRESS", help="address of a running agent [the keyfile's account, run here]")
+@click.option("--name", default="ros1", show_default=True, help="name of the device in the agent's keys")
+@click.option("--master", "serves_master", is_flag=True, help="serve a ROS master, rather than join one")
+@click.option(
+    "--ros-master-uri", envvar="ROS_MASTER_URI", default="http://127.0.0.1:11311", show_default=True,
+    help="the ROS master to join, or where to serve one",
+)  # fmt: skip
+@click.option(
+    "--ros-ip", default="127.0.0.1", show_default=True,
+    help="address that our nodes listen on. ROS 1 has no access control: who reaches it can do what the agent allows",
+)  # fmt: skip
+@click.option("--files", "folders", multiple=True, type=click.Path(path_type=Path, file_okay=False, exists=True),
+    help="folder that /ipfs/add_file and get_file may read and write [that for temporary files]",
+)  # fmt: skip
+@click.option("--original-timing", is_flag=True, help="publish a job's topics after one second, subscriber or not")
+@click.option("--messages", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+    help="write the messages of the settings' generation as a catkin workspace to DIR, and end",
+)  # fmt: skip
+@click.option("--message-version", type=click.Choice(["3", "4", "5"]),
+    help="version of messages for --messages, and for tools that take any [the settings' generation]",
+)  # fmt: skip
+@with_settings(
+    NetworkSettings, AccountSettings, ChainSettings, ExecutionSettings, TelemetrySettings, "lighthouse_contract"
+)
+def command(settings: Settings, messages: Path | None, message_version: str | None, **options: Any) -> None:
+    """Show an agent to a ROS 1 system with the names of the legacy stack: nodes, topics, services, parameters. Needs no
+    ROS. Ctrl-C stops it.
+
+    In a job, what its objective plays is published below /liability/eth_ADDRESS, and what nodes publish there is
+    recorded. Messages of all generations are served at the same time. Nodes may sign and spend only if the agent's
+    settings say open_services = true.
+    """
+    generation = message_version or str(settings.generation)
+    if messages is not None:
+        _write_messages(messages, generation)
+        return
+    run_until_stopped(
+        lambda: _serve(settings, Ros1Options(generation=generation, **options)), settings=settings, role="edge"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ros1Options:
+    """The flags of the command."""
+
+    agent: str | None
+    name: str
+    serves_master: bool
+    ros_master_uri: str
+    ros_ip: str
+    folders: tuple[Path, ...]
+    original_timing: bool
+    generation: str
+
+
+def _write_messages(folder: Path, generation: str) -> None:
+    from bridges.ros1._definitions import write_workspace
+
+    try:
+        packages = write_workspace(folder, generation)
+    except InputError as error:
+        fail(error)
+    click.echo(f"{folder}/src has the packages {', '.join(packages)}: build it with catkin_make")
+    if (folder / "python").exists():
+        click.echo(f"{folder}/python has them as Python: export PYTHONPATH={folder}/python:$PYTHONPATH")
+
+
+async def _serve(settings: Settings, options: Ros1Options) -> None:
+    from bridges.ros1._bridge import Ros1Bridge, RosBridgeOptions
+    from mesh.network.metrics import network_families
+    from mesh.telemetry.serving import Telemetry
+    from schemas import parse_address
+
+    if options.agent is not None:
+        options = replace(options, agent=parse_address(options.agent))
+    if not ipaddress.ip_address(options.ros_ip).is_loopback:
+        facts = log_event("ros1-open", address=options.ros_ip)
+        log.warning(
+            "ROS 1 has no access control: who reaches %s can do what the agent allows", options.ros_ip, extra=facts
+        )
+    async with AsyncExitStack() as stack:
+        graph = await _graph(options, stack)
+        settings = await settings_with_parameters(graph, settings)
+        telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen if options.agent else ""))
+        agent, network, channel, store, exchange = await _agent(settings, options, stack, telemetry)
+        chosen = RosBridgeOptions(
+            recording_topics=frozenset(filter(None, map(str.strip, settings.recording_topics.split(",")))),
+            as_original=options.original_timing,
+            folders=options.folders or (Path(tempfile.gettempdir()),),
+            generation=options.generation,
+            is_alone=options.serves_master,
+            size_limit=settings.objective_size_limit,
+        )
+        directory = settings.state_directory / "bridge" / "ros1"
+        bridge = await stack.enter_async_context(
+            Ros1Bridge(
+                network.session, channel, graph, store, exchange,
+                agent=agent, directory=directory, name=options.name, options=chosen,
+            )
+        )  # fmt: skip
+        set_process_source(LogSource("edge", parse_address(agent)))
+
+        async def measure() -> Iterable[MetricFamily]:
+            return (*bridge.families(), *network_families(network))
+
+        stack.enter_context(telemetry.showing(measure=measure, health=bridge.parts))
+        words = f"bridge of {agent}: the ROS master is {graph.master}"
+        announce(log, "edge-started", words, device=options.name)
+        await bridge.run()
+
+
+async def _graph(options: Ros1Options, stack: AsyncExitStack) -> Ros1Graph:
+    """The ROS graph, on our master or on another one."""
+    from bridges.ros1._wire import place_of
+    from bridges.ros1.master import RosMaster
+    from bridges.ros1.node import Ros1Graph
+    from mesh.base.flood import Drops
+
+    drops, uri = Drops(), options.ros_master_uri
+    port = place_of(uri)[1]
+    if options.serves_master:
+        master = await stack.enter_async_context(RosMaster(options.ros_ip, port, drops))
+        uri = master.uri
+    return Ros1Graph(uri, options.ros_ip, drops)
+
+
+async def _agent(
+    settings: Settings, options: Ros1Options, stack: AsyncExitStack, telemetry: Telemetry
+) -> tuple[str, Network, Channel, Store, Exchange]:
+    """The agent that is run here, or what is needed beside one that runs elsewhere."""
+
+    from mesh.content import Exchange
+    from mesh.role.composition import open_store, watching
+
+    if options.agent is None:
+        from mesh import Agent
+
+        if not settings.keyfile:
+            raise InputError(
+                "there is no agent", hint="name the address of one (--agent), or a keyfile, whose agent is run here"
+            )
+        agent = await stack.enter_async_context(Agent(settings=settings))
+        return agent.address, agent.network, agent.channel, agent.parts.store, agent.parts.exchange
+    network, channel = await open_when_ready(
+        stack, settings, lambda: watching(settings), role="bridge", on_wait=telemetry.starting
+    )
+    directory = settings.state_directory / "bridge" / "ros1" / "content"
+    store = await open_store(stack, settings, directory, limit=settings.objective_size_limit)
+    exchange = await stack.enter_async_context(Exchange(network.session, store))
+    return options.agent, network, channel, store, exchange
+
+
+async def settings_with_parameters(graph: Ros1Graph, settings: Settings) -> Settings:
+    """The settings, changed by the parameters of the legacy stack that are set; the others are set from the settings.
+
+    They are read once. Those that an earlier bridge has set are not the user's, and are set again.
+    """
+    from bridges.ros1._wire import Ros1Error
+
+    found, ours = dict[str, Any](), dict[str, str]()
+    try:
+        earlier = await _parameter(graph, OURS)
+        for name, option in PARAMETERS.items():
+            value, mine = await _parameter(graph, name), str(getattr(settings, option))
+            if isinstance(value, str) and value and value != mine and [name, value] not in (earlier or []):
+                found[option] = value
+            elif option not in PRIVATE:
+                ours[name] = mine
+                await graph.call("setParam", name, mine)
+        await graph.call("setParam", OURS, [list(each) for each in ours.items()])
+        if await _parameter(graph, WITHOUT_MEANING) is not None:
+            ignored = log_event("option-retired", option=WITHOUT_MEANING)
+            log.info("%s has no meaning here: the master is always asked", WITHOUT_MEANING, extra=ignored)
+    except Ros1Error as error:
+        graph.outage.failed(error, "the parameters of ROS are not read")
+    if found:
+        facts = log_event("ros1-parameters", names=", ".join(sorted(found)))
+        log.info("the parameter server sets %s", ", ".join(sorted(found)), extra=facts)
+    return replace(settings, **found)
+
+
+async def _parameter(graph: Ros1Graph, name: str) -> Any:
+    """A parameter; None if it is not set. Raises `Ros1Error` if the master does not answer."""
+    return await graph.call("getParam", name) if await graph.call("hasParam", name) else None

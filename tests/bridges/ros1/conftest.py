@@ -1,0 +1,69 @@
+"""Both masters, real ROS 1 on one of them, and the legacy network's messages of each generation as Python."""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bridges.ros1._definitions import write_workspace
+from bridges.ros1.master import RosMaster
+from bridges.ros1.node import Ros1Graph
+from mesh.base.flood import Drops
+from tests.bridges.ros1.peers import Ros, RosMasterServer
+from tests.support.market import founded, place
+from tests.support.peers import require
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterator
+    from contextlib import AbstractAsyncContextManager
+
+
+__all__ = ["founded", "place"]
+
+
+@pytest.fixture(scope="session")
+def rosmaster() -> Iterator[RosMasterServer]:
+    """The master of ROS, for all tests: their nodes have names of their own."""
+    with RosMasterServer() as server:
+        yield server
+
+
+class Messages(dict[str, Path]):
+    """The folder with the messages of each generation, made when it is needed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __missing__(self, generation: str) -> Path:
+        write_workspace(self._folder / generation, generation)
+        self[generation] = self._folder / generation
+        return self[generation]
+
+
+@pytest.fixture(scope="session")
+def messages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The messages of each generation, as `aira bridge ros1 --messages` writes them."""
+    require("genpy")
+    return Messages(tmp_path_factory.mktemp("messages"))
+
+
+@pytest.fixture
+def graph() -> Callable[[], AbstractAsyncContextManager[Ros1Graph]]:
+    """Opens a graph of ours on a master of ours."""
+
+    @asynccontextmanager
+    async def opened() -> AsyncIterator[Ros1Graph]:
+        drops = Drops()
+        async with RosMaster("127.0.0.1", 0, drops) as master:
+            yield Ros1Graph(master.uri, drops=drops)
+
+    return opened
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Callable[[str], Ros]:
+    """The programs of ROS on a master."""
+    return lambda master: Ros(master, tmp_path)

@@ -1,0 +1,274 @@
+"""Whole paid jobs, done by nodes of rospy that know nothing but the legacy stack."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bridges.ros1._control import decimal
+from bridges.ros1._definitions import service_types
+from bridges.ros1._wire import Ros1Error
+from bridges.ros1.messages import plain
+from bridges.ros1.node import Ros1Graph, Ros1Node
+from mesh.agent.ledger import Phase
+from mesh.recording import open_objective
+from schemas import Empty, Result, String
+from tests.bridges.ros1.jobs import bridged
+from tests.support.bags import Bag, BagMessage
+from tests.support.boards import board, edge
+from tests.support.market import in_phase, offering
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from contextlib import AbstractAsyncContextManager
+    from pathlib import Path
+
+    from mesh.agent.contracts import Contract
+    from tests.bridges.ros1.peers import Ros, RosMasterServer
+    from tests.support.market import Place
+
+    Opened = Callable[[], AbstractAsyncContextManager[Ros1Graph]]
+
+
+async def recorded(contract: Contract) -> list[tuple[str, str, str]]:
+    """Topic, type and text of each message in the recording of a job."""
+    found = open_objective(await contract.recording()).messages()
+    return [(one.topic, one.type.schema_name, getattr(one.value, "data", one.value) or "") for one in found]
+
+
+@pytest.mark.sample("generation")
+@pytest.mark.parametrize("generation", ["3", "4", "5"])
+@pytest.mark.parametrize(("argument", "message", "word"), [("Empty", Empty(), "on"), ("String", String("red"), "red")])
+async def test_a_tutorial_node_does_a_paid_job(
+    place: Place,
+    graph: Opened,
+    ros: Callable[[str], Ros],
+    messages: dict[str, Path],
+    generation: str,
+    argument: str,
+    message: object,
+    word: str,
+) -> None:
+    """It offers, starts the job, blinks, says so and finishes: what it says is in the recording, and it is paid."""
+    before = await place.balance("robot")
+    robot = place.agent("robot", open_services=True)
+    async with (
+        asyncio.timeout(60),
+        graph() as here,
+        place.at_work(robot) as person,
+        bridged(place, robot, here),
+        ros(here.master).node("blink", argument, messages=messages[generation]) as node,
+    ):
+        assert await node.hear() == "ready"
+        contract = await person.demand([("/blink", message)], cost=42)
+        assert await node.hear() == {"started": True}
+        assert await node.hear() == {"blink": word}
+        assert (await contract.outcome()).success
+        assert await recorded(contract) == [
+            ("/blink", f"std_msgs/{argument}", "" if argument == "Empty" else word),
+            ("/led", "std_msgs/String", word),
+        ]
+    assert await place.balance("robot") == before + 42
+
+
+async def test_a_sensor_answers_a_free_demand_with_a_bag(
+    place: Place, graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
+) -> None:
+    """It makes a real bag, puts it into our store and signs a result; whoever demanded it reads the bag."""
+    robot = place.agent("robot", open_services=True)
+    async with (
+        asyncio.timeout(60),
+        graph() as here,
+        place.at_work(robot) as person,
+        bridged(place, robot, here),
+        ros(here.master).node("sensor", "12 0.5", messages=messages["5"]) as node,
+        person.channel.subscribe(Result) as results,
+    ):
+        assert await node.hear() == "ready"
+        await person.order([("/measure", None)])
+        said = await node.hear()
+        assert said["added"], said["why"]
+        result = (await anext(results)).message
+        assert result.result == said["cid"]
+        bag = open_objective(await person.fetch(result.result))
+        assert [(one.topic, one.value) for one in bag.messages()] == [("/measurements", "12 0.5")]
+
+
+async def test_a_job_whose_node_dies_fails_with_the_reason(
+    place: Place, graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
+) -> None:
+    """The person is refunded, and reads why."""
+    before = await place.balance("person")
+    robot = place.agent("robot", open_services=True)
+    async with (
+        asyncio.timeout(60),
+        graph() as here,
+        place.at_work(robot) as person,
+        bridged(place, robot, here, gone_seconds=1.0),
+        ros(here.master).node("blink", "Empty", "die", messages=messages["3"]) as node,
+    ):
+        assert await node.hear() == "ready"
+        contract = await person.demand([("/blink", Empty())], cost=42)
+        outcome = await contract.outcome()
+        assert (outcome.success, outcome.code) == (False, "ros1-node-gone")
+    assert await place.balance("person") == before
+
+
+async def test_a_bridge_that_is_started_again_in_a_job_goes_on_with_it(
+    place: Place, graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
+) -> None:
+    """A job that was ready meanwhile is shown to nodes, and recorded, and the node ends it."""
+    robot = place.agent("robot", open_services=True)
+    async with asyncio.timeout(60), graph() as here, place.at_work(offering(robot)) as person:
+        async with bridged(place, robot, here):
+            """Gone when the contract comes."""
+        contract = await person.demand([("/blink", Empty())])
+        await in_phase(robot, contract, Phase.READY)
+        async with bridged(place, robot, here), ros(here.master).node("blink", messages=messages["5"]) as node:
+            assert await node.hear() in ("ready", {"started": True})
+            assert (await contract.outcome()).success
+        assert ("/led", "std_msgs/String", "on") in await recorded(contract)
+
+
+async def test_services_show_the_account_in_the_units_of_the_original(
+    place: Place, graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
+) -> None:
+    """Balances in XRT and ether, allowances in the smallest unit; what spends is refused unless it is allowed."""
+    robot = place.agent("robot")
+    async with graph() as here, place.at_work(robot), bridged(place, robot, here):
+        tools = ros(here.master)
+        tools.environment["PYTHONPATH"] = str(messages["3"] / "python")
+        services = ("/eth/accounts", "/eth/xrt_balance", "/eth/xrt_allowance", "/eth/current_block")
+        accounts, balance, allowance, _block, transfer = await asyncio.gather(
+            *(tools.run("rosservice", "call", name) for name in services),
+            tools.run("rosservice", "call", "/eth/transfer", "{to: {address: '0x1'}, value: {uint256: '1'}}"),
+        )
+        assert robot.address in accounts
+        assert f'uint256: "{decimal(await place.balance("robot"), 9)}"' in balance
+        assert 'uint256: "' in allowance
+        assert "open_services" in transfer
+
+
+async def test_the_graph_has_the_names_of_the_legacy_documentation(
+    place: Place, graph: Opened, ros: Callable[[str], Ros]
+) -> None:
+    """Chapter 2: what `rosnode list` and `rostopic list` printed."""
+    robot = place.agent("robot")
+    async with graph() as here, place.at_work(robot), bridged(place, robot, here, is_alone=True):
+        tools = ros(here.master)
+        nodes, topics = await asyncio.gather(tools.run("rosnode", "list"), tools.run("rostopic", "list"))
+    assert set(nodes.split()) >= CHAPTER_2_NODES
+    assert set(topics.split()) >= CHAPTER_2_TOPICS
+
+
+CHAPTER_2_NODES = {
+    "/eth/erc20_token",
+    "/eth/eth_node",
+    "/liability/executor",
+    "/liability/infochan/channel",
+    "/liability/infochan/signer",
+    "/liability/listener",
+    "/rosout",
+}
+CHAPTER_2_TOPICS = {
+    "/eth/event/approval",
+    "/eth/event/transfer",
+    "/liability/complete",
+    "/liability/finalized",
+    "/liability/incoming",
+    "/liability/infochan/eth/sending/demand",
+    "/liability/infochan/eth/signing/offer",
+    "/liability/infochan/incoming/result",
+    "/liability/ready",
+    "/liability/result",
+    "/rosout",
+    "/rosout_agg",
+}
+
+
+async def test_a_job_survives_a_restart_of_the_ros_master(
+    place: Place, rosmaster: RosMasterServer, ros: Callable[[str], Ros], messages: dict[str, Path]
+) -> None:
+    """Connections go on meanwhile, and the services are registered again for the node that ends the job."""
+    robot = place.agent("robot", open_services=True)
+    async with (
+        asyncio.timeout(60),
+        place.at_work(robot) as person,
+        bridged(place, robot, Ros1Graph(rosmaster.uri)) as here,
+        ros(rosmaster.uri).node("blink", "Empty", "told", messages=messages["3"]) as node,
+    ):
+        assert await node.hear() == "ready"
+        contract = await person.demand([("/blink", Empty())])
+        assert await node.hear() == {"started": True}
+        assert await node.hear() == {"blink": "on"}
+        rosmaster.kill()
+        await asyncio.to_thread(rosmaster.start)
+
+        async def is_registered() -> bool:
+            with suppress(Ros1Error):
+                return bool(await here.graph.call("lookupService", "/liability/finish"))
+            return False
+
+        await until_found(is_registered, what="the services on the new master")
+        node.tell("go on")
+        assert (await contract.outcome()).success
+
+
+async def test_the_player_of_bags_plays_and_records(
+    place: Place, graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
+) -> None:
+    """A bag that a node added is played below a namespace; what is published there becomes a recording."""
+    bag = Bag([BagMessage("/say", String("hello").encode(), 1)]).encode()
+    (place.folder / "say.bag").write_bytes(bag)
+    robot = place.agent("robot")
+    async with (
+        graph() as here,
+        place.at_work(robot) as person,
+        bridged(place, robot, here, folders=(place.folder,)),
+        Ros1Node(Ros1Graph(here.master), "/test") as node,
+        ros(here.master).node("echo", "/played/say", "/played/answer") as echo,
+    ):
+        assert await echo.hear() == "ready"
+        kinds = {name: next(iter(versions.values())) for name, versions in service_types().items()}
+        add, new, start, stop = (
+            kinds[f"ipfs_common/{name}" if name.startswith("Ipfs") else f"robonomics_liability/{name}"]
+            for name in ("IpfsUploadFile", "CreateRosbagPlayer", "StartRosbagPlayer", "StopRosbagPlayer")
+        )
+        added = await node.call("/ipfs/add_file", add, {"file": str(place.folder / "say.bag")})
+        assert added["success"], added["error_msg"]
+        refused = await node.call("/ipfs/add_file", add, {"file": "/etc/hostname"})
+        assert not refused["success"]
+        made = await node.call("/rosbagplayer/new", new, {**added, "namespace": "/played"})
+        assert made["success"], made["error_msg"]
+        assert (await node.call("/rosbagplayer/start", start, made))["success"]
+        await asyncio.sleep(1.0)  # it is recorded until it is stopped
+        stopped = await node.call("/rosbagplayer/stop", stop, {**made, "success": True})
+        recording = open_objective(await person.fetch(plain(stopped["ipfs_address"])))
+        assert [(one.topic, one.value) for one in recording.messages()] == [("/say", "hello"), ("/answer", "hello")]
+
+
+async def test_a_board_on_an_edge_agent_hears_a_node_of_ros(
+    place: Place, graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
+) -> None:
+    """The lesson's firmware in a simulated Uno: the node publishes /blink_led, as to a board on rosserial."""
+    robot = place.agent("robot", open_services=True)
+    async with (
+        asyncio.timeout(90),
+        graph() as here,
+        place.at_work(robot) as person,
+        bridged(place, robot, here, recording_topics=frozenset({"/blink_led"})),
+        ros(here.master).node("blink", "Empty", "board", messages=messages["3"]) as node,
+    ):
+        with ExitStack() as stack:
+            uno = stack.enter_context(board("examples/blink/blink_rosserial"))
+            serial = edge(uno.port, robot.address, place.endpoint, "--protocol", "rosserial")
+            await asyncio.to_thread(stack.enter_context, serial)
+            assert await node.hear() == "ready"
+            contract = await person.demand([("/blink", Empty())])
+            assert (await contract.outcome()).success
+            assert [change.high for change in uno.changes(13)][-6:] == [True, False] * 3
+        assert ("/blink_led", "std_msgs/Empty", "") in await recorded(contract)
