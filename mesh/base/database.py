@@ -60,6 +60,7 @@ class SyncedDatabase:
             opened.close()
             raise
         self._database = opened
+        self.written += 1  # what earlier processes wrote
         self.synced = self.written
 
     def _prepare(self, database: sqlite3.Connection) -> None:
