@@ -225,7 +225,7 @@ class _Share:
         return self._ages.first(None) if or_oldest else None
 
 
-LIMIT: Final = 20_480
+LIMIT: Final = 16_384
 """Open orders that a book holds by default: with up to 2 KB each, a provider stays below 200 MB."""
 UNLIMITED: Final = 2**256
 

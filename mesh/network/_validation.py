@@ -203,7 +203,7 @@ class NameCache:
 
 log = logging.getLogger(__name__)
 
-DEDUPLICATION_LIMIT: Final = 65_536
+DEDUPLICATION_LIMIT: Final = 32_768
 """Accepted messages that a validator remembers, to drop duplicates."""
 SLICE: Final = 128
 """Signatures verified at a time: some seven milliseconds."""

@@ -151,7 +151,7 @@ class MarketSettings:
 
     lighthouse_contract: str = option("", "ENS name of the lighthouse, the market to trade on")
     erc20_token: str = option("", "ENS name or address of the token that pays for work")
-    open_orders_limit: PositiveInt = option(20_480, "most open orders that a provider keeps, 2 KB each")
+    open_orders_limit: PositiveInt = option(16_384, "most open orders that a provider keeps, 2 KB each")
     unmined_limit: PositiveInt = option(
         16, "most transactions of a provider that wait to be mined; some nodes keep no more of one account"
     )
