@@ -148,7 +148,9 @@ class Edge:
         self._board_losses = 0
         self._declared: dict[str, list[Any]] = {}
         self._token: Any = None
+        self._said_by = said_by(options.name)
         self._name_of: dict[BoardTopic, str] = {}
+        """The names of topics in the mesh; empty for those that are not used."""
         self._commandable: dict[str, BoardTopic] = {}
 
     def run(self, session: zenoh.Session) -> None:
@@ -191,6 +193,9 @@ class Edge:
         }
 
     def _on_event(self, event: LineEvent) -> None:
+        if isinstance(event, events.MessageReceived):
+            self._publish(event.topic, event.payload)
+            return
         with liability_context(self._jobs.current):
             match event:
                 case events.BoardReady(info):
@@ -200,8 +205,6 @@ class Edge:
                     log.warning("the board is absent: %s", reason, extra=log_event("board-lost", reason=reason))
                     self._record_connection(f"absent: {reason}")
                     self._withdraw_token()
-                case events.MessageReceived(topic, payload):
-                    self._publish(topic, payload)
                 case events.CommandFinished():
                     self._command_finished(event)
                 case events.BoardLogged(level, text):
@@ -210,7 +213,7 @@ class Edge:
     def _board_ready(self, info: DeviceInfo) -> None:
         """Declare the board's topics in the mesh, and its presence."""
         named = tuple(self._valid_names(info))
-        self._name_of = dict(named)
+        self._name_of = dict.fromkeys(info.topics, "") | dict(named)
         accepting = [(topic, name) for topic, name in named if topic.flow in (Flow.SUBSCRIBES, Flow.SERVES)]
         self._commandable = {name: topic for topic, name in reversed(accepting)}
         for topic, name in accepting:
@@ -225,7 +228,7 @@ class Edge:
         self._record_connection("present")
         if self._token is None:
             self._token = self._session.liveliness().declare_token(self._key(PRESENT))
-        topics = ", ".join(self._name_of.values()) or "no topics"
+        topics = ", ".join(name for _, name in named) or "no topics"
         ready = log_event("board-ready", name=info.name, version=info.version, topics=topics)
         title = " ".join(filter(None, ("the board", info.name, info.version)))
         log.info("%s is present: %s", title, topics, extra=ready)
@@ -360,13 +363,16 @@ class Edge:
 
     def _publish(self, topic: BoardTopic, payload: bytes) -> None:
         """Put a board's message on its topic of the current job, or of the device; or forward its request."""
-        if (name := self._name_of.get(topic)) is None:
+        if topic not in self._name_of:
+            self._name_of[topic] = ""
+            self._reject(topic, "the board has not announced it")
+        if not (name := self._name_of[topic]):
             return
         if topic.flow is Flow.REQUESTS:
             self._request(topic, self._key(name), payload)
         else:
             key = self._job_key(job, name) if (job := self._jobs.current) else self._key(name)
-            self._put(key, payload, topic.type, attachment=said_by(self.options.name))
+            self._put(key, payload, topic.type, attachment=self._said_by)
 
     def _request(self, topic: BoardTopic, key: str, payload: bytes) -> None:
 
@@ -400,6 +406,7 @@ class Edge:
             topics=tuple(
                 DeviceTopic(name, topic.flow.value, topic.type.schema_name or topic.type.encoding)
                 for topic, name in self._name_of.items()
+                if name
             ),
             counters=vars(dialect.counters),
         )

@@ -15,8 +15,6 @@ from dataclasses import dataclass, field, replace
 from struct import Struct
 from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple, TypeVar
 
-from mcap import records
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from mesh.recording._source import (
@@ -45,7 +43,6 @@ if TYPE_CHECKING:
 
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-LIBRARY: Final = "aira-mesh"
 
 _PREFIX: Final = Struct("<BQ")
 _MESSAGE: Final = Struct("<HIQQ")
@@ -200,20 +197,6 @@ def check_range_crc(file: BinaryIO, *, start: int, end: int, crc: int) -> None:
         found, left = zlib.crc32(piece, found), left - len(piece)
     if found != crc:
         raise CorruptRecording("a checksum is wrong")
-
-
-def header_of(profile: str, *, room: int = 0) -> bytes:
-    """The header record, with room for a profile of so many characters: readers skip what follows its fields."""
-    header = bytes_of(records.Header(profile, LIBRARY)) + bytes(max(room - len(profile), 0))
-    return _PREFIX.pack(Opcode.HEADER, len(header) - _PREFIX.size) + header[_PREFIX.size :]
-
-
-def bytes_of(*members: records.McapRecord) -> bytes:
-    """Records as they are in a file."""
-    builder = RecordBuilder()
-    for record in members:
-        record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
 _FOOTER: Final = Struct("<BQQQI")

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 import zstandard
 from mcap import records
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
-from mesh.recording._mcap_reader import MAGIC, bytes_of, header_of
+from mesh.recording._mcap_reader import MAGIC
 from mesh.recording._source import Unrecordable
 from schemas.payloads import JSON
 
@@ -34,6 +35,9 @@ ROS2: Final = "ros2"
 """The profile without which readers of rosbag2 refuse a file."""
 MAX_TIME: Final = (1 << 64) - 1
 
+LIBRARY: Final = "aira-mesh"
+
+_PREFIX: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELDS: Final = _MESSAGE.size - 9
 _INDEX: Final = struct.Struct("<BQHI")
@@ -74,7 +78,7 @@ class McapWriter:
         """For each channel of the open chunk: log time and offset of one message after the other."""
         self.messages = 0
         self._profile = profile
-        stream.write(MAGIC + (header_of("", room=len(ROS2)) if profile is None else header_of(profile)))
+        stream.write(MAGIC + (_header_of("", room=len(ROS2)) if profile is None else _header_of(profile)))
 
     def add(
         self,
@@ -133,7 +137,7 @@ class McapWriter:
             schema_id=self._schema(type),
             metadata=dict(metadata),
         )
-        self._append(bytes_of(record))
+        self._append(_bytes_of(record))
         self._channels.append(record)
         channel = self._known_channels[key] = WriterChannel(record.id)
         return channel
@@ -142,7 +146,7 @@ class McapWriter:
         """Write a metadata record. Raises `Unrecordable`."""
         for text in (name, *values, *values.values()):
             _check_text(text)
-        record = bytes_of(records.Metadata(name=name, metadata=dict(values)))
+        record = _bytes_of(records.Metadata(name=name, metadata=dict(values)))
         self._metadata.append(records.MetadataIndex(offset=self._stream.tell(), length=len(record), name=name))
         self._stream.write(record)
 
@@ -150,7 +154,7 @@ class McapWriter:
         """Write an attachment: `data` under the names and times of `attachment`."""
         create_time, log_time = attachment.create_time, attachment.log_time
         name, media_type = attachment.name, attachment.media_type
-        record = bytes_of(records.Attachment(create_time, log_time, name, media_type, data))
+        record = _bytes_of(records.Attachment(create_time, log_time, name, media_type, data))
         offset = self._stream.tell()
         self._attachments.append(
             records.AttachmentIndex(offset, len(record), log_time, create_time, len(data), name, media_type)
@@ -167,16 +171,16 @@ class McapWriter:
         self._close_chunk()
         if self._profile is None and self._channels and all(map(self._is_ros2, self._channels)):
             self._stream.seek(len(MAGIC))
-            self._stream.write(header_of(ROS2))
+            self._stream.write(_header_of(ROS2))
             self._stream.seek(0, SEEK_END)
-        self._stream.write(bytes_of(records.DataEnd(0)))
+        self._stream.write(_bytes_of(records.DataEnd(0)))
         start = self._stream.tell()
         summary, offsets = self._summary(start)
         offsets_start = start + len(summary)
-        summary += bytes_of(*offsets)
+        summary += _bytes_of(*offsets)
         crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, 8 + 8 + 4, start, offsets_start), zlib.crc32(summary))
         footer = records.Footer(summary_start=start, summary_offset_start=offsets_start, summary_crc=crc)
-        self._stream.write(summary + bytes_of(footer) + MAGIC)
+        self._stream.write(summary + _bytes_of(footer) + MAGIC)
 
     def _is_ros2(self, channel: records.Channel) -> bool:
         encoding = self._schemas[channel.schema_id - 1].encoding if channel.schema_id else ""
@@ -194,7 +198,7 @@ class McapWriter:
             return known
         name, encoding, data = key
         schema = records.Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
-        self._append(bytes_of(schema))
+        self._append(_bytes_of(schema))
         self._schemas.append(schema)
         self._known_schemas[key] = schema.id
         return schema.id
@@ -217,7 +221,7 @@ class McapWriter:
             uncompressed_crc=zlib.crc32(data),
             uncompressed_size=len(data),
         )
-        start, record = self._stream.tell(), bytes_of(chunk)
+        start, record = self._stream.tell(), _bytes_of(chunk)
         indexes, offsets = self._message_indexes(start + len(record))
         self._stream.write(record + indexes)
         self._chunks.append(
@@ -259,7 +263,7 @@ class McapWriter:
         ]
         summary, offsets = b"", []
         for opcode, members in groups:
-            group = bytes_of(*members)
+            group = _bytes_of(*members)
             if group:
                 offsets.append(records.SummaryOffset(opcode, start + len(summary), len(group)))
             summary += group
@@ -296,3 +300,17 @@ def _check_text(text: str) -> None:
         text.encode()
     except UnicodeEncodeError:
         raise Unrecordable(f"{text[:40]!a} can't be encoded as UTF-8") from None
+
+
+def _header_of(profile: str, *, room: int = 0) -> bytes:
+    """The header record, with room for a profile of so many characters: readers skip what follows its fields."""
+    header = _bytes_of(records.Header(profile, LIBRARY)) + bytes(max(room - len(profile), 0))
+    return _PREFIX.pack(Opcode.HEADER, len(header) - _PREFIX.size) + header[_PREFIX.size :]
+
+
+def _bytes_of(*members: records.McapRecord) -> bytes:
+    """Records as they are in a file."""
+    builder = RecordBuilder()
+    for record in members:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]

@@ -14,11 +14,14 @@ import msgspec
 import pytest
 
 from bridges.serial._device import Device
-from bridges.serial.dialect import CallFailed, CallStatus
+from bridges.serial._edge import Edge, EdgeOptions
+from bridges.serial.dialect import BoardTopic, CallFailed, CallStatus, Flow, MessageReceived
 from schemas import String
+from schemas.payloads import STRING
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, ROSSERIAL_TWINS, board, edge
 from tests.support.commands import aira
 from tests.support.market import founded, place
+from tests.support.orders import ROBOT
 from tests.support.ports import free_port
 from tests.support.raising import raises_with
 from tests.support.waiting import until, until_found
@@ -203,3 +206,12 @@ def test_an_invalid_option_is_one_clear_line(arguments: tuple[str, ...], reporte
     assert done.returncode == 2
     assert reported in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_topic_that_the_board_has_not_announced_is_named_once_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    edge = Edge(EdgeOptions(agent=ROBOT.address, port="/dev/ttyNONE", protocol="frames", baud=57_600))
+    for _ in range(2):
+        edge._on_event(MessageReceived(BoardTopic("/late", Flow.PUBLISHES, STRING, 7), String("late").encode()))
+    edge.stop()
+    edge._line.run()  # closes what it has opened
+    assert [record.event for record in caplog.records] == ["topic-rejected"]  # type: ignore[attr-defined]
