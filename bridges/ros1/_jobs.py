@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -26,7 +25,7 @@ from mesh.base.log_context import liability_context, log_event
 from mesh.errors import AiraError, InvalidKey
 from mesh.network import Pump, call, sending
 from mesh.recording import NOTE_TOPIC
-from mesh.recording.ros import RosConverter
+from mesh.recording.ros import LEGACY_TOPIC, RosConverter, legacy_topic
 from schemas import String, parse_address
 from schemas.errors import InvalidPayload
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, objective_selector, parse_agent_key
@@ -51,8 +50,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-BELOW: Final = "/liability/eth_"
-"""What the topics of a job begin with; its address follows."""
 SUBSCRIBER_SECONDS: Final = 5.0
 """For which the first message of a topic waits for a subscriber."""
 ORIGINAL_SECONDS: Final = 1.0
@@ -73,8 +70,6 @@ MOST_WAITING: Final = 10_000
 """Messages of a job that wait to be published."""
 GONE_SECONDS: Final = 30.0
 """For which the node that started a job may be away: it may be restarted. Then the job fails."""
-
-_JOB_TOPIC: Final = re.compile(r"/liability/eth_(0x[0-9A-Fa-f]{40})(/.+)")
 
 
 @dataclass(eq=False)
@@ -237,7 +232,7 @@ class RosJobs(Lifecycle):
 
     async def _advertise(self, liability: str, job: _Job, topic: str, kind: PayloadType) -> Ros1Publisher:
         """Publish a topic of the job, and wait for its first subscriber, as the original waited a second."""
-        publisher = job.publishers[topic] = await advertise(self._node, f"{BELOW}{liability}{topic}", kind)
+        publisher = job.publishers[topic] = await advertise(self._node, legacy_topic(liability, topic), kind)
         if self._as_original:
             await asyncio.sleep(ORIGINAL_SECONDS)
         elif not await publisher.wait_for_subscriber(SUBSCRIBER_SECONDS):
@@ -284,7 +279,7 @@ class RosJobs(Lifecycle):
             topics = await self._graph.topics()
             if topics is None:
                 return  # what is connected stays
-            wanted = {topic for topic in topics if topic in self._also or _JOB_TOPIC.fullmatch(topic)}
+            wanted = {topic for topic in topics if topic in self._also or LEGACY_TOPIC.fullmatch(topic)}
             for topic in self._subscriptions.keys() - wanted:
                 await self._subscriptions.pop(topic).close()
             for topic in sorted(wanted - self._subscriptions.keys()):
@@ -305,7 +300,7 @@ class RosJobs(Lifecycle):
 
     def _record(self, topic: str, payload: bytes, header: Mapping[str, str]) -> None:
         """A node has said something: it becomes part of the recording of its job."""
-        found = _JOB_TOPIC.fullmatch(topic)
+        found = LEGACY_TOPIC.fullmatch(topic)
         jobs, below = (self.open, topic) if found is None else ((found[1],), found[2])
         kind = type_in(header)
         self.received += 1

@@ -19,6 +19,7 @@ import contextlib
 import logging
 import re
 import secrets
+import shutil
 import threading
 import time
 from contextlib import asynccontextmanager
@@ -34,8 +35,9 @@ from mesh.agent._outbox import outgoing
 from mesh.agent.handlers import Job
 from mesh.agent.ledger import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
 from mesh.base.background import Background
+from mesh.base.extras import needs_extra
 from mesh.base.log_context import liability_context, log_event, with_liability_context
-from mesh.base.private_files import sync_directory
+from mesh.base.private_files import make_private_folder, sync_directory
 from mesh.errors import AiraError, ClosedError, ContentError, InputError, public_text
 from mesh.recording import (
     GENEROUS,
@@ -46,9 +48,12 @@ from mesh.recording import (
     RecordingAbout,
     RecordingFailed,
     Unrecordable,
+    convert,
+    is_bag,
     open_objective,
     play,
 )
+from mesh.recording.ros import legacy_topic
 from mesh.role.database import LedgerUnusable
 from schemas import Result
 from schemas.errors import InvalidPayload
@@ -442,6 +447,20 @@ class JobRecordings:
         )
         return self.recorders.open(finished, about)
 
+    def to_bag(self, address: str, recording: Path) -> Path:
+        """A finished recording as a bag of the legacy network: a job's topics are below `/liability/eth_ADDRESS`.
+
+        It exists until `discard`. Blocks on the disk. Raises as `convert` does.
+        """
+        folder = self._folder / f"{address}.bag"
+        shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed here
+        make_private_folder(folder)
+
+        def rename(topic: str) -> str:
+            return topic if topic == NOTE_TOPIC else legacy_topic(address, topic)
+
+        return convert(recording, folder / "result.bag", to="bag", rename=rename).path
+
     def addresses(self) -> set[str]:
         """The addresses of the liabilities that have a recording here. Blocks on the disk."""
         return {path.name.partition(".")[0] for path in self._folder.glob("*.mcap*")}
@@ -451,6 +470,7 @@ class JobRecordings:
 
         Without `sync`, a power loss may bring it back.
         """
+        shutil.rmtree(self._folder / f"{address}.bag", ignore_errors=True)
         for leftover in self._files(address):
             leftover.unlink(missing_ok=True)
         if sync and self._folder.exists():
@@ -489,6 +509,10 @@ class Executor:
         self._pace: Pace = AtOnce() if parts.settings.playback == "at-once" else RecordedTimes()
         names = (name.strip() for name in parts.settings.recording_topics.split(","))
         self._recorded = frozenset(name for name in names if name) or None
+        self._bag_results = parts.settings.bag_results
+        if self._bag_results:
+            with needs_extra("ros", "bag_results"):
+                import rosbags.rosbag1  # noqa: F401
         self.recordings = JobRecordings(parts.recordings, parts.signer.address, self._recorded)
         self.preparing: Final[dict[str, asyncio.Task[None]]] = {}
         """The tasks that fetch and check objectives, by the address of the job."""
@@ -596,7 +620,7 @@ class Executor:
 
     @with_liability_context
     async def finish(self, address: str, *, success: bool, note: str = "") -> str:
-        """End a job: close the recording, put it in the store, sign and send the Result. Returns the recording's CID.
+        """End a job: close the recording, put it in the store, sign and send the Result. Returns the result's CID.
 
         With success it first waits until devices have answered their commands (`JobRun.settle`). `note` says why the
         job failed, in the recording and the ledger. A job whose recording lacks what was played ends without
@@ -612,15 +636,32 @@ class Executor:
             if success and (missing := ended.missing + summary.lost_played):
                 success, note = False, note_of(incomplete(address, missing))
                 log.error("%s", note, extra=log_event("recording-incomplete", missing=missing))
-            cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)
+            cid = recording = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)
+            if self._bag_results:
+                cid = await asyncio.to_thread(self._put_bag, job.liability, summary.path) or recording
             await self.owe_result(address, success=success, result=cid, note=note, is_pinned=True)
             await asyncio.to_thread(self.recordings.discard, address)
             self._fetched.pop(address, None)
-        facts = log_event("job-finished", success=success, result=cid, messages=summary.messages)
+        facts = log_event("job-finished", success=success, result=cid, recording=recording, messages=summary.messages)
         log.info("complete, success %s, result %s, %d messages", success, cid, summary.messages, extra=facts)
         await self._on_phase(Phase.COMPLETE, replace(job.liability, result=cid, is_success=success))
         await self._outbox.send_new()
         return cid
+
+    def _put_bag(self, liability: Liability, recording: Path) -> str:
+        """Put the recording of a job into the store as a bag, if its objective is one, with the names of the legacy
+        network. Returns the bag's CID; empty if there is none. Blocks on the disk.
+        """
+        address = liability.address
+        try:
+            objective = self._store.path(liability.objective)
+            if objective is None or not is_bag(objective):
+                return ""
+            return self._store.put_file(self.recordings.to_bag(address, recording), pin=address)
+        except InputError as error:
+            facts = log_event("result-not-a-bag", code=error.code)
+            log.warning("the result is not a bag, but the recording itself: %s", error, extra=facts)
+            return ""
 
     @with_liability_context
     async def _fetch(self, liability: Liability) -> None:

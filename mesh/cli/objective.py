@@ -55,6 +55,7 @@ from mesh.recording import (
     RecordingFormat,
     TopicRates,
     convert,
+    is_bag,
     messages_in,
     numbers_of,
     open_objective,
@@ -602,20 +603,12 @@ def pack_objective(
 def _from_file(source: Path, out: Path, *, as_json: bool) -> None:
     require_new_file(out)
     with writing(out), _opened(source) as stream, progress(f"packing {source.name}") as tell:
-        if _is_bag(source):
+        if is_bag(source):
             convert(source, out, to="mcap", cid=cid_of_file(source), progress=tell)
         else:
             total = source.stat().st_size if source.is_file() else None
             pack(messages_in(_lines_with_progress(stream, tell, total)), out)
     _print_made(out, as_json=as_json)
-
-
-def _is_bag(source: Path) -> bool:
-    """Whether a file is a ROS 1 bag by its first bytes; standard input never is."""
-    if not source.is_file():
-        return False
-    with source.open("rb") as stream:
-        return stream.read(9) == b"#ROSBAG V"
 
 
 @contextmanager

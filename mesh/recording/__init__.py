@@ -1,5 +1,6 @@
 """Recordings: objectives of unknown origin (MCAP, ROS 1 bags, rosbag2) checked and played, and jobs recorded."""
 
+from mesh.recording._bag_reader import is_bag
 from mesh.recording._converting import (
     ConversionSummary,
     PackSummary,

@@ -78,6 +78,14 @@ class BagRecord(NamedTuple):
         return value[0] if len(value) == 1 else -1
 
 
+def is_bag(path: Path) -> bool:
+    """Whether a file is a ROS 1 bag by its first bytes; what is no file (`-` for standard input) never is."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(9) == MAGIC[:9]  # of any version
+
+
 def bag_records(file: BinaryIO, size: int, *, begin: int = 0, cut: bool = False) -> Iterator[BagRecord]:
     """The records of a bag in file order, without their data. Raises `CorruptRecording` if the bag is cut off.
 

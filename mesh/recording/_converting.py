@@ -23,7 +23,7 @@ import base64
 import binascii
 import tempfile
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from fnmatch import fnmatchcase
 from functools import partial
@@ -232,15 +232,16 @@ def convert(
     leave_out: bool = False,
     distribution: str = "jazzy",
     cid: str = "",
+    rename: Callable[[str], str] = str,
     limits: Limits = GENEROUS,
     progress: Progress | None = None,
 ) -> ConversionSummary:
     """Convert the recording at `source`, a file or a folder of rosbag2, to a new file or folder at `target`.
 
     `topics` are patterns (`/camera/*`; none: all topics). Types that the recording does not define are those of the
-    ROS `distribution`. `cid`, the source's own, goes into an MCAP file's metadata. Replaces no file. Blocks on the
-    disk. Raises `InputError` (`unconvertible`, `time-out-of-range`), what `open_objective` does, `OSError`,
-    and without rosbags `PackageMissing`.
+    ROS `distribution`. `cid`, the source's own, goes into an MCAP file's metadata. `rename` gives the name that a topic
+    has in the target. Replaces no file. Blocks on the disk. Raises `InputError` (`unconvertible`, `time-out-of-range`),
+    what `open_objective` does, `OSError`, and without rosbags `PackageMissing`.
     """
     sources = [open_source(path, limits) for path in recording_files(source)]
     converter = RosConverter(_VERSIONS[to], distribution)
@@ -255,7 +256,7 @@ def convert(
     total = sum(segment.count for each in sources for segment in each.segments)
     count, first, last = 0, 0, 0
     with _WRITERS[to](target, sources, cid) as (path, add):
-        for channel, conversion, message in _messages(sources, plans):
+        for channel, conversion, message in _messages(sources, plans, rename):
             add(channel, conversion, message)
             first, last = min(first, message.log_time) if count else message.log_time, max(last, message.log_time)
             count += 1
@@ -293,10 +294,11 @@ def _plans(
 
 
 def _messages(
-    sources: Sequence[RecordingSource], plans: Sequence[Plan]
+    sources: Sequence[RecordingSource], plans: Sequence[Plan], rename: Callable[[str], str]
 ) -> Iterator[tuple[RecordingChannel, RosConversion, RecordedMessage]]:
     """The converted messages, in file order. Raises `CorruptRecording` for one that is not of its type."""
     for source, plan in zip(sources, plans, strict=True):
+        renamed = {number: replace(one, topic=rename(one.topic)) for number, one in source.channels.items()}
         for message in source.in_file_order():
             conversion = plan.get(message.channel)
             if conversion is None:
@@ -307,7 +309,7 @@ def _messages(
             except Exception as error:  # the converter is made from the file's definitions, and may fail in any way
                 why = f"a message on {channel.topic} is no {channel.type.schema_name}: {error}"
                 raise CorruptRecording(why, path=source.path) from None
-            yield channel, conversion, message._replace(payload=payload)
+            yield renamed[message.channel], conversion, message._replace(payload=payload)
 
 
 @contextmanager

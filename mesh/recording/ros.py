@@ -29,6 +29,15 @@ if TYPE_CHECKING:
 Fields: TypeAlias = list[tuple[str, Any]]
 Definitions: TypeAlias = dict[str, tuple[list[Any], Fields]]
 
+LEGACY_TOPIC: Final = re.compile(r"/liability/eth_(0x[0-9A-Fa-f]{40})(/.+)", re.DOTALL)
+"""A job's topic in a ROS graph and in the bags of the legacy network: the liability, and the topic as elsewhere."""
+
+
+def legacy_topic(liability: str, topic: str) -> str:
+    """The name of a job's topic that `LEGACY_TOPIC` matches."""
+    return f"/liability/eth_{liability}{topic}"
+
+
 _SEPARATOR: Final = re.compile(r"^---[ \t]*$", re.MULTILINE)
 
 

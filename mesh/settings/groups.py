@@ -217,6 +217,11 @@ class ExecutionSettings(ContentSettings):
     playback: Literal["recorded", "at-once"] = option(
         "recorded", "play an objective's messages at their recorded times, or all at once"
     )
+    bag_results: bool = option(
+        False,
+        "hand in a ROS 1 bag as the result of a job whose objective is one, as the people of the legacy network expect;"
+        " validators accept no bags unless they are set to",
+    )
     open_services: bool = option(
         False,
         "let anyone on the router make this agent sign, send messages and spend (rpc/sign, rpc/send,"

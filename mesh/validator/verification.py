@@ -16,7 +16,6 @@ their order count as played.
 
 from __future__ import annotations
 
-import re
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -40,6 +39,7 @@ from mesh.recording import (
     RecordingError,
     open_objective,
 )
+from mesh.recording.ros import LEGACY_TOPIC
 from schemas import Result, cid_of_file, parse_address
 from schemas.signing import verify as verify_signature
 
@@ -429,7 +429,6 @@ def _describe(due: Sequence[MessageDigest], played: Sequence[MessageDigest], num
     return f"message {number} on {topic} was not played, but one on {played[0].topic}"
 
 
-_TOPIC: Final = re.compile(r"/liability/eth_(0x[0-9a-fA-F]{40})(/.+)", re.DOTALL)
 _ONLY_MCAP: Final = (
     "statistics",
     "closed",
@@ -453,9 +452,9 @@ class LegacyRecording:
         self._recording, self._claimed, self._objective = recording, liability, objective
         self.metadata: Final[Mapping[str, Mapping[str, str]]] = {}
         self.start_ns: Final = recording.start_ns
-        topics = {topic.name for topic in recording.topics}
-        self._named = dict.fromkeys(sorted(named[1].lower() for topic in topics if (named := _TOPIC.fullmatch(topic))))
-        self._job = liability.lower() or (next(iter(self._named)) if len(self._named) == 1 else "")
+        matches = [LEGACY_TOPIC.fullmatch(topic.name) for topic in recording.topics]
+        self._named = sorted({named[1].lower() for named in matches if named is not None})
+        self._job = liability.lower() or (self._named[0] if len(self._named) == 1 else "")
         self._missing: Counter[str] = Counter()
         """How many of the messages due on each topic are not there in their order, once all are read."""
 
@@ -465,7 +464,7 @@ class LegacyRecording:
         for message in () if self._objective is None else self._objective.messages():
             due.setdefault(message.topic, deque()).append(digest_of(message))
         for written in self._recording.in_file_order():
-            named = _TOPIC.fullmatch(written.message.topic)
+            named = LEGACY_TOPIC.fullmatch(written.message.topic)
             if named is None or named[1].lower() != self._job:
                 continue
             message = msgspec.structs.replace(written.message, topic=named[2], role="device")

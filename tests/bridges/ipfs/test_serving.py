@@ -20,18 +20,21 @@ from mesh.content import Exchange, Store
 from mesh.dev import JsonRpcServer
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
-from schemas import Demand, Empty, cid_of_bytes, decode, encode
+from schemas import Demand, Empty, String, cid_of_bytes, cid_of_file, decode, encode
+from tests.bridges.ipfs.legacy import LegacyClient
+from tests.bridges.ros1.conftest import ros, rosmaster
 from tests.support.market import MODEL, founded, offering, place
 from tests.support.objectives import objective
 from tests.support.peers import require
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
     from mesh.agent.handlers import Job
+    from tests.bridges.ros1.peers import Ros, RosMasterServer
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
+__all__ = ["founded", "place", "ros", "rosmaster"]
 
 SCRIPTS: Final = Path(__file__).parent / "legacy_pages"
 
@@ -89,6 +92,51 @@ async def test_a_legacy_page_orders_a_job_without_ipfs(place: Place, client: str
         found = await run(client, node.url, place.market.deployment.ens, api.url, MODEL, content)
     assert found["offer"] == place.address("robot")
     assert found["result"] == found["result message"]
+
+
+async def test_a_legacy_page_orders_with_a_bag_and_gets_a_bag(
+    place: Place, rosmaster: RosMasterServer, ros: Callable[[str], Ros]
+) -> None:
+    """From real `rosbag record` to real `rosbag play`, and nothing of the person's is newer than 2018."""
+    tools = ros(rosmaster.uri)
+    robot = offering(place.agent("robot", bag_results=True))
+
+    @robot.on("/blink")
+    async def blink(job: Job, message: String) -> None:
+        job.publish("/led", message.data)
+
+    task, result = place.folder / "objective.bag", place.folder / "result.bag"
+    async with tools.node("talker", "/blink") as talker:
+        assert await talker.hear() == "ready"
+        async with tools.recording("-O", str(task), "-l", "1", "/blink"):
+            talker.tell("red")
+    before = await place.balance("robot")
+    async with (
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+        Provider(network.session, place.chains["provider"], "airalab.lighthouse.3.robonomics.eth") as provider,
+        robot,
+        served(place) as api,
+        JsonRpcServer(place.node.provider) as node,
+        Background() as tasks,
+    ):
+        tasks.start(provider.run(), "provider of the test")
+        content = b64encode(task.read_bytes()).decode()
+        found = await run("robonomics-3", node.url, place.market.deployment.ens, api.url, MODEL, content)
+        async with LegacyClient(api.url) as client:
+            result.write_bytes(await client.cat(found["result"]))
+    assert found["result"] == found["result message"] == cid_of_file(result)
+    assert await place.balance("robot") == before + 42
+    below = f"/liability/eth_{found['liability']}"
+    async with tools.node("listener", f"{below}/led") as listener:
+        assert await listener.hear() == "ready"
+        info = await tools.run("rosbag", "info", "-y", str(result))
+        await tools.run(
+            "rosbag", "play", "-q", "--wait-for-subscribers", "--topics", f"{below}/led", "--bags", str(result)
+        )
+        assert await listener.hear() == "red"
+    assert "messages: 2\n" in info
+    assert "indexed: True" in info
+    assert all(f"topic: {below}{topic}\n" in info for topic in ("/blink", "/led"))
 
 
 async def test_our_own_client_of_daemons_understands_it(place: Place) -> None:

@@ -28,11 +28,14 @@ def heard() -> object:
 
 
 def talker(topic: str) -> None:
-    """Publish the texts that the test sends."""
-    publisher = rospy.Publisher(topic, String, queue_size=10)
+    """Publish the texts that the test sends, once somebody subscribes."""
+    publisher = rospy.Publisher(topic, String, queue_size=1000)
     say("ready")
     while True:
-        publisher.publish(String(heard()))
+        text = heard()
+        while not publisher.get_num_connections():
+            rospy.sleep(0.01)
+        publisher.publish(String(text))
 
 
 def listener(topic: str) -> None:

@@ -107,6 +107,22 @@ class Ros:
         return output.decode()
 
     @asynccontextmanager
+    async def recording(self, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
+        """What `rosbag record` starts; waits for its end, which `-l`, `--duration` or a signal bring."""
+        require("rosbag")
+        process = await asyncio.create_subprocess_exec(
+            "/usr/lib/rosbag/record", *arguments, env=self.environment, stdout=subprocess.DEVNULL
+        )
+        try:
+            yield process
+            async with asyncio.timeout(SECONDS):
+                await process.wait()
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+
+    @asynccontextmanager
     async def node(
         self, function: str, *arguments: str, messages: Path | None = None
     ) -> AsyncIterator[Ros1NodeProcess]:
