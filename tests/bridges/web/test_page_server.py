@@ -11,7 +11,7 @@ from mesh import Job, String  # noqa: TC001  handlers are read at run time
 from schemas import ZERO_ADDRESS, Demand, Result, Withdrawal, cid_of_bytes, encode
 from schemas.keys import event_selector
 from schemas.model import ModelDescription, ModelTopic, ValueSchema
-from tests.mesh.evidence.test_legacy import DUE, bag, below
+from tests.mesh.validator.test_legacy import DUE, bag, below
 from tests.support.market import MODEL, offering, offering_unseen
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found

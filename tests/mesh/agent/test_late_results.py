@@ -14,7 +14,7 @@ from mesh.chain.liabilities import Liabilities
 from mesh.dev._embedded import EmbeddedChain
 from mesh.dev.development import deploy_market
 from mesh.role.following import ChainHead
-from tests.mesh.work.restarts import COST, made_by_a_provider_that_leaves, speaking, words
+from tests.mesh.agent.restarts import COST, made_by_a_provider_that_leaves, speaking, words
 from tests.support.log_events import logged_facts
 from tests.support.market import Founded, Place, in_phase, offering
 from tests.support.waiting import until, until_found

@@ -20,7 +20,7 @@ from mesh.cli.demand import JobPrinter, _who_is_here
 from mesh.errors import RemoteError
 from mesh.watching import present
 from schemas import cid_of_bytes, cid_of_file
-from tests.mesh.operations.site import MODEL, Site, settings_of
+from tests.mesh.cli.site import MODEL, Site, settings_of
 from tests.support.commands import aira, coroutine
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint

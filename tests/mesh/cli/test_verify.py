@@ -23,7 +23,7 @@ from mesh.errors import AiraError, InvalidAddress
 from mesh.role.composition import load_account
 from mesh.settings import Settings
 from schemas import cid_of_bytes
-from tests.mesh.evidence.jobs import LIABILITY, OTHER, WORDS, make_job
+from tests.mesh.validator.jobs import LIABILITY, OTHER, WORDS, make_job
 from tests.support.commands import aira, coroutine, refused
 from tests.support.development import settings_of
 from tests.support.listening import Listener
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from click.testing import Result
 
     from mesh.agent.handlers import Job
-    from tests.mesh.evidence.jobs import JobFiles
+    from tests.mesh.validator.jobs import JobFiles
 
 demand = coroutine(commands.demand)
 MODEL = cid_of_bytes(b"what is verified")

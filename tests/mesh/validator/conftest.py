@@ -1,7 +1,20 @@
-"""Markets for the tests of validators."""
+"""Markets for the tests of validators, and a complete job with its files."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.mesh.validator.jobs import JobFiles, make_job
 from tests.support.market import founded, place
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
 __all__ = ["founded", "place"]
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> JobFiles:
+    return make_job(tmp_path)

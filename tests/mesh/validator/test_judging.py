@@ -15,7 +15,7 @@ from mesh.validator.judging import judge
 from mesh.validator.policies import MOST_OVERDUE, POLICIES, Evidence, Policy, own_policy, policy_of
 from mesh.validator.verification import Finding
 from schemas.verdicts import MOST_FINDINGS
-from tests.mesh.evidence.jobs import OTHER, THIEF, WORDS, make_job
+from tests.mesh.validator.jobs import OTHER, THIEF, WORDS, make_job
 from tests.mesh.validator.trials import Trial, failed, liability_of
 from tests.support.raising import raises_with
 from tests.support.waiting import wait_until

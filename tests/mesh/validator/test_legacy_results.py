@@ -11,8 +11,8 @@ from mesh.validator.judging import Case, Judgement, examine, judge
 from mesh.validator.policies import policy_of
 from mesh.validator.verification import Claim
 from schemas import cid_of_file, parse_address
-from tests.mesh.evidence.jobs import ROBOT, JobFiles
-from tests.mesh.evidence.test_legacy import DUE, JOB, OTHER, bag, below
+from tests.mesh.validator.jobs import ROBOT, JobFiles
+from tests.mesh.validator.test_legacy import DUE, JOB, OTHER, bag, below
 from tests.mesh.validator.trials import ALWAYS, failed, liability_of
 
 if TYPE_CHECKING:

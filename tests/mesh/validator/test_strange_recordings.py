@@ -16,7 +16,7 @@ from mesh.validator.judging import Case, examine, judge
 from mesh.validator.policies import POLICIES, own_policy, policy_of
 from schemas import cid_of_file
 from schemas.payloads import PayloadType
-from tests.mesh.evidence.jobs import JobFiles, make_job
+from tests.mesh.validator.jobs import JobFiles, make_job
 from tests.mesh.validator.trials import liability_of
 from tests.support.bags import Bag, BagMessage
 

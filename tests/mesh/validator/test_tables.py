@@ -6,7 +6,7 @@ import re
 from typing import TYPE_CHECKING
 
 from mesh.validator.policies import POLICIES
-from tests.mesh.evidence.jobs import make_job
+from tests.mesh.validator.jobs import make_job
 from tests.mesh.validator.tables import PAGE, honest_table, in_page, tampered_table
 from tests.mesh.validator.trials import Trial
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.validator.judging import Case, Judgement, judge
 from schemas import ZERO_ADDRESS, Liability, cid_of_bytes
-from tests.mesh.evidence.jobs import OTHER, JobFiles
+from tests.mesh.validator.jobs import OTHER, JobFiles
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

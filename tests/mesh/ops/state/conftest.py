@@ -15,7 +15,7 @@ from mesh.agent.ledger import Ledger, Phase
 from mesh.chain._pending import TransactionStore
 from mesh.content import Store
 from schemas import cid_of_bytes
-from tests.mesh.work.samples import liability
+from tests.mesh.agent.samples import liability
 from tests.support.market import founded, place
 from tests.support.orders import demand
 

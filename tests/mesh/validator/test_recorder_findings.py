@@ -11,14 +11,14 @@ import pytest
 from mesh.recording import ABOUT, CLOCK_RECORD, RECOVERED, Recorder, RecordingAbout, open_objective
 from mesh.validator.verification import MOST_SEAMS
 from schemas import cid_of_file
-from tests.mesh.evidence.jobs import LIABILITY, OTHER, ROBOT, JobFiles, failures, make_job
+from tests.mesh.validator.jobs import LIABILITY, OTHER, ROBOT, JobFiles, failures, make_job
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.recording import ChannelMessage
-    from tests.mesh.evidence.jobs import Metadata
+    from tests.mesh.validator.jobs import Metadata
 
 
 def edited(number: int, **fields: Any) -> Any:

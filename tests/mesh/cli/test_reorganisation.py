@@ -10,7 +10,7 @@ import pytest
 from mesh.agent.ledger import Phase
 from mesh.watching import status_of
 from schemas.status import Status
-from tests.mesh.operations.site import FEE, Site, has_event, has_traceback
+from tests.mesh.cli.site import FEE, Site, has_event, has_traceback
 from tests.support.log_events import logged_facts
 from tests.support.waiting import until, until_found
 

@@ -15,7 +15,7 @@ import pytest
 from mesh.base.terminal import accept_all_characters
 from tests.support.commands import AIRA, environment
 
-BLINK = Path(__file__).parents[2] / "examples" / "blink" / "blink.mcap"
+BLINK = Path(__file__).parents[3] / "examples" / "blink" / "blink.mcap"
 ENCODINGS = ("latin-1", "koi8-r", "ascii", "cp1251", "utf-8")
 HELP = """
 import click

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from mesh.agent._outbox import outgoing
 from mesh.agent.ledger import Ledger, Phase
-from tests.mesh.work.samples import liability
+from tests.mesh.agent.samples import liability
 from tests.support.orders import demand
 
 if TYPE_CHECKING:

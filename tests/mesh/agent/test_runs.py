@@ -9,7 +9,7 @@ import pytest
 
 from mesh.recording import AtOnce, RecordedTimes, open_objective
 from schemas import String
-from tests.mesh.work.samples import job, liability
+from tests.mesh.agent.samples import job, liability
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

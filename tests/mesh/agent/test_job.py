@@ -13,7 +13,7 @@ from mesh.agent.jobs import QUEUED
 from mesh.errors import ClosedError, InvalidKey
 from mesh.recording import NOTE_TOPIC, RecordedTimes
 from schemas import InvalidPayload, LiabilityTopicKey, String
-from tests.mesh.work.runs import AGENT, Making, making, session
+from tests.mesh.agent.runs import AGENT, Making, making, session
 from tests.support.objectives import objective
 from tests.support.raising import raises_with
 from tests.support.waiting import until

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from tests.mesh.work.restarts import COST, speaking, words
+from tests.mesh.agent.restarts import COST, speaking, words
 
 if TYPE_CHECKING:
     import pytest

@@ -17,8 +17,8 @@ import pytest
 from mesh.agent.ledger import SCHEMA, Ledger, Phase
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.role.database import VERSION, Database, LedgerUnusable
-from tests.mesh.work.ledgers import RESULT, ledger, mark_as_version, path
-from tests.mesh.work.samples import liability, message
+from tests.mesh.agent.ledgers import RESULT, ledger, mark_as_version, path
+from tests.mesh.agent.samples import liability, message
 from tests.support.disks import file_size_limit
 from tests.support.waiting import until
 

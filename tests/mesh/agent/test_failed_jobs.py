@@ -18,7 +18,7 @@ from mesh.recording import NOTE_TOPIC
 from mesh.role.database import LedgerUnusable
 from mesh.role.running import cause_of
 from schemas import Empty, String, cid_of_bytes
-from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
+from tests.mesh.agent.executions import COST, doing_nothing, heard, recorded
 from tests.support.market import Place, offering, offering_unseen
 from tests.support.objectives import objective
 

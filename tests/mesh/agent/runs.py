@@ -10,7 +10,7 @@ import zenoh
 
 from mesh.agent.jobs import JobRun
 from mesh.recording import AtOnce, RecordedTimes, Recorder, RecorderSettings, RecordingAbout, open_objective
-from tests.mesh.work.samples import job
+from tests.mesh.agent.samples import job
 from tests.support.routers import EmbeddedRouter, client_config
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from mesh.recording import open_objective
 from mesh.validator.verification import Claim, verify
 from schemas import String
-from tests.mesh.work.power import powered_robot
-from tests.mesh.work.restarts import COST, WORDS, Paying, paid, speaking, words
+from tests.mesh.agent.power import powered_robot
+from tests.mesh.agent.restarts import COST, WORDS, Paying, paid, speaking, words
 from tests.support.log_events import logged_facts
 
 if TYPE_CHECKING:

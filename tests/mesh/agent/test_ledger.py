@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from mesh.agent._outbox import outgoing
 from mesh.agent.ledger import Ledger, Phase
-from tests.mesh.work.ledgers import RESULT, ledger, path
-from tests.mesh.work.samples import liability, message
+from tests.mesh.agent.ledgers import RESULT, ledger, path
+from tests.mesh.agent.samples import liability, message
 from tests.support.orders import PERSON, ROBOT, STRANGER, demand, offer, withdrawal
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from mesh.agent.agent import Agent
 from mesh.agent.ledger import Ledger, Phase
 from mesh.recording import open_objective
 from schemas import String, cid_of_file
-from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
+from tests.mesh.agent.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
 from tests.support.market import in_phase, offering, offering_unseen
 from tests.support.orders import result
 from tests.support.waiting import until, until_found

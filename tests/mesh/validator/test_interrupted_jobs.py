@@ -11,7 +11,7 @@ from mesh.base.clock import SYSTEM_CLOCK
 from mesh.recording import Recorder, RecordingAbout, open_objective
 from mesh.validator.verification import verify
 from schemas import cid_of_file
-from tests.mesh.evidence.jobs import WORDS, JobFiles, failures, make_job, record, stop
+from tests.mesh.validator.jobs import WORDS, JobFiles, failures, make_job, record, stop
 from tests.support.clocks import HOUR, NOON, SECOND, SetClock
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.agent.ledger import Phase
 from schemas import Empty, String, cid_of_file
-from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
+from tests.mesh.agent.executions import COST, doing_nothing, heard, recorded
 from tests.support.market import Place, offering
 from tests.support.objectives import MILLISECOND, objective, timed
 from tests.support.waiting import until, until_found

@@ -15,8 +15,8 @@ from mesh.agent.ledger import Phase
 from mesh.chain.liabilities import Liabilities
 from mesh.recording import open_objective
 from schemas import String, cid_of_file
-from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
-from tests.mesh.work.samples import liability
+from tests.mesh.agent.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
+from tests.mesh.agent.samples import liability
 from tests.support.market import in_phase, offering
 from tests.support.orders import result
 from tests.support.waiting import until, until_found
