@@ -14,7 +14,7 @@ from mesh.agent.jobs import read_reason
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
 from mesh.telemetry.metrics import is_healthy
-from mesh.validator.verification import Claim, Verdict, check_end, verify
+from mesh.validator.verification import Claim, JobFiles, Verdict, check_end, verify
 from mesh.watching import present, statuses
 from schemas import ZERO_ADDRESS, encode, parse_cid
 from schemas.decoding import decode_json
@@ -161,17 +161,14 @@ class Views:
         if not claim.result:
             verdict = Verdict((check_end(claim),))
         else:
-            objective, result = await self._files.fetch(claim.objective), await self._files.fetch(claim.result)
-            verdict = await self._files.in_thread(
-                verify,
-                claim,
-                objective=objective,
-                result=result,
+            files = JobFiles(
+                objective=await self._files.fetch(claim.objective),
+                result=await self._files.fetch(claim.result),
                 message=None if message is None else encode(message.message),
                 objective_cid=claim.objective,
                 result_cid=claim.result,
-                bags=True,
             )
+            verdict = await self._files.in_thread(verify, claim, files, bags=True)
         return {
             "holds": verdict.holds,
             "claim": msgspec.to_builtins(claim),

@@ -173,6 +173,7 @@ async def check_recording(
 ) -> bool:
     """Print what the policies find in a recording. Returns whether all of it holds."""
     from mesh.validator.judging import examine
+    from mesh.validator.verification import JobFiles
 
     chosen = await asyncio.to_thread(_policies, settings, policies, checks)
     said = None if message is None else await asyncio.to_thread(read_message, message)
@@ -186,10 +187,8 @@ async def check_recording(
             found = await asyncio.to_thread(
                 examine,
                 _liability_in(about),
-                objective=require_readable(objective),
-                recording=path,
+                JobFiles(objective=require_readable(objective), result=path, message=said),
                 policies=chosen,
-                message=said,
                 model=description,
                 bags=settings.validator_bags,
                 progress=tell,

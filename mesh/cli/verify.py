@@ -18,7 +18,7 @@ from mesh.cli.output import plural, print_facts, print_json, print_line, print_t
 from mesh.errors import AiraError, InputError
 from mesh.role.running import report, run_to_end
 from mesh.settings import ChainSettings
-from mesh.validator.verification import Claim, Verdict, check_end, verify
+from mesh.validator.verification import Claim, JobFiles, Verdict, check_end, verify
 from schemas import parse_address
 from schemas.address import ZERO_ADDRESS
 from schemas.decoding import decode_json
@@ -188,18 +188,15 @@ async def _verdict(
     async with opened_store(settings) as store:
         played = require_readable(objective) if objective else await fetch(settings, store, claim.objective)
         recorded = require_readable(result) if result else await fetch(settings, store, claim.result)
+        files = JobFiles(
+            objective=played,
+            result=recorded,
+            message=message,
+            objective_cid="" if objective else claim.objective,
+            result_cid="" if result else claim.result,
+        )
         with progress("verifying") as tell:
-            return await asyncio.to_thread(
-                verify,
-                claim,
-                objective=played,
-                result=recorded,
-                message=message,
-                objective_cid="" if objective else claim.objective,
-                result_cid="" if result else claim.result,
-                bags=True,
-                progress=tell,
-            )
+            return await asyncio.to_thread(verify, claim, files, bags=True, progress=tell)
 
 
 def print_findings(findings: Sequence[tuple[bool | None, str, str]]) -> None:

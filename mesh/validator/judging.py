@@ -9,17 +9,18 @@ import logging
 import struct
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from mesh.base.log_context import log_event
-from mesh.recording import Limits
+from mesh.recording import GENEROUS, Limits
 from mesh.validator.policies import CHECK_TIMEOUT, COMPLETE, Evidence
 from mesh.validator.verification import (
     NOT_IN_BAGS,
     Claim,
     Finding,
+    JobFiles,
     LegacyRecording,
     RecordingObserver,
     read_result,
@@ -129,12 +130,14 @@ def judge(
     claim = Claim.of_contract(case.liability)
     complete, own = trial.run(
         msgspec.structs.replace(claim, result=claimed.result if claimed else "", success=case.claimed, finalized=None),
-        objective=objective,
-        result=recording,
-        message=case.message,
-        objective_cid=case.objective_cid,
-        result_cid=cid,
-        period=(case.since_ns, case.until_ns),
+        JobFiles(
+            objective=objective,
+            result=recording,
+            message=case.message,
+            objective_cid=case.objective_cid,
+            result_cid=cid,
+            period=(case.since_ns, case.until_ns),
+        ),
         bags=bags,
         limits=limits,
     )
@@ -150,11 +153,9 @@ def judge(
 
 def examine(
     liability: Liability,
+    files: JobFiles,
     *,
-    objective: Path,
-    recording: Path,
     policies: Sequence[Policy],
-    message: bytes | None = None,
     model: ModelDescription | None = None,
     bags: bool = False,
     progress: Progress | None = None,
@@ -165,8 +166,7 @@ def examine(
     thread. Raises `OSError` if a file can't be read.
     """
     trial = _Trial(liability, model, policies)
-    files = {"objective": objective, "result": recording}
-    complete, own = trial.run(Claim(), **files, message=message, bags=bags, progress=progress)
+    complete, own = trial.run(Claim(), files, bags=bags, progress=progress)
     found = [*((COMPLETE.name, finding) for finding in complete), *own]
     return tuple(_reported(policy, finding) for policy, finding in found)
 
@@ -184,14 +184,22 @@ class _Trial(RecordingObserver):
         self.is_legacy = False
         """Whether it is a bag of the legacy software, in which most findings of `verify` stay undecided."""
 
-    def run(self, claim: Claim, **files: Any) -> tuple[list[Finding], list[tuple[str, Finding]]]:
-        """What `verify` and then the policies find in the files (the arguments of `verify`).
+    def run(
+        self,
+        claim: Claim,
+        files: JobFiles,
+        *,
+        bags: bool,
+        limits: Limits = GENEROUS,
+        progress: Progress | None = None,
+    ) -> tuple[list[Finding], list[tuple[str, Finding]]]:
+        """What `verify` and then the policies find in the files.
 
         A recording that they can't deal with proves nothing, which is a finding: if it raised an error, its maker
         could keep the validator from judging. Raises `OSError` if a file can't be read.
         """
         try:
-            verdict = verify(claim, observer=self, **files)
+            verdict = verify(claim, files, bags=bags, limits=limits, observer=self, progress=progress)
             found = [one for one in verdict.findings if one.name not in _NOT_JUDGED]
             # Without a readable recording no check was begun.
             pairs = zip(self._policies, self._checks, strict=False)

@@ -682,15 +682,27 @@ class RecordingObserver:
 _NOBODY: Final = RecordingObserver()
 
 
+@dataclass(frozen=True, kw_only=True)
+class JobFiles:
+    """The `objective` and the `result` (the recording) of a job, and what is known of them.
+
+    `message` is the encoded Result. Give the CIDs of files that were fetched by them: a CID made with other settings
+    than ours can't be computed from the file. `period` is when the job was done: from when to when, in nanoseconds of
+    Unix time.
+    """
+
+    objective: Path
+    result: Path
+    message: bytes | None = None
+    objective_cid: str = ""
+    result_cid: str = ""
+    period: tuple[int, int] | None = None
+
+
 def verify(
     claim: Claim,
+    files: JobFiles,
     *,
-    objective: Path,
-    result: Path,
-    message: bytes | None = None,
-    objective_cid: str = "",
-    result_cid: str = "",
-    period: tuple[int, int] | None = None,
     bags: bool = False,
     limits: Limits = GENEROUS,
     observer: RecordingObserver = _NOBODY,
@@ -698,23 +710,21 @@ def verify(
 ) -> Verdict:
     """Check everything that can be checked: the files behind the two CIDs, the signature, the recording.
 
-    `message` is the encoded Result, if at hand. Pass the CIDs of files that were fetched by them: a CID made with other
-    settings than ours can't be computed from the file. `period` is when the job was done, if that is known: from when
-    to when, in nanoseconds of Unix time. With `bags` the recording may be a bag of the legacy software,
-    of which less can be checked; otherwise a bag fails. Files beyond the `limits` are not readable. `observer` sees the
-    messages of the recording. `progress` is called with the bytes of both files read, of all.
+    With `bags` the recording may be a bag of the legacy software, of which less can be checked; otherwise a bag fails.
+    Files beyond the `limits` are not readable. `observer` sees the messages of the recording. `progress` is called with
+    the bytes of both files read, of all.
 
     Use a thread. Raises `OSError` if a file can't be read.
     """
-    sizes = result.stat().st_size, objective.stat().st_size
+    sizes = files.result.stat().st_size, files.objective.stat().st_size
 
     def opened(path: Path, before: int = 0) -> Objective:
         """A file that is opened once; `before` are the bytes that were read of the other one."""
         of_both = None if progress is None else lambda done, _: progress(before + done, sum(sizes))
         return open_objective(path, limits, progress=of_both)
 
-    cids = objective_cid or cid_of_file(objective), result_cid or cid_of_file(result)
-    signed = None if message is None else read_result(message)
+    cids = files.objective_cid or cid_of_file(files.objective), files.result_cid or cid_of_file(files.result)
+    signed = None if files.message is None else read_result(files.message)
     findings = [check_end(claim), _check_signature(claim, signed, recording=cids[1])]
     if signed is not None and not isinstance(signed, str):
         claim = _supplemented(claim, signed)
@@ -724,11 +734,12 @@ def verify(
         # Without a contract, still check that the two files belong together.
         claim = msgspec.structs.replace(claim, objective=cids[0])
     try:
-        recording = opened(result)
+        recording = opened(files.result)
     except RecordingError as error:
         return Verdict((*findings, Finding("readable", False, f"the recording is not readable: {error.why}")))
     check = _check_bag if bags and recording.format == "bag" else _check_recording
-    findings += check(claim, recording, partial(opened, objective, sizes[0]), period=period, observer=observer)
+    open_due = partial(opened, files.objective, sizes[0])
+    findings += check(claim, recording, open_due, period=files.period, observer=observer)
     return Verdict(tuple(findings))
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.agent.ledger import Phase
 from mesh.chain import Chain, Finalized, NewLiability, Transfer
-from mesh.validator.verification import Claim, verify
+from mesh.validator.verification import Claim, JobFiles, verify
 from schemas import ZERO_ADDRESS
 from tests.simulation.chain import NodeFaults, SimulatedNode
 from tests.simulation.faults import MOST_BLOCKS
@@ -160,13 +160,10 @@ class Audit:
         objective = next(
             path for path in self._market.objectives.values() if self._market.cids[path] == record.objective
         )
-        verdict = verify(
-            Claim.of_contract(record),
-            objective=objective,
-            result=recording,
-            objective_cid=record.objective,
-            result_cid=record.result,
+        files = JobFiles(
+            objective=objective, result=recording, objective_cid=record.objective, result_cid=record.result
         )
+        verdict = verify(Claim.of_contract(record), files)
         for finding in verdict.findings:
             is_open = finding.name == "played" and finding.holds is None
             if is_open or (finding.holds is False and finding.name in INVALID):

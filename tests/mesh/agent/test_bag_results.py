@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.recording import open_objective
-from mesh.validator.verification import Claim, verify
+from mesh.validator.verification import Claim, JobFiles, verify
 from schemas import Empty, String, cid_of_file
 from tests.support.bags import Bag, BagMessage
 from tests.support.log_events import logged_facts
@@ -57,7 +57,7 @@ async def test_a_bag_is_answered_with_a_bag_that_shows_the_job(place: Place) -> 
             liability=contract.address, promisor=robot.address, objective=cid_of_file(task), result=outcome.result,
             success=True, finalized=True,
         )  # fmt: skip
-        verdict = verify(claim, objective=task, result=result, bags=True)
+        verdict = verify(claim, JobFiles(objective=task, result=result), bags=True)
         assert [one for one in verdict.findings if one.holds is False] == []
         assert {"liability", "played", "result-file"} <= {one.name for one in verdict.findings if one.holds}
         assert not list(robot.parts.recordings.iterdir())

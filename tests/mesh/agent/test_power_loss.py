@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from mesh.recording import open_objective
-from mesh.validator.verification import Claim, verify
+from mesh.validator.verification import Claim, JobFiles, verify
 from schemas import String
 from tests.mesh.agent.power import powered_robot
 from tests.mesh.agent.restarts import COST, WORDS, Paying, paid, speaking, words
@@ -41,7 +41,7 @@ async def test_a_success_after_a_power_cut_has_a_complete_recording(
     assert said == [], "the ledger knew that all was played"
     assert [data for topic, data in messages if topic == "/say"] == WORDS
     assert [data for topic, data in messages if topic == "/said"] == WORDS, "what the handlers published is synced, too"
-    verdict = await asyncio.to_thread(verify, claim, objective=objective, result=recording)
+    verdict = await asyncio.to_thread(verify, claim, JobFiles(objective=objective, result=recording))
     assert verdict.holds
     assert await paid.once()
 

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
-from tests.mesh.validator.jobs import WORDS, JobFiles, make_job
+from tests.mesh.validator.jobs import WORDS, SampleJob, make_job
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,16 +34,16 @@ validator.run()
 
 
 @pytest.fixture
-def job(tmp_path: Path) -> JobFiles:
+def job(tmp_path: Path) -> SampleJob:
     return make_job(tmp_path)
 
 
-def checked(job: JobFiles, *more: str | Path) -> Result:
+def checked(job: SampleJob, *more: str | Path) -> Result:
     words = ["validator", "check", job.result, "--objective", job.objective, "--data-dir", job.result.parent / "data"]
     return CliRunner().invoke(main, [str(word) for word in [*words, *more]])
 
 
-def test_an_honest_recording_holds_by_the_default_policies(job: JobFiles) -> None:
+def test_an_honest_recording_holds_by_the_default_policies(job: SampleJob) -> None:
     done = checked(job)
     assert done.exit_code == 0, done.output
     lines = done.stdout.splitlines()
@@ -52,14 +52,14 @@ def test_an_honest_recording_holds_by_the_default_policies(job: JobFiles) -> Non
     assert lines[-1].startswith("0 of 16 checks failed")
 
 
-def test_each_policy_that_is_named_is_applied_and_a_failure_is_exit_code_1(job: JobFiles) -> None:
+def test_each_policy_that_is_named_is_applied_and_a_failure_is_exit_code_1(job: SampleJob) -> None:
     done = checked(job, "--policy", "acknowledged:answer=/nobody", "--policy", "schema")
     assert done.exit_code == 1
     assert "FAILS  acknowledged/answers" in done.stdout
     assert "holds  schema/types" in done.stdout
 
 
-def test_a_recording_that_is_cut_fails_and_without_an_objective_can_not_be_checked(job: JobFiles) -> None:
+def test_a_recording_that_is_cut_fails_and_without_an_objective_can_not_be_checked(job: SampleJob) -> None:
     job.result.write_bytes(job.result.read_bytes()[:900])
     done = checked(job)
     assert (done.exit_code, "FAILS  complete/readable" in done.stdout) == (1, True)
@@ -68,7 +68,7 @@ def test_a_recording_that_is_cut_fails_and_without_an_objective_can_not_be_check
     assert (done.exit_code, "[corrupt-recording]" in done.stderr) == (2, True)
 
 
-def test_findings_are_printed_as_json(job: JobFiles) -> None:
+def test_findings_are_printed_as_json(job: SampleJob) -> None:
     done = checked(job, "--policy", "rate", "--json")
     said = json.loads(done.stdout)
     assert said["holds"] is True
@@ -76,7 +76,7 @@ def test_findings_are_printed_as_json(job: JobFiles) -> None:
     assert {finding["policy"] for finding in said["findings"]} == {"complete", "rate"}
 
 
-def test_own_checks_of_a_program_are_applied_without_running_its_validator(job: JobFiles, tmp_path: Path) -> None:
+def test_own_checks_of_a_program_are_applied_without_running_its_validator(job: SampleJob, tmp_path: Path) -> None:
     (tmp_path / "loud.py").write_text(PROGRAM)
     done = checked(job, "--checks", tmp_path / "loud.py", "--json")
     assert done.exit_code == 1, done.output
@@ -93,20 +93,20 @@ def test_own_checks_of_a_program_are_applied_without_running_its_validator(job: 
         (["--message", "nowhere.json"], "file-unreadable"),
     ],
 )
-def test_checks_that_can_not_run_are_exit_code_2(job: JobFiles, more: list[str], code: str) -> None:
+def test_checks_that_can_not_run_are_exit_code_2(job: SampleJob, more: list[str], code: str) -> None:
     done = checked(job, *more)
     assert done.exit_code == 2
     assert f"[{code}]" in done.stderr
 
 
-def test_a_program_without_a_validator_is_refused(job: JobFiles, tmp_path: Path) -> None:
+def test_a_program_without_a_validator_is_refused(job: SampleJob, tmp_path: Path) -> None:
     (tmp_path / "empty.py").write_text("answer = 42\n")
     done = checked(job, "--checks", tmp_path / "empty.py")
     assert (done.exit_code, "[program-unusable]" in done.stderr) == (2, True)
 
 
 def test_the_objective_is_fetched_from_the_store_by_the_cid_that_the_recording_names(
-    job: JobFiles, tmp_path: Path
+    job: SampleJob, tmp_path: Path
 ) -> None:
     def run(*words: Any) -> Result:
         return CliRunner().invoke(main, [str(word) for word in [*words, "--data-dir", tmp_path / "data"]])

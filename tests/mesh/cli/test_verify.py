@@ -40,23 +40,23 @@ if TYPE_CHECKING:
     from click.testing import Result
 
     from mesh.agent.handlers import Job
-    from tests.mesh.validator.jobs import JobFiles
+    from tests.mesh.validator.jobs import SampleJob
 
 demand = coroutine(commands.demand)
 MODEL = cid_of_bytes(b"what is verified")
 
 
 @pytest.fixture
-def job(tmp_path: Path) -> JobFiles:
+def job(tmp_path: Path) -> SampleJob:
     return make_job(tmp_path)
 
 
-def verified(job: JobFiles, *more: str | Path) -> Result:
+def verified(job: SampleJob, *more: str | Path) -> Result:
     words = ["verify", "--objective", job.objective, "--result", job.result, "--data-dir", job.result.parent / "data"]
     return CliRunner().invoke(main, [str(word) for word in [*words, *more]])
 
 
-def test_two_files_are_verified_without_chain_and_network(job: JobFiles) -> None:
+def test_two_files_are_verified_without_chain_and_network(job: SampleJob) -> None:
     done = verified(job)
     assert done.exit_code == 0, done.output
     lines = done.stdout.splitlines()
@@ -65,7 +65,7 @@ def test_two_files_are_verified_without_chain_and_network(job: JobFiles) -> None
     assert lines[-1] == "0 of 17 checks failed, 7 stayed open"
 
 
-def test_a_failed_check_is_named_and_the_exit_code_is_1(job: JobFiles) -> None:
+def test_a_failed_check_is_named_and_the_exit_code_is_1(job: SampleJob) -> None:
     job.forge(lambda messages, metadata: messages[:4])
     done = verified(job)
     assert done.exit_code == 1
@@ -80,14 +80,14 @@ def test_unplayed_messages_fail_without_chain_and_network(tmp_path: Path) -> Non
     assert "FAILS  played" in done.stdout
 
 
-def test_an_address_is_compared_with_the_one_in_the_recording(job: JobFiles) -> None:
+def test_an_address_is_compared_with_the_one_in_the_recording(job: SampleJob) -> None:
     assert verified(job, LIABILITY, "--offline").exit_code == 0
     done = verified(job, OTHER, "--offline")
     assert done.exit_code == 1
     assert f"names the liability '{LIABILITY}'" in done.stdout
 
 
-def test_with_the_message_the_signature_is_verified(job: JobFiles, tmp_path: Path) -> None:
+def test_with_the_message_the_signature_is_verified(job: SampleJob, tmp_path: Path) -> None:
     message = tmp_path / "result.json"
     message.write_bytes(job.message())
     done = verified(job, "--message", message, "--json")
@@ -99,7 +99,7 @@ def test_with_the_message_the_signature_is_verified(job: JobFiles, tmp_path: Pat
     assert found["finalized"] is None
 
 
-def test_control_characters_of_untrusted_text_are_not_printed(job: JobFiles) -> None:
+def test_control_characters_of_untrusted_text_are_not_printed(job: SampleJob) -> None:
     def evil(messages: list[Any], metadata: dict[str, dict[str, str]]) -> list[Any]:
         metadata["aira"]["liability"] = "\x1b[2J" + LIABILITY
         return messages
@@ -128,14 +128,14 @@ def test_unreadable_input_is_one_clear_line_and_exit_code_2(
     refused(done, error, value, exit_code=2)
 
 
-def test_a_result_that_is_no_recording_fails(job: JobFiles) -> None:
+def test_a_result_that_is_no_recording_fails(job: SampleJob) -> None:
     job.result.write_bytes(b"no recording")
     done = verified(job)
     assert done.exit_code == 1
     assert "it is neither an MCAP file" in done.stdout
 
 
-def test_it_runs_as_a_separate_process(job: JobFiles) -> None:
+def test_it_runs_as_a_separate_process(job: SampleJob) -> None:
     done = aira("verify", "--objective", job.objective, "--result", job.result, AIRA_DATA_DIR=str(job.result.parent))
     assert (done.returncode, done.stderr) == (0, "")
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.validator.jobs import JobFiles, make_job
+from tests.mesh.validator.jobs import SampleJob, make_job
 from tests.support.market import founded, place
 
 if TYPE_CHECKING:
@@ -16,5 +16,5 @@ __all__ = ["founded", "place"]
 
 
 @pytest.fixture
-def job(tmp_path: Path) -> JobFiles:
+def job(tmp_path: Path) -> SampleJob:
     return make_job(tmp_path)

@@ -9,7 +9,7 @@ import msgspec
 
 from mesh.recording import Recorder, RecordingAbout, open_objective
 from mesh.recording._mcap_writer import McapWriter
-from mesh.validator.verification import Claim, Verdict, verify
+from mesh.validator.verification import Claim, JobFiles, Verdict, verify
 from schemas import Result, Signer, String, cid_of_file, encode
 from schemas.payloads import STRING
 from tests.support.objectives import objective
@@ -30,7 +30,7 @@ Metadata = dict[str, dict[str, str]]
 
 
 @dataclass
-class JobFiles:
+class SampleJob:
     """The files of a job, and the claim of its contract."""
 
     objective: Path
@@ -40,7 +40,7 @@ class JobFiles:
     def verify(self, message: bytes | None = None, **claimed: Any) -> Verdict:
         """Verify the job, with these fields of the claim changed."""
         claim = msgspec.structs.replace(self.claim, **claimed)
-        return verify(claim, objective=self.objective, result=self.result, message=message)
+        return verify(claim, JobFiles(objective=self.objective, result=self.result, message=message))
 
     def forge(self, change: Callable[[list[ChannelMessage], Metadata], list[ChannelMessage]]) -> None:
         """Rewrite the recording with changed messages and metadata, as a valid file with its own CID."""
@@ -71,7 +71,7 @@ class JobFiles:
         return encode(signer.sign(Result(**said)))
 
 
-def make_job(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "", **about: str) -> JobFiles:
+def make_job(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "", **about: str) -> SampleJob:
     """A job whose objective has five messages on `/say`, of which these were `played`; the device answered each."""
     path = folder / "objective.mcap"
     path.write_bytes(objective(*(("/say", word) for word in WORDS), ("/stop", b"")))
@@ -89,7 +89,7 @@ def make_job(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "",
         success=True,
         finalized=True,
     )
-    return JobFiles(path, folder / "result.mcap", claim)
+    return SampleJob(path, folder / "result.mcap", claim)
 
 
 def record(recorder: Recorder, words: tuple[str, ...], *, answered: bool = True) -> None:

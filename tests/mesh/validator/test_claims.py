@@ -6,10 +6,10 @@ import pytest
 
 from mesh.validator.verification import Claim
 from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, encode
-from tests.mesh.validator.jobs import OTHER, ROBOT, THIEF, JobFiles, failures
+from tests.mesh.validator.jobs import OTHER, ROBOT, THIEF, SampleJob, failures
 
 
-def test_a_result_message_proves_who_signed_it(job: JobFiles) -> None:
+def test_a_result_message_proves_who_signed_it(job: SampleJob) -> None:
     verdict = job.verify(job.message(), finalized=None)
     assert verdict.holds
     signature = verdict.of("signature")
@@ -26,7 +26,7 @@ def test_a_result_message_proves_who_signed_it(job: JobFiles) -> None:
     ],
 )
 def test_a_result_message_with_another_signer_liability_or_recording_fails(
-    job: JobFiles, fields: dict[str, object], why: str
+    job: SampleJob, fields: dict[str, object], why: str
 ) -> None:
     said = failures(job.verify(job.message(**fields)))  # type: ignore[arg-type]
     assert set(said) == {"signature"}
@@ -34,11 +34,11 @@ def test_a_result_message_with_another_signer_liability_or_recording_fails(
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b'{"liability": 1}'])
-def test_an_undecodable_result_message_fails(job: JobFiles, content: bytes) -> None:
+def test_an_undecodable_result_message_fails(job: SampleJob, content: bytes) -> None:
     assert failures(job.verify(content))["signature"].startswith("the Result message: ")
 
 
-def test_a_demand_is_not_a_result(job: JobFiles) -> None:
+def test_a_demand_is_not_a_result(job: SampleJob) -> None:
     demand = Demand(
         model=cid_of_bytes(b"m"),
         objective=cid_of_bytes(b"o"),
@@ -53,7 +53,7 @@ def test_a_demand_is_not_a_result(job: JobFiles) -> None:
     assert "not a Result" in failures(job.verify(encode(ROBOT.sign(demand))))["signature"]
 
 
-def test_two_files_alone_leave_the_other_findings_open(job: JobFiles) -> None:
+def test_two_files_alone_leave_the_other_findings_open(job: SampleJob) -> None:
     job.claim = Claim()
     verdict = job.verify()
     assert verdict.holds
@@ -61,7 +61,7 @@ def test_two_files_alone_leave_the_other_findings_open(job: JobFiles) -> None:
     assert undecided == {"finalized", "signature", "result-file", "objective-file", "liability", "agent", "lighthouse"}
 
 
-def test_an_arbiter_needs_no_chain_with_the_result_message(job: JobFiles) -> None:
+def test_an_arbiter_needs_no_chain_with_the_result_message(job: SampleJob) -> None:
     job.claim = Claim()
     verdict = job.verify(job.message())
     assert verdict.holds

@@ -9,16 +9,16 @@ import pytest
 
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.recording import Recorder, RecordingAbout, open_objective
-from mesh.validator.verification import verify
+from mesh.validator.verification import JobFiles, verify
 from schemas import cid_of_file
-from tests.mesh.validator.jobs import WORDS, JobFiles, failures, make_job, record, stop
+from tests.mesh.validator.jobs import WORDS, SampleJob, failures, make_job, record, stop
 from tests.support.clocks import HOUR, NOON, SECOND, SetClock
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 
-def interrupted(tmp_path: Path, *parts: tuple[str, ...], clocks: tuple[SetClock, ...] = ()) -> JobFiles:
+def interrupted(tmp_path: Path, *parts: tuple[str, ...], clocks: tuple[SetClock, ...] = ()) -> SampleJob:
     """A job whose agent crashed after each of the parts but the last. Each clock is set back in its part."""
     job = make_job(tmp_path)
     about = {name: text for name, text in open_objective(job.result).metadata["aira"].items() if name != "software"}
@@ -89,7 +89,8 @@ def test_the_time_of_all_parts_counts_for_the_period_but_not_the_time_between(tm
     """Two parts of three and two seconds, with two hours between them by the robot's clock."""
     job = interrupted(tmp_path, WORDS[:3], WORDS[3:], clocks=(SetClock(), SetClock(NOON + 2 * HOUR)))
     for seconds, holds in ((3, False), (4, True)):
-        verdict = verify(job.claim, objective=job.objective, result=job.result, period=(NOON, NOON + seconds * SECOND))
+        period = (NOON, NOON + seconds * SECOND)
+        verdict = verify(job.claim, JobFiles(objective=job.objective, result=job.result, period=period))
         found = verdict.of("period")
         assert found is not None
         assert found.holds is holds, found.detail

@@ -9,7 +9,7 @@ import pytest
 from mesh.recording import convert, pack
 from mesh.recording.objective import Played
 from mesh.recording.ros import RosTypes
-from mesh.validator.verification import Claim, Verdict, verify
+from mesh.validator.verification import Claim, JobFiles, Verdict, verify
 from schemas import cid_of_file, parse_address
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def judge(folder: Path, recorded: list[tuple[str, str]], *, bags: bool = True) -
         success=True,
         finalized=True,
     )
-    return verify(claim, objective=objective, result=result, bags=bags)
+    return verify(claim, JobFiles(objective=objective, result=result), bags=bags)
 
 
 def below(messages: list[tuple[str, str]], liability: str = JOB) -> list[tuple[str, str]]:

@@ -9,9 +9,9 @@ import pytest
 
 from mesh.validator.judging import Case, Judgement, examine, judge
 from mesh.validator.policies import policy_of
-from mesh.validator.verification import Claim
+from mesh.validator.verification import Claim, JobFiles
 from schemas import cid_of_file, parse_address
-from tests.mesh.validator.jobs import ROBOT, JobFiles
+from tests.mesh.validator.jobs import ROBOT, SampleJob
 from tests.mesh.validator.test_legacy import DUE, JOB, OTHER, bag, below
 from tests.mesh.validator.trials import ALWAYS, failed, liability_of
 
@@ -35,7 +35,7 @@ def judged(
         objective=cid_of_file(objective),
         result=cid_of_file(result),
     )
-    job = JobFiles(objective, result, claim)
+    job = SampleJob(objective, result, claim)
     given: dict[str, Any] = {
         "liability": liability_of(job),
         "claimed": True,
@@ -92,9 +92,9 @@ def test_a_bag_that_another_one_signed_does_not_count(tmp_path: Path) -> None:
 def test_a_bag_is_checked_by_hand(tmp_path: Path) -> None:
     judgement = judged(tmp_path, ANSWERED)
     assert judgement.success
-    liability = msgspec.structs.replace(liability_of(JobFiles(tmp_path, tmp_path, Claim())), address=JOB)
+    liability = msgspec.structs.replace(liability_of(SampleJob(tmp_path, tmp_path, Claim())), address=JOB)
     objective, recording = tmp_path / "objective.bag", tmp_path / "result.bag"
-    findings = examine(liability, objective=objective, recording=recording, policies=(), bags=True)
+    findings = examine(liability, JobFiles(objective=objective, result=recording), policies=(), bags=True)
     found = {one.code: one.holds for one in findings}
     assert found["played"]
     assert False not in found.values()

@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 from mesh.recording import ABOUT, CLOCK_RECORD, RECOVERED, Recorder, RecordingAbout, open_objective
-from mesh.validator.verification import MOST_SEAMS
+from mesh.validator.verification import MOST_SEAMS, JobFiles, verify
 from schemas import cid_of_file
-from tests.mesh.validator.jobs import LIABILITY, OTHER, ROBOT, JobFiles, failures, make_job
+from tests.mesh.validator.jobs import LIABILITY, OTHER, ROBOT, SampleJob, failures, make_job
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -61,12 +61,12 @@ def without_clock(messages: list[ChannelMessage], metadata: Metadata) -> list[Ch
         (edited(1, role="", sequence=0), "roles", "nothing says who sent the messages on /said"),
     ],
 )
-def test_what_no_recorder_writes_fails(job: JobFiles, forgery: Any, name: str, why: str) -> None:
+def test_what_no_recorder_writes_fails(job: SampleJob, forgery: Any, name: str, why: str) -> None:
     job.forge(forgery)
     assert why in failures(job.verify())[name]
 
 
-def test_a_copy_of_a_message_at_its_time_fails(job: JobFiles) -> None:
+def test_a_copy_of_a_message_at_its_time_fails(job: SampleJob) -> None:
     def copied(messages: list[ChannelMessage], _metadata: Metadata) -> list[ChannelMessage]:
         again = msgspec.structs.replace(messages[1].message, sequence=1)
         return [*messages[:2], msgspec.structs.replace(messages[1], message=again), *messages[2:]]
@@ -76,29 +76,27 @@ def test_a_copy_of_a_message_at_its_time_fails(job: JobFiles) -> None:
     assert said["duplicates"] == "message 1 on /said has the time and content of the one before it"
 
 
-def test_a_changed_byte_of_metadata_which_have_no_checksum_is_found(job: JobFiles) -> None:
+def test_a_changed_byte_of_metadata_which_have_no_checksum_is_found(job: SampleJob) -> None:
     data = job.result.read_bytes()
     job.result.write_bytes(data.replace(b"liability", b"LIABILITY"))
     assert "names no liability" in failures(job.verify())["liability"]
 
 
-def test_the_period_is_checked_if_it_is_known(job: JobFiles) -> None:
-    from mesh.validator.verification import verify
-
+def test_the_period_is_checked_if_it_is_known(job: SampleJob) -> None:
     start = open_objective(job.result).start_ns
     for period, holds in (
         ((start - 10**9, start + 10**12), True),
         ((start + 1, start + 10**12), False),
         ((0, 1), False),
     ):
-        verdict = verify(job.claim, objective=job.objective, result=job.result, period=period)
+        verdict = verify(job.claim, JobFiles(objective=job.objective, result=job.result, period=period))
         found = verdict.of("period")
         assert found is not None
         assert found.holds is holds
     assert job.verify().of("period") is None
 
 
-def test_hundreds_of_crashes_are_not_believed_and_cost_no_time(job: JobFiles) -> None:
+def test_hundreds_of_crashes_are_not_believed_and_cost_no_time(job: SampleJob) -> None:
     seams = ",".join(str(number % 11) for number in range(200_000))
     job.forge(stated(RECOVERED, seams=seams, messages="11"))
     began = time.monotonic()
@@ -116,5 +114,5 @@ def test_an_objective_without_messages_is_played_at_once(tmp_path: Path) -> None
     claim = msgspec.structs.replace(
         job.claim, objective=cid_of_file(path), result=cid_of_file(tmp_path / "result.mcap")
     )
-    verdict = JobFiles(path, tmp_path / "result.mcap", claim).verify()
+    verdict = SampleJob(path, tmp_path / "result.mcap", claim).verify()
     assert [finding.name for finding in verdict.findings if not finding.holds] == []

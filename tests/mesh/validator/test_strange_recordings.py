@@ -14,9 +14,10 @@ from mesh.recording import Unrecordable
 from mesh.recording._mcap_writer import McapWriter
 from mesh.validator.judging import Case, examine, judge
 from mesh.validator.policies import POLICIES, own_policy, policy_of
+from mesh.validator.verification import JobFiles
 from schemas import cid_of_file
 from schemas.payloads import PayloadType
-from tests.mesh.validator.jobs import JobFiles, make_job
+from tests.mesh.validator.jobs import SampleJob, make_job
 from tests.mesh.validator.trials import liability_of
 from tests.support.bags import Bag, BagMessage
 
@@ -111,7 +112,7 @@ def test_there_is_a_verdict_on_any_recording(tmp_path: Path, caplog: pytest.LogC
             write_mcap(strange, dice)
         else:
             write_bag(strange, dice, job.claim.liability)
-        result = JobFiles(job.objective, strange, msgspec.structs.replace(job.claim, result=cid_of_file(strange)))
+        result = SampleJob(job.objective, strange, msgspec.structs.replace(job.claim, result=cid_of_file(strange)))
         case = Case(
             liability=liability_of(result),
             claimed=True,
@@ -124,6 +125,6 @@ def test_there_is_a_verdict_on_any_recording(tmp_path: Path, caplog: pytest.LogC
             judgement = judge(case, objective=objective, recording=strange, policies=policies, bags=True)
             assert judgement.is_decided
             assert not judgement.success
-            found = examine(case.liability, objective=objective, recording=strange, policies=policies, bags=True)
+            found = examine(case.liability, JobFiles(objective=objective, result=strange), policies=policies, bags=True)
             assert any(finding.holds is False for finding in found)
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []

@@ -16,7 +16,7 @@ from tests.mesh.validator.jobs import (
     OTHER,
     THIEF,
     WORDS,
-    JobFiles,
+    SampleJob,
     failures,
     make_job,
     record,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from tests.mesh.validator.jobs import Metadata
 
 
-def test_every_finding_of_an_honest_job_holds(job: JobFiles) -> None:
+def test_every_finding_of_an_honest_job_holds(job: SampleJob) -> None:
     verdict = job.verify()
     assert [finding.name for finding in verdict.findings] == [
         "finalized",
@@ -164,7 +164,7 @@ def of_nobody(messages: list[ChannelMessage], metadata: Metadata) -> list[Channe
     ],
 )
 def test_a_forged_recording_fails_with_the_right_findings(
-    job: JobFiles, forgery: object, found: dict[str, str]
+    job: SampleJob, forgery: object, found: dict[str, str]
 ) -> None:
     job.forge(forgery)  # type: ignore[arg-type]
     said = failures(job.verify())
@@ -179,7 +179,7 @@ def another_answer(messages: list[ChannelMessage], metadata: Metadata) -> list[C
     return messages
 
 
-def test_a_changed_file_is_not_the_one_that_was_signed(job: JobFiles) -> None:
+def test_a_changed_file_is_not_the_one_that_was_signed(job: SampleJob) -> None:
     signed = job.claim.result
     job.forge(another_answer)
     assert job.verify().holds
@@ -187,32 +187,32 @@ def test_a_changed_file_is_not_the_one_that_was_signed(job: JobFiles) -> None:
     assert failures(verdict) == {"result-file": f"the result is {cid_of_file(job.result)}, and it should be {signed}"}
 
 
-def test_a_cut_recording_is_not_readable(job: JobFiles) -> None:
+def test_a_cut_recording_is_not_readable(job: SampleJob) -> None:
     job.result.write_bytes(job.result.read_bytes()[:-20])
     said = failures(job.verify())
     assert set(said) == {"result-file", "readable"}
     assert "end" in said["readable"]
 
 
-def test_a_flipped_bit_fails_the_checksum(job: JobFiles) -> None:
+def test_a_flipped_bit_fails_the_checksum(job: SampleJob) -> None:
     content = bytearray(job.result.read_bytes())
     content[content.index(b"\x28\xb5\x2f\xfd") + 40] ^= 1
     job.result.write_bytes(content)
     assert set(failures(job.verify())) == {"result-file", "readable"}
 
 
-def test_another_objective_than_the_contracts_fails(job: JobFiles) -> None:
+def test_another_objective_than_the_contracts_fails(job: SampleJob) -> None:
     said = failures(job.verify(objective=cid_of_bytes(b"harder work")))
     assert set(said) == {"objective-file", "objective"}
 
 
-def test_a_contract_that_has_not_ended_proves_nothing(job: JobFiles) -> None:
+def test_a_contract_that_has_not_ended_proves_nothing(job: SampleJob) -> None:
     verdict = job.verify(finalized=False, result="", success=None)
     assert set(failures(verdict)) == {"finalized"}
     assert [finding.holds for finding in verdict.findings[:3]] == [False, None, None]
 
 
-def test_a_contract_that_was_refunded_holds_no_result(job: JobFiles) -> None:
+def test_a_contract_that_was_refunded_holds_no_result(job: SampleJob) -> None:
     said = failures(job.verify(result="", success=False))
     assert said == {"finalized": "the contract was refunded or cancelled, and holds no result"}
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.validator.judging import Case, Judgement, judge
 from schemas import ZERO_ADDRESS, Liability, cid_of_bytes
-from tests.mesh.validator.jobs import OTHER, JobFiles
+from tests.mesh.validator.jobs import OTHER, SampleJob
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 ALWAYS = (0, 1 << 63)
 
 
-def liability_of(job: JobFiles) -> Liability:
+def liability_of(job: SampleJob) -> Liability:
     """The contract of a job, which has not ended."""
     return Liability(
         address=job.claim.liability,
@@ -41,7 +41,7 @@ def liability_of(job: JobFiles) -> Liability:
 class Trial:
     """Judges the result of a job as a juror does, which remembers what it has judged."""
 
-    job: JobFiles
+    job: SampleJob
     judged: dict[str, str] = field(default_factory=dict)
 
     def judge(self, *policies: Policy, **changed: Any) -> Judgement:
