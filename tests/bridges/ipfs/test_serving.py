@@ -15,6 +15,7 @@ import pytest
 
 from bridges.ipfs._serving import IpfsApi
 from bridges.ipfs.daemon import Daemon, IpfsError
+from bridges.ipfs.service import IpfsBridge
 from mesh.base.background import Background
 from mesh.content import Exchange, Store
 from mesh.dev import JsonRpcServer
@@ -26,12 +27,14 @@ from tests.bridges.ros1.conftest import ros, rosmaster
 from tests.support.market import MODEL, founded, offering, place
 from tests.support.objectives import objective
 from tests.support.peers import require
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from mesh.agent.handlers import Job
     from tests.bridges.ros1.peers import Ros, RosMasterServer
+    from tests.support.ipfs import JsIpfs
     from tests.support.market import Place
 
 __all__ = ["founded", "place", "ros", "rosmaster"]
@@ -90,6 +93,41 @@ async def test_a_legacy_page_orders_a_job_without_ipfs(place: Place, client: str
     ):
         tasks.start(provider.run(), "provider of the test")
         found = await run(client, node.url, place.market.deployment.ens, api.url, MODEL, content)
+    assert found["offer"] == place.address("robot")
+    assert found["result"] == found["result message"]
+
+
+@pytest.mark.parametrize(("client", "generation"), [("robonomics-3", 3), ("robonomics-5", 5)])
+async def test_a_legacy_page_orders_a_job_on_a_daemon(
+    place: Place, js_ipfs: JsIpfs, client: str, generation: Literal[3, 5]
+) -> None:
+    """robonomics-js with its own IPFS provider and the daemon's own client; the bridge is at the same daemon."""
+    lighthouse = f"airalab.lighthouse.{generation}.robonomics.eth"
+    options: Any = {"generation": generation, "lighthouse_contract": lighthouse}
+    robot = offering(place.agent("robot", **options))
+
+    @robot.on("/blink")
+    async def blink(job: Job, _message: Empty) -> None:
+        job.publish("/led", "on")
+
+    content = b64encode(objective(("/blink", None))).decode()
+    settings = place.settings("bridge", ipfs_http_provider=js_ipfs.api, **options)
+    http_client = require("js-ipfs").parents[2] / "ipfs-http-client" / "src" / "index.js"
+    async with (
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+        IpfsBridge(network, settings, chain=lambda: place.chain("provider")) as bridge,
+        Provider(network.session, place.chains["provider"], lighthouse) as provider,
+        robot,
+        JsonRpcServer(place.node.provider) as node,
+        LegacyClient(js_ipfs.api) as daemon,
+        Background() as tasks,
+    ):
+        tasks.start(bridge.run(), "bridge of the test")
+        tasks.start(provider.run(), "provider of the test")
+        await until(lambda: bridge.channels[0].status().state in ("alone", "connected"))
+        ens = place.market.deployment.ens
+        found = await run(client, node.url, ens, js_ipfs.api, MODEL, content, str(http_client))
+        assert cid_of_bytes(await daemon.cat(found["result"])) == found["result"]
     assert found["offer"] == place.address("robot")
     assert found["result"] == found["result message"]
 

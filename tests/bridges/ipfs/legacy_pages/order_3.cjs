@@ -1,7 +1,7 @@
 // Run by node: order a job with robonomics-js 0.3.0 and its own IPFS provider, as a page of 2018 did.
 //
-//     NODE_PATH=… node order_3.cjs NODE_URL ENS IPFS_URL MODEL OBJECTIVE_TEXT
-const [url, ens, ipfsUrl, model, content] = process.argv.slice(2)
+//     NODE_PATH=… node order_3.cjs NODE_URL ENS IPFS_URL MODEL OBJECTIVE [HTTP_CLIENT]
+const [url, ens, ipfsUrl, model, content, httpClient] = process.argv.slice(2)
 
 // The client waits 3 to 10 s between two looks at the chain.
 const later = global.setTimeout
@@ -11,7 +11,7 @@ global.setInterval = (work, ms, ...rest) => again(work, ms / 20, ...rest)
 
 require('regenerator-runtime/runtime')
 const Web3 = require('web3')
-const IPFS = require('ipfs-api')
+const { open } = require('./ipfs.cjs')
 Promise.join = require('bluebird').join
 const { default: Robonomics, MessageProviderIpfsApi } = require('robonomics-js')
 
@@ -20,13 +20,9 @@ const report = (name, value) => console.log(JSON.stringify({ name, value }))
 async function main() {
   const web3 = new Web3(new Web3.providers.HttpProvider(url))
   const account = web3.eth.accounts[2]
-  const { hostname, port } = new URL(ipfsUrl)
-  const ipfs = new IPFS(hostname, port)
+  const { ipfs, add } = await open(ipfsUrl, httpClient)
   report('daemon', [(await ipfs.version()).version, (await ipfs.id()).id])
-  const [{ hash }] = await ipfs.add(Buffer.from(content, 'base64'))
-  for (const bytes of [await ipfs.cat(hash), (await ipfs.get(hash))[0].content]) {
-    if (!bytes.equals(Buffer.from(content, 'base64'))) throw new Error('other bytes came back')
-  }
+  const hash = await add(Buffer.from(content, 'base64'))
   const provider = new MessageProviderIpfsApi(ipfs)
   const robonomics = new Robonomics({ web3, account, provider, signPrefix: false, ens })
   await robonomics.ready()
@@ -36,7 +32,10 @@ async function main() {
   robonomics.getOffer(model, (offer) => report('offer', offer.account))
   robonomics.getResult((message) => report('result message', message.result))
   const terms = { objective: hash, token: robonomics.xrt.address, cost: 42, deadline: web3.eth.blockNumber + 1000 }
-  const liability = await robonomics.postDemand(model, terms)
+  const made = new Promise((resolve) => robonomics.watchLiability(null, resolve))
+  const posted = robonomics.postDemand(model, terms)
+  // It waits for a callback that the clients of today's daemons do not call.
+  const liability = await (httpClient ? made : posted)
   report('liability', liability.address)
   report('result', await new Promise((resolve) => liability.watchResult(resolve)))
 }

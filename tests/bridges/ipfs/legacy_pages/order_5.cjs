@@ -1,11 +1,11 @@
 // Run by node: order a job with robonomics-js 0.6.3 and its own IPFS provider, as a page of 2019 did.
 //
-//     NODE_PATH=… node order_5.cjs NODE_URL ENS IPFS_URL MODEL OBJECTIVE
-const [url, ens, ipfsUrl, model, content] = process.argv.slice(2)
+//     NODE_PATH=… node order_5.cjs NODE_URL ENS IPFS_URL MODEL OBJECTIVE [HTTP_CLIENT]
+const [url, ens, ipfsUrl, model, content, httpClient] = process.argv.slice(2)
 
 require('regenerator-runtime/runtime')
 const Web3 = require('web3')
-const IPFS = require('ipfs-api')
+const { open } = require('./ipfs.cjs')
 const { default: Robonomics, MessageProviderIpfsApi, Account } = require('robonomics-js')
 
 const report = (name, value) => console.log(JSON.stringify({ name, value }))
@@ -13,9 +13,8 @@ const report = (name, value) => console.log(JSON.stringify({ name, value }))
 async function main() {
   const web3 = new Web3(new Web3.providers.WebsocketProvider(url.replace('http', 'ws')))
   const address = (await web3.eth.getAccounts())[2]
-  const { hostname, port } = new URL(ipfsUrl)
-  const ipfs = new IPFS(hostname, port)
-  const [{ hash }] = await ipfs.add(Buffer.from(content, 'base64'))
+  const { ipfs, add } = await open(ipfsUrl, httpClient)
+  const hash = await add(Buffer.from(content, 'base64'))
   const robonomics = new Robonomics({
     web3, account: { address, isSignPrefix: false }, ens: { address: ens }, lighthouse: 'airalab',
     messageProvider: new MessageProviderIpfsApi(ipfs)
