@@ -173,11 +173,15 @@ def decode_reply(body: bytes) -> Any:
 
 
 def _loads(body: bytes) -> tuple[tuple[Any, ...], str | None]:
+    try:
+        text = body.decode()  # the parser would also take UTF-16, in which the next check sees nothing
+    except UnicodeDecodeError:
+        raise WireError("an XML-RPC call that is not UTF-8") from None
     # Entities can expand to any size; no call needs a document type.
-    if b"<!" in body:
+    if "<!" in text:
         raise WireError("an XML-RPC call with a document type")
     try:
-        return xmlrpc.client.loads(body)
+        return xmlrpc.client.loads(text)
     except xmlrpc.client.Fault as error:
         raise Ros1Error(error.faultString[:300]) from None
     except Exception as error:  # whatever a parser of a stranger's text may raise

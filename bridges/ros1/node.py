@@ -115,7 +115,7 @@ async def serve_calls(
 class Ros1Server(Lifecycle):
     """A port: XML-RPC calls on it go to `dispatch`, other connections to `connected`.
 
-    What is malformed is counted in `drops`, and its connection ends.
+    What is malformed is counted in `drops`, and its connection ends; so are connections that are too many or too slow.
     """
 
     title = "ROS 1 port"
@@ -148,7 +148,6 @@ class Ros1Server(Lifecycle):
 
     async def _open(self, stack: AsyncExitStack) -> None:
         self._tasks = await stack.enter_async_context(Background())
-        stack.callback(self._door.end_all)
         try:
             server = await asyncio.start_server(self._accept, self._host, self.port, limit=LONGEST_HEAD)
         except (OSError, OverflowError) as error:
@@ -165,9 +164,14 @@ class Ros1Server(Lifecycle):
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         sender = str((writer.get_extra_info("peername") or ("",))[0])
-        guest = self._door.enter(sender, writer.transport.abort)
-        if guest is None:
+
+        def refuse() -> None:
+            self._drops.count("ros1-connection", sender)
             writer.transport.abort()
+
+        guest = self._door.enter(sender, refuse)
+        if guest is None:
+            refuse()
         else:
             self._tasks.start(self._serve(reader, writer, sender, guest), "ROS 1 connection")
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import struct
+import tracemalloc
 from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -164,6 +166,7 @@ async def test_a_subscriber_that_does_not_read_loses_messages_and_holds_up_nobod
         del lazy
 
 
+BOMB = '<!DOCTYPE b [<!ENTITY a "xxxxxxxx">]><methodCall><methodName>&a;&a;&a;&a;</methodName></methodCall>'
 HOSTILE = {
     "a header of two gigabytes": struct.pack("<I", 2**31 - 1),
     "a field longer than its header": struct.pack("<II", 8, 99) + b"abcd",
@@ -174,6 +177,8 @@ HOSTILE = {
     "a body of a gigabyte": b"POST / HTTP/1.1\r\nContent-Length: 1000000000\r\n\r\n",
     "no length": b"POST / HTTP/1.1\r\n\r\n",
     "an endless head": b"POST / HTTP/1.1\r\n" + b"x" * (64 << 10),
+    "a document type in another encoding": b"POST / HTTP/1.1\r\nContent-Length: 320\r\n\r\n"
+    + f"{BOMB:<159}".encode("utf-16"),
     "nesting": b"POST / HTTP/1.1\r\nContent-Length: 60000\r\n\r\n" + b"<a>" * 20000,
 }
 
@@ -212,15 +217,38 @@ async def test_a_message_of_two_gigabytes_is_not_waited_for(graph: Opened) -> No
         assert here.drops.heaviest("ros1-malformed")[0][0] == "/liar"
 
 
-async def test_a_thousand_connections_do_not_keep_others_out(graph: Opened) -> None:
-    """Those that ask nothing make room for those who do."""
+FLOODS = {
+    "idle connections": b"",
+    "messages of two gigabytes": HOSTILE["a header of two gigabytes"],
+    "endless heads": HOSTILE["an endless head"][: 20 << 10],
+    "bombs of entities": b"POST / HTTP/1.1\r\nContent-Length: %d\r\n\r\n" % len(BOMB) + BOMB.encode(),
+}
+
+
+@pytest.mark.parametrize("name", FLOODS)
+async def test_a_flood_is_one_line_in_the_log_and_keeps_nobody_out(
+    graph: Opened, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    """A thousand connections of each kind: what they take is bounded, and others are served."""
+    caplog.set_level(logging.INFO)
     async with graph() as here, Ros1Node(here, "/stout") as node:
         await node.serve("/trigger", {TRIGGER.md5: TRIGGER}, TRIGGER.md5, triggered)
-        idle = [await asyncio.open_connection(*place_of(node.uri)) for _ in range(1000)]
+        tracemalloc.start()
+        strangers = [await asyncio.open_connection(*place_of(node.uri)) for _ in range(1000)]
+        for _, writer in strangers:
+            writer.write(FLOODS[name])
         assert await node.call("/trigger", TRIGGER, {}) == ANSWER
         assert node._server.guests <= LIMITS.connections
-        for _, writer in idle:
+        await until(lambda: sum(here.drops.totals().values()) >= 1000 - LIMITS.connections, what="the count")
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 32 << 20, f"{peak >> 20} MiB"
+        for _, writer in strangers:
             writer.transport.abort()
+        await until(lambda: not node._server.guests, what="their end")
+        assert here.drops.report(), "what a minute of the bridge writes"
+        assert not here.drops.report()
+    assert [record.name for record in caplog.records] == ["mesh.base.flood"], caplog.text
 
 
 async def test_rosbag_records_our_topics_and_plays_to_our_node(
