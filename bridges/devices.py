@@ -95,6 +95,11 @@ def is_put_by_edge(attachment: zenoh.ZBytes | None) -> bool:
     return attachment is not None and attachment.to_bytes().startswith(PUT_BY_EDGE)
 
 
+def is_said_by_device(attachment: zenoh.ZBytes | None) -> bool:
+    """Whether a device has said something with this attachment: it names the device."""
+    return attachment is not None and attachment.to_bytes().startswith(PUT_BY_EDGE + b" ")
+
+
 @contextmanager
 def answer_log_queries(session: zenoh.Session, key: str, role: str) -> Iterator[None]:
     """Answer queries for this process's log on a key of the device, as it has no services of its own."""

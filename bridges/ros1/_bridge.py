@@ -1,25 +1,24 @@
 """The bridge: a ROS 1 system as a device and a control surface of an agent.
 
 The legacy stack's nodes, topics and services are in the graph (`control`, `files`); what objectives play is published
-below `/liability/eth_ADDRESS`, and what nodes publish there is recorded (`jobs`).
+below `/liability/eth_ADDRESS`, and what nodes publish there is recorded (`jobs`). What boards of the agent say is
+published, too (`devices`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import tempfile
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from bridges.devices import ABOUT, DeviceAbout, DeviceTopic
 from bridges.ros1._control import NODES, LegacyGraph
 from bridges.ros1._definitions import md5_of, message_types
+from bridges.ros1._devices import DEVICES_NODE, RosDevices
 from bridges.ros1._files import FILES_NODE, PLAYER_NODE, LegacyFiles
-from bridges.ros1._jobs import GONE_SECONDS, RosJobs
+from bridges.ros1._jobs import RosJobs
 from bridges.ros1._wire import Ros1Error
-from bridges.ros1.node import Ros1Graph, Ros1Node
+from bridges.ros1.node import Ros1Node
 from mesh.base.background import Background, call_in_loop
 from mesh.base.lifecycle import Role
 from mesh.base.log_context import log_event
@@ -34,8 +33,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.content import Exchange, Store
-    from mesh.network import Channel
+    from bridges.ros1._parts import RosBridgeOptions, RosBridgeParts
 
 log = logging.getLogger(__name__)
 
@@ -47,93 +45,32 @@ class NodeShutDown(Ros1Error, code="ros1-shut-down"):
     """Somebody shut one of the bridge's nodes down: by `rosnode kill`, or with a new node of its name."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RosBridgeOptions:
-    """How a bridge serves its graph.
-
-    `recording_topics` are recorded besides those of jobs. With `as_original` topics are published after a second,
-    whether anybody subscribes or not. `folders` are those that the services for files may read and write. `generation`
-    is the version of messages for those who take any. With `is_alone`, our master is the only one: it has /rosout.
-    A job whose node has disappeared for `gone_seconds` fails.
-    """
-
-    recording_topics: frozenset[str] = frozenset()
-    as_original: bool = False
-    folders: tuple[Path, ...] = (Path(tempfile.gettempdir()),)
-    generation: str = "3"
-    is_alone: bool = False
-    size_limit: int = 256 << 20
-    gone_seconds: float = GONE_SECONDS
-
-
 class Ros1Bridge(Role):
-    """A ROS 1 system as the device `name` of the agent with the address `agent`, and its control surface.
-
-    `channel` is that of the agent's market; files are those of `store` and `exchange`; recordings of the player of
-    bags are made in `directory`. Raises `InvalidKey` for an invalid name.
-    """
+    """A ROS 1 system as a device of an agent, and its control surface. Raises `InvalidKey` for an invalid name."""
 
     title = "bridge to ROS 1"
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        channel: Channel,
-        graph: Ros1Graph,
-        store: Store,
-        exchange: Exchange,
-        *,
-        agent: str,
-        directory: Path,
-        name: str = "ros1",
-        options: RosBridgeOptions = RosBridgeOptions(),
-    ) -> None:
-        self._session = session
-        self._channel = channel
-        self._graph = graph
-        self._store = store
-        self._exchange = exchange
-        self._agent = agent
-        self._name = name
-        self._directory = directory
+    def __init__(self, parts: RosBridgeParts, options: RosBridgeOptions) -> None:
+        self._parts = parts
         self._options = options
+        self._graph = parts.graph
+        self._session = parts.network.session
         self._key(PRESENT)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         options, loop = self._options, asyncio.get_running_loop()
         nodes = {
             name: await stack.enter_async_context(Ros1Node(self._graph, name))
-            for name in (*NODES, FILES_NODE, PLAYER_NODE)
+            for name in (*NODES, FILES_NODE, PLAYER_NODE, DEVICES_NODE)
         }
         self._tasks = await stack.enter_async_context(Background())
         if options.is_alone:
             await self._serve_rosout(stack)
         executor = next(iter(nodes.values()))
-        self.jobs = await stack.enter_async_context(
-            RosJobs(
-                self._session,
-                self._agent,
-                executor,
-                also_recorded=options.recording_topics,
-                as_original=options.as_original,
-                gone_seconds=options.gone_seconds,
-            )
-        )
-        files = LegacyFiles(
-            nodes[FILES_NODE],
-            nodes[PLAYER_NODE],
-            self._store,
-            self._exchange,
-            folders=options.folders,
-            directory=self._directory,
-            generation=options.generation,
-            size_limit=options.size_limit,
-        )
-        await stack.enter_async_context(files)
-        legacy = LegacyGraph(
-            self._session, self._channel, nodes, self.jobs, agent=self._agent, generation=options.generation
-        )
-        await stack.enter_async_context(legacy)
+        self.jobs = await stack.enter_async_context(RosJobs(self._parts, options, executor))
+        await stack.enter_async_context(RosDevices(self._parts, nodes[DEVICES_NODE]))
+        await stack.enter_async_context(LegacyFiles(self._parts, options, nodes))
+        await stack.enter_async_context(LegacyGraph(self._parts, options, nodes, self.jobs))
         declared: list[Any] = [
             self._session.liveliness().declare_token(self._key(PRESENT)),
             self._session.declare_queryable(
@@ -194,7 +131,7 @@ class Ros1Bridge(Role):
     def _reply_about(self, query: zenoh.Query) -> None:
         topics = {topic for job in self.jobs.open for topic in self.jobs.topics(job)}
         DeviceAbout(
-            name=self._name,
+            name=self._options.name,
             present=True,
             port=self._graph.master,
             job=next(iter(self.jobs.open), ""),
@@ -203,4 +140,4 @@ class Ros1Bridge(Role):
         ).reply(query)
 
     def _key(self, topic: str) -> str:
-        return str(DeviceTopicKey(self._agent, self._name, topic))
+        return str(DeviceTopicKey(self._parts.agent, self._options.name, topic))

@@ -23,9 +23,21 @@ from mesh.base.flood import BoundedDict
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.errors import AiraError, InputError
-from mesh.network import Channel, call
-from schemas import ZERO_ADDRESS, Demand, Liability, Offer, Result, parse_address
-from schemas.keys import EthEvent, EthEventKey, EventKey, event_selector, parse_agent_key
+from mesh.network import Pump, call
+from mesh.recording import open_objective
+from schemas import (
+    ZERO_ADDRESS,
+    Demand,
+    Liability,
+    Offer,
+    OrderFeedback,
+    PlaybackPosition,
+    Result,
+    TransactionFeedback,
+    decode,
+    parse_address,
+)
+from schemas.keys import EthEvent, EthEventKey, EventKey, event_selector, market_selector, parse_agent_key
 from schemas.rpc import SERVICES, ApprovalEvent, Nothing, TransferEvent
 
 if TYPE_CHECKING:
@@ -33,6 +45,7 @@ if TYPE_CHECKING:
     from contextlib import AsyncExitStack
 
     from bridges.ros1._jobs import RosJobs
+    from bridges.ros1._parts import RosBridgeOptions, RosBridgeParts
     from bridges.ros1.node import Handler, Ros1Node, Ros1Publisher
     from schemas import Record
 
@@ -46,11 +59,20 @@ CHANNEL_OF_OCTOBER: Final = "/liability/infochan/channel"
 SIGNER_OF_OCTOBER: Final = "/liability/infochan/signer"
 TOKEN: Final = "/eth/erc20_token"
 ETH: Final = "/eth/eth_node"
-NODES: Final = (EXECUTOR, LISTENER, CHANNEL, SIGNER, CHANNEL_OF_OCTOBER, SIGNER_OF_OCTOBER, TOKEN, ETH)
+PERSISTENCE: Final = "/liability/persistence"
+NODES: Final = (EXECUTOR, LISTENER, CHANNEL, SIGNER, CHANNEL_OF_OCTOBER, SIGNER_OF_OCTOBER, TOKEN, ETH, PERSISTENCE)
 """The nodes of the legacy stack; two were called otherwise in October 2018."""
 
 LIABILITY: Final = "robonomics_liability/Liability"
 KINDS: Final[Mapping[str, type[Demand | Offer | Result]]] = {"demand": Demand, "offer": Offer, "result": Result}
+FEEDBACK: Final[Mapping[type[OrderFeedback | TransactionFeedback], tuple[str, str]]] = {
+    OrderFeedback: ("/liability/infochan/incoming/feedback/added_order", "robonomics_msgs/AddedOrderFeedback"),
+    TransactionFeedback: (
+        "/liability/infochan/incoming/feedback/added_pending_transaction",
+        "robonomics_msgs/AddedPendingTransactionFeedback",
+    ),
+}
+"""What providers of generation 5 say about orders: topic and type."""
 AMOUNTS: Final = ("cost", "deadline", "validatorFee", "lighthouseFee")
 ETHER: Final = 18
 XRT: Final = 9
@@ -63,8 +85,10 @@ KEPT_SECONDS: Final = 5.0
 """For which the market's messages are kept for nodes that subscribe just then."""
 MOST_KEPT: Final = 64
 """Messages of one kind that are kept so."""
-START_SECONDS: Final = 5.0
+ANSWER_SECONDS: Final = 5.0
 """For the agent's answer which jobs it has."""
+FETCH_SECONDS: Final = 60.0
+"""For an objective, without a new block of it."""
 
 
 class Nonce(bytes):
@@ -75,23 +99,21 @@ class Nonce(bytes):
 
 
 class LegacyGraph(Lifecycle):
-    """The legacy stack's names for the agent with the address `agent`: `async with LegacyGraph(...)`.
-
-    `channel` is that of its market. `generation` is the version of messages for those who take any.
-    """
+    """The legacy stack's names for the agent, on `nodes`: `async with LegacyGraph(...)`."""
 
     title = "legacy names on ROS 1"
 
     def __init__(
-        self, session: zenoh.Session, channel: Channel, nodes: Mapping[str, Ros1Node], jobs: RosJobs, *,
-        agent: str, generation: str,
-    ) -> None:  # fmt: skip
-        self._session = session
-        self._channel = channel
+        self, parts: RosBridgeParts, options: RosBridgeOptions, nodes: Mapping[str, Ros1Node], jobs: RosJobs
+    ) -> None:
+        self._session = parts.network.session
+        self._channel = parts.channel
         self._nodes = nodes
         self._jobs = jobs
-        self._agent = parse_address(agent)
-        self._generation = generation
+        self._agent = parse_address(parts.agent)
+        self._exchange = parts.exchange
+        self._size_limit = options.size_limit
+        self._generation = options.generation
         self._requests: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue(WAITING)
         self._complete: BoundedDict[str, bool] = BoundedDict(REMEMBERED)
         self._topics: dict[str, Ros1Publisher] = {}
@@ -105,6 +127,8 @@ class LegacyGraph(Lifecycle):
         self._tasks.start(self._send_requests(), "messages of ROS nodes")
         for kind in KINDS.values():
             self._tasks.start(self._show_market(kind), f"{kind.__name__}s to ROS")
+        for feedback in FEEDBACK:
+            self._tasks.start(self._show_feedback(feedback), f"{feedback.__name__} to ROS")
         heard = {event_selector(self._agent): self._handle_event}
         heard |= {str(EthEventKey(self._agent, event)): self._handle_token_event for event in get_args(EthEvent)}
 
@@ -128,6 +152,7 @@ class LegacyGraph(Lifecycle):
             (EXECUTOR, "/liability/result", "robonomics_msgs/Result"),
             (TOKEN, "/eth/event/transfer", "ethereum_common/TransferEvent"),
             (TOKEN, "/eth/event/approval", "ethereum_common/ApprovalEvent"),
+            *((CHANNEL, topic, type) for topic, type in FEEDBACK.values()),
             *((CHANNEL, f"/liability/infochan/incoming/{kind}", _type_of(kind)) for kind in KINDS),
             *((SIGNER, f"/liability/infochan/eth/sending/{kind}", _type_of(kind)) for kind in KINDS),
         ):
@@ -153,6 +178,13 @@ class LegacyGraph(Lifecycle):
             (EXECUTOR, "/liability/resume", started, partial(self._drive, "resume")),
             (EXECUTOR, "/liability/finish", "robonomics_liability/FinishLiability", self._finish),
             (LISTENER, "/liability/read", "robonomics_liability/ReadLiability", self._read),
+            (PERSISTENCE, f"{PERSISTENCE}/exists", "robonomics_liability/PersistenceContainsLiability", self._exists),
+            (
+                PERSISTENCE,
+                f"{PERSISTENCE}/get_liability_timestamp",
+                "robonomics_liability/PersistenceLiabilityTimestamp",
+                self._played_until,
+            ),
             (ETH, "/eth/accounts", "ethereum_common/Accounts", self._eth("accounts")),
             (ETH, "/eth/current_block", "ethereum_common/BlockNumber", self._eth("current_block")),
             (ETH, "/eth/account_eth_balance", balance, self._eth("account_eth_balance", ETHER)),
@@ -204,13 +236,8 @@ class LegacyGraph(Lifecycle):
     async def _recall_jobs(self) -> None:
         """Show the jobs that are ready already, as after a restart of this bridge, and no running ones."""
 
-        def ask() -> dict[str, bytes]:
-            replies = self._session.get(event_selector(self._agent), timeout=START_SECONDS)
-            found = (reply.ok for reply in replies)
-            return {str(each.key_expr): each.payload.to_bytes() for each in found if each is not None}
-
         with suppress(zenoh.ZError, AiraError):
-            found = await asyncio.to_thread(ask)
+            found = await self._ask_jobs()
             # The agent calls running jobs ready, too: it says only how many are.
             status = await call(self._session, self._agent, "status", Nothing())
             are_ready = status.work is not None and status.work.jobs.get("ready", 0)
@@ -219,6 +246,16 @@ class LegacyGraph(Lifecycle):
                 is_waiting = are_ready and event == "ready" and f"{below}/progress" not in found
                 if is_waiting or event == "complete":
                     self._handle_event(key, payload)
+
+    async def _ask_jobs(self, liability: str = "*") -> dict[str, bytes]:
+        """What the agent answers about a job, or about all that have not ended, by key. Raises `ZError`."""
+
+        def ask() -> dict[str, bytes]:
+            replies = self._session.get(event_selector(self._agent, liability), timeout=ANSWER_SECONDS)
+            found = (reply.ok for reply in replies)
+            return {str(each.key_expr): each.payload.to_bytes() for each in found if each is not None}
+
+        return await asyncio.to_thread(ask)
 
     def _handle_token_event(self, key: str, payload: bytes) -> None:
         kind = key.rpartition("/")[2]
@@ -242,6 +279,22 @@ class LegacyGraph(Lifecycle):
                 self._topics[f"/liability/infochan/eth/sending/{name}"].publish(values)
                 if name == "result" and self._complete.pop(values["liability"], False):
                     self._topics["/liability/result"].publish(values | {"signature": b""})
+
+    async def _show_feedback(self, kind: type[OrderFeedback | TransactionFeedback]) -> None:
+        """Publish what providers say about orders. Nothing in it can be verified."""
+        topic = self._topics[FEEDBACK[kind][0]]
+
+        def decoded(sample: zenoh.Sample) -> dict[str, Any] | None:  # runs on the pump's thread
+            try:
+                message = decode(sample.payload.to_bytes())
+            except AiraError:
+                return None
+            return feedback_fields(message) if isinstance(message, kind) else None
+
+        selector = market_selector(self._channel.lighthouse, kind.kind)
+        async with Pump(self._session, selector, decoded, drops=self._nodes[CHANNEL].drops) as pump:
+            async for values in pump:
+                topic.publish(values)
 
     def _request(self, service: str, type: str, payload: bytes, header: Mapping[str, str]) -> None:
         """A node wants a message signed, or sent."""
@@ -312,6 +365,27 @@ class LegacyGraph(Lifecycle):
             return {"read": False}
         return {"read": True, "liability": _encoded(found.liability)}
 
+    async def _exists(self, request: Mapping[str, Any], _caller: str) -> dict[str, Any]:
+        """Whether the agent has a job that has not ended."""
+        found = await self._ask_jobs(parse_address(plain(request)))
+        return {"exists": any(key.endswith(("/incoming", "/ready")) for key in found)}
+
+    async def _played_until(self, request: Mapping[str, Any], _caller: str) -> dict[str, Any]:
+        """The time in its objective of what was played last in a job; 0 if that is not known, as in the original."""
+        found = await self._ask_jobs(parse_address(plain(request)))
+        by_event = {key.rpartition("/")[2]: payload for key, payload in found.items()}
+        if not by_event.keys() >= {"ready", "progress"}:
+            return {}
+        done = PlaybackPosition.decode(by_event["progress"]).position
+        cid = Liability.decode(by_event["ready"]).objective
+        path = await self._exchange.fetch(cid, size_limit=self._size_limit, timeout=FETCH_SECONDS)
+
+        def last_time() -> int:
+            played = open_objective(path).messages(from_index=max(done - 1, 0))
+            return next((one.log_time_ns for one in played), 0) if done else 0
+
+        return {"timestamp": divmod(await asyncio.to_thread(last_time), 10**9)}
+
     def _eth(self, service: str, places: int | None = None) -> Handler:
         """A service of the agent's account; `places` says of a balance where its decimal point is."""
 
@@ -350,6 +424,14 @@ def fields_of(message: Demand | Offer | Result) -> dict[str, Any]:
         fields["nonce"] = Nonce(nonce.to_bytes(32, "big") if isinstance(nonce, int) else bytes.fromhex(nonce))
         fields["sender"] = message.sender or ""
     return fields
+
+
+def feedback_fields(message: OrderFeedback | TransactionFeedback) -> dict[str, Any]:
+    """The fields of a provider's feedback."""
+    if isinstance(message, TransactionFeedback):
+        return {"tx": message.tx}
+    signature = bytes.fromhex(message.signature.removeprefix("0x"))
+    return {"order": bytes.fromhex(message.order), "accepted": message.accepted, "signature": signature}
 
 
 def _type_of(kind: str) -> str:

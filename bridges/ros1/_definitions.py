@@ -25,6 +25,7 @@ _COMMON: Final = {
     "ipfs_common/Multihash": "string multihash\n",
     "ipfs_common/Filepath": "string filepath\n",
 }
+_TX_HASH: Final = "string txhash\n"
 _TOKEN_EVENTS: Final = {
     "ethereum_common/TransferEvent": "Address args_from\nAddress args_to\nUInt256 args_value\n",
     "ethereum_common/ApprovalEvent": "Address args_owner\nAddress args_spender\nUInt256 args_value\n",
@@ -100,6 +101,11 @@ _VERSIONS: Final[dict[str, dict[str, str]]] = {
         "4": _fields(_RESULT, **_FOUR),
     },
     **{name: {"3": text} for name, text in (_COMMON | _TOKEN_EVENTS).items()},
+    "ethereum_common/TxHash": {"5": _TX_HASH},
+    "robonomics_msgs/AddedOrderFeedback": {
+        "5": "uint8[32] order\nethereum_common/UInt256 accepted\nuint8[] signature\n"
+    },
+    "robonomics_msgs/AddedPendingTransactionFeedback": {"5": "ethereum_common/TxHash tx\n"},
     "std_msgs/String": {"3": "string data\n"},
     "rosgraph_msgs/Log": {
         "3": "byte DEBUG=1\nbyte INFO=2\nbyte WARN=4\nbyte ERROR=8\nbyte FATAL=16\nHeader header\nbyte level\n"
@@ -123,6 +129,12 @@ _SERVICES: Final[dict[str, dict[str, str]]] = {
     "robonomics_liability/FinishLiability": _of_liability("bool success\n", ""),
     "robonomics_liability/ReadLiability": {
         "5": "ethereum_common/Address address\n---\nbool read\nLiability liability\n",
+    },
+    "robonomics_liability/PersistenceContainsLiability": {
+        "4": "ethereum_common/Address address\n---\nbool exists\n",
+    },
+    "robonomics_liability/PersistenceLiabilityTimestamp": {
+        "4": "ethereum_common/Address address\n---\ntime timestamp\n",
     },
     "robonomics_liability/CreateRosbagPlayer": {
         "4": "ipfs_common/Multihash ipfs_address\nstring namespace\n---\n"
@@ -151,8 +163,9 @@ _SERVICES: Final[dict[str, dict[str, str]]] = {
 @lru_cache(maxsize=1)
 def message_types() -> dict[str, dict[str, Ros1Type]]:
     """Every version of each message, by name and MD5 sum; the last one first."""
+    known = _COMMON | {"ethereum_common/TxHash": _TX_HASH}
     return {
-        name: {kind.md5: kind for text in reversed(versions.values()) for kind in (Ros1Type(name, text, _COMMON),)}
+        name: {kind.md5: kind for text in reversed(versions.values()) for kind in (Ros1Type(name, text, known),)}
         for name, versions in _VERSIONS.items()
     }
 

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from bridges.ros1._definitions import md5_of, service_types
-from bridges.ros1._jobs import LOOK_SECONDS, SUBSCRIBER_SECONDS, advertise, type_in
+from bridges.ros1._jobs import LOOK_SECONDS, SUBSCRIBER_SECONDS
+from bridges.ros1._payloads import advertise, type_in
 from bridges.ros1._wire import resolve
 from bridges.ros1.messages import plain
 from mesh.base.background import Background
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from contextlib import AsyncExitStack
 
+    from bridges.ros1._parts import RosBridgeOptions, RosBridgeParts
     from bridges.ros1.node import Ros1Node, Ros1Publisher, Ros1Subscription
-    from mesh.content import Exchange, Store
     from mesh.recording import Objective
 
 log = logging.getLogger(__name__)
@@ -54,33 +55,16 @@ class _Player:
 
 
 class LegacyFiles(Lifecycle):
-    """The services for files on the nodes `files` and `player`: `async with LegacyFiles(...)`.
-
-    `folders` are those that they may read and write; recordings are made in `directory`.
-    """
+    """The services for files on two of the `nodes`: `async with LegacyFiles(...)`."""
 
     title = "files on ROS 1"
 
-    def __init__(
-        self,
-        files: Ros1Node,
-        player: Ros1Node,
-        store: Store,
-        exchange: Exchange,
-        *,
-        folders: tuple[Path, ...],
-        directory: Path,
-        generation: str,
-        size_limit: int,
-    ) -> None:
-        self._files = files
-        self._player = player
-        self._store = store
-        self._exchange = exchange
-        self._folders = tuple(folder.resolve() for folder in folders)
-        self._directory = directory
-        self._generation = generation
-        self._size_limit = size_limit
+    def __init__(self, parts: RosBridgeParts, options: RosBridgeOptions, nodes: Mapping[str, Ros1Node]) -> None:
+        self._parts = parts
+        self._options = options
+        self._files = nodes[FILES_NODE]
+        self._player = nodes[PLAYER_NODE]
+        self._folders = tuple(folder.resolve() for folder in options.folders)
         self._players: dict[str, _Player] = {}
 
     async def _open(self, stack: AsyncExitStack) -> None:
@@ -93,7 +77,7 @@ class LegacyFiles(Lifecycle):
             (self._player, "/rosbagplayer/start", "robonomics_liability/StartRosbagPlayer", self._start),
             (self._player, "/rosbagplayer/stop", "robonomics_liability/StopRosbagPlayer", self._stop),
         ):
-            await node.serve(name, service_types()[type], md5_of(type, self._generation), handler)
+            await node.serve(name, service_types()[type], md5_of(type, self._options.generation), handler)
 
     def _checked(self, text: str) -> Path:
         """A path below one of the folders. Raises `InputError`."""
@@ -104,7 +88,7 @@ class LegacyFiles(Lifecycle):
 
     async def _add(self, request: Mapping[str, Any], _caller: str) -> dict[str, Any]:
         try:
-            cid = await asyncio.to_thread(self._store.put_file, self._checked(plain(request)), pin="ros1")
+            cid = await asyncio.to_thread(self._parts.store.put_file, self._checked(plain(request)), pin="ros1")
         except (AiraError, OSError) as error:
             return {"success": False, "error_msg": str(error)}
         return {"success": True, "ipfs_address": cid}
@@ -119,7 +103,7 @@ class LegacyFiles(Lifecycle):
         return {"success": True}
 
     async def _fetch(self, cid: str) -> Path:
-        return await self._exchange.fetch(cid, size_limit=self._size_limit, timeout=FETCH_SECONDS)
+        return await self._parts.exchange.fetch(cid, size_limit=self._options.size_limit, timeout=FETCH_SECONDS)
 
     async def _new(self, request: Mapping[str, Any], _caller: str) -> dict[str, Any]:
         cid, namespace = plain(request["ipfs_address"]), request["namespace"]
@@ -129,9 +113,9 @@ class LegacyFiles(Lifecycle):
             namespace = resolve(namespace, "/")
             objective = await asyncio.to_thread(open_objective, await self._fetch(cid))
             name = f"{cid}{namespace.replace('/', '_')}_{secrets.token_hex(4)}"
-            self._directory.mkdir(parents=True, exist_ok=True)
+            self._parts.directory.mkdir(parents=True, exist_ok=True)
             about = RecordingAbout(objective=cid)
-            recorder = await asyncio.to_thread(Recorder, self._directory / f"{name}.mcap", about)
+            recorder = await asyncio.to_thread(Recorder, self._parts.directory / f"{name}.mcap", about)
         except (AiraError, OSError) as error:
             return {"success": False, "error_msg": str(error)}
         self._players[name] = _Player(objective, namespace, recorder)
@@ -150,7 +134,7 @@ class LegacyFiles(Lifecycle):
         if player is None:
             return {"success": False}
         await self._end(player)
-        cid = await asyncio.to_thread(self._store.put_file, player.recorder.path, pin="ros1")
+        cid = await asyncio.to_thread(self._parts.store.put_file, player.recorder.path, pin="ros1")
         await asyncio.to_thread(player.recorder.path.unlink)
         return {"success": True, "ipfs_address": cid}
 

@@ -16,29 +16,21 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
+from bridges.ros1._payloads import RosPayloads, advertise, type_in
 from bridges.ros1._wire import Ros1Error
-from bridges.ros1.messages import Ros1Type
-from bridges.ros1.node import Ros1Graph, Ros1Node, Ros1Subscription, call_api
+from bridges.ros1.node import call_api
 from mesh.base.background import Background
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import liability_context, log_event
 from mesh.errors import AiraError, InvalidKey
 from mesh.network import Pump, call, sending
 from mesh.recording import NOTE_TOPIC
-from mesh.recording.ros import LEGACY_TOPIC, RosConverter, legacy_topic
+from mesh.recording.ros import LEGACY_TOPIC, legacy_topic
 from schemas import String, parse_address
-from schemas.errors import InvalidPayload
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, objective_selector, parse_agent_key
 from schemas.payloads import (
-    EMPTY,
-    JSON,
-    RAW,
     PayloadType,
     SentDefinitions,
-    decode_value,
-    defined_by,
-    encode_value,
-    payload_type,
 )
 from schemas.rpc import FinishLiability
 
@@ -46,7 +38,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from contextlib import AsyncExitStack
 
-    from bridges.ros1.node import Ros1Publisher
+    from bridges.ros1._parts import RosBridgeOptions, RosBridgeParts
+    from bridges.ros1.node import Ros1Node, Ros1Publisher, Ros1Subscription
 
 log = logging.getLogger(__name__)
 
@@ -68,8 +61,6 @@ MOST_TOPICS: Final = 512
 """Topics that are recorded at the same time."""
 MOST_WAITING: Final = 10_000
 """Messages of a job that wait to be published."""
-GONE_SECONDS: Final = 30.0
-"""For which the node that started a job may be away: it may be restarted. Then the job fails."""
 
 
 @dataclass(eq=False)
@@ -85,49 +76,21 @@ class _Job:
     is_busy: bool = False
 
 
-def type_in(header: Mapping[str, str]) -> PayloadType:
-    """The type of a publisher's messages, with its definition, by the header of its connection."""
-    definition = header.get("message_definition", "").encode()
-    return PayloadType("ros1", header.get("type", ""), "ros1msg", definition)
-
-
-async def advertise(node: Ros1Node, topic: str, kind: PayloadType) -> Ros1Publisher:
-    """Publish a topic of messages that are encoded already. Raises `InvalidPayload` for a bad definition."""
-    type = Ros1Type(kind.schema_name, kind.schema_data.decode(errors="replace"))
-    return await node.advertise(topic, {type.md5: type}, type.md5)
-
-
 class RosJobs(Lifecycle):
-    """The topics of the agent's jobs, on the node `node`: `async with RosJobs(...)`.
-
-    `also_recorded` are topics elsewhere in the graph that are recorded in every job. With `as_original`, topics are
-    published after a second, whether anybody subscribes or not. `gone_seconds` is `GONE_SECONDS`.
-    """
+    """The topics of the agent's jobs, on the node `node`: `async with RosJobs(...)`."""
 
     title = "jobs on ROS 1"
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        agent: str,
-        node: Ros1Node,
-        *,
-        also_recorded: frozenset[str] = frozenset(),
-        as_original: bool = False,
-        gone_seconds: float = GONE_SECONDS,
-    ) -> None:
-        self._session = session
-        self._agent = agent
+    def __init__(self, parts: RosBridgeParts, options: RosBridgeOptions, node: Ros1Node) -> None:
+        self._session = parts.network.session
+        self._agent = parts.agent
+        self._graph = parts.graph
+        self._options = options
         self._node = node
-        self._graph: Ros1Graph = node.graph
-        self._also = also_recorded
-        self._as_original = as_original
-        self._gone_seconds = gone_seconds
         self._jobs: dict[str, _Job] = {}
         self._subscriptions: dict[str, Ros1Subscription] = {}
-        self._types: dict[tuple[str, str], PayloadType] = {}
+        self._payloads = RosPayloads()
         self._definitions = SentDefinitions()
-        self._converter = RosConverter(0, "jazzy")
         self._looking = asyncio.Lock()
         self._heard_at = 0.0
         self._idle = asyncio.Event()
@@ -185,13 +148,7 @@ class RosJobs(Lifecycle):
         """A played message. Runs on the pump's thread."""
         if sample.kind != zenoh.SampleKind.PUT:
             return None
-        key, kind = str(sample.key_expr), payload_type(str(sample.encoding))
-        if not kind.schema_data and kind.schema_name:
-            found = None if sample.attachment is None else defined_by(sample.attachment.to_bytes(), kind)
-            if found is not None and len(self._types) < MOST_WAITING:
-                self._types[key, kind.schema_name] = found
-            kind = found or self._types.get((key, kind.schema_name), kind)
-        return key, sample.payload.to_bytes(), kind
+        return str(sample.key_expr), sample.payload.to_bytes(), self._payloads.type_of(sample)
 
     async def _queue_all(self, pump: Pump[tuple[str, bytes, PayloadType]]) -> None:
         async for key, payload, kind in pump:
@@ -221,7 +178,7 @@ class RosJobs(Lifecycle):
             job.is_busy = True
             with liability_context(liability):
                 try:
-                    payload, kind = self._for_ros(payload, kind)
+                    payload, kind = self._payloads.for_ros(payload, kind)
                     publisher = job.publishers.get(topic) or await self._advertise(liability, job, topic, kind)
                     publisher.publish(payload)
                     self.published += 1
@@ -233,7 +190,7 @@ class RosJobs(Lifecycle):
     async def _advertise(self, liability: str, job: _Job, topic: str, kind: PayloadType) -> Ros1Publisher:
         """Publish a topic of the job, and wait for its first subscriber, as the original waited a second."""
         publisher = job.publishers[topic] = await advertise(self._node, legacy_topic(liability, topic), kind)
-        if self._as_original:
+        if self._options.as_original:
             await asyncio.sleep(ORIGINAL_SECONDS)
         elif not await publisher.wait_for_subscriber(SUBSCRIBER_SECONDS):
             facts = log_event("ros1-no-subscriber", topic=publisher.topic)
@@ -242,22 +199,6 @@ class RosJobs(Lifecycle):
             )
         await self._listen_to_nodes()
         return publisher
-
-    def _for_ros(self, payload: bytes, kind: PayloadType) -> tuple[bytes, PayloadType]:
-        """A message as one of ROS 1, with its definition. Raises `InvalidPayload`, `PackageMissing`."""
-        if kind.encoding == "ros1":
-            kind = kind if kind.schema_data else self._converter.of(kind).type
-            if not kind.schema_data and kind != EMPTY:
-                raise InvalidPayload(kind.schema_name, "its definition is not known")
-            return payload, kind
-        if kind.encoding == "cdr":
-            conversion = RosConverter(1, "jazzy").of(kind)
-            return conversion.convert(payload), conversion.type
-        value = decode_value(payload, kind)
-        changed, type = encode_value(value)
-        return (
-            (changed, type) if type not in (JSON, RAW) else encode_value(String(payload.decode(errors="replace")).data)
-        )
 
     async def _end(self, job: _Job) -> None:
         if job.player is not None:
@@ -279,7 +220,8 @@ class RosJobs(Lifecycle):
             topics = await self._graph.topics()
             if topics is None:
                 return  # what is connected stays
-            wanted = {topic for topic in topics if topic in self._also or LEGACY_TOPIC.fullmatch(topic)}
+            also = self._options.recording_topics
+            wanted = {topic for topic in topics if topic in also or LEGACY_TOPIC.fullmatch(topic)}
             for topic in self._subscriptions.keys() - wanted:
                 await self._subscriptions.pop(topic).close()
             for topic in sorted(wanted - self._subscriptions.keys()):
@@ -319,11 +261,11 @@ class RosJobs(Lifecycle):
     async def _watch_drivers(self) -> None:
         """Fail the jobs whose node has disappeared."""
         while True:
-            await asyncio.sleep(min(1.0, self._gone_seconds / 4))
+            await asyncio.sleep(min(1.0, self._options.gone_seconds / 4))
             for liability, job in tuple(self._jobs.items()):
                 if not job.driver or await self._is_there(job.driver):
                     job.seen = time.monotonic()
-                elif time.monotonic() - job.seen > self._gone_seconds:
+                elif time.monotonic() - job.seen > self._options.gone_seconds:
                     await self._fail(liability, job)
 
     async def _is_there(self, node: str) -> bool:

@@ -30,9 +30,8 @@ from mesh.telemetry.logs import set_process_source
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from bridges.ros1._parts import RosBridgeParts
     from bridges.ros1.node import Ros1Graph
-    from mesh.content import Exchange, Store
-    from mesh.network import Channel, Network
     from mesh.telemetry.metrics import MetricFamily
     from mesh.telemetry.serving import Telemetry
 
@@ -50,7 +49,22 @@ PARAMETERS: Final = {f"{node}/{name}": name for node, names in _OF_NODES.items()
     "/eth/erc20_token/token_contract": "erc20_token"
 }
 """The parameters of the legacy stack's nodes, and our settings that they are."""
-WITHOUT_MEANING: Final = "/liability/executor/master_check_interval"
+WITHOUT_MEANING: Final = frozenset(
+    {
+        "/liability/executor/ipfs_http_provider",
+        "/liability/executor/master_check_interval",
+        "/liability/infochan/ipfs_channel/ipfs_http_provider",
+        "/liability/infochan/ipfs_common_node/ipfs_file_providers",
+        "/liability/infochan/ipfs_common_node/ipfs_http_provider",
+        "/liability/infochan/ipfs_common_node/ipfs_swarm_connect_to",
+        "/liability/listener/ipfs_http_provider",
+        "/liability/listener/poll_interval",
+        "/liability/persistence/persistence_update_interval",
+        "/liability/player_service/ipfs_http_provider",
+        "/liability/player_service/master_check_interval",
+    }
+)
+"""The parameters of the legacy stack's nodes that nothing here needs; docs/legacy.md says why."""
 PRIVATE: Final = frozenset({"keyfile", "keyfile_password_file", "web3_http_provider", "web3_ws_provider"})
 """Settings that are read from the parameter server and never written to it: paths, and URLs of nodes."""
 OURS: Final = "/liability/executor/aira_parameters"
@@ -126,7 +140,8 @@ def _write_messages(folder: Path, generation: str) -> None:
 
 
 async def _serve(settings: Settings, options: Ros1Options) -> None:
-    from bridges.ros1._bridge import Ros1Bridge, RosBridgeOptions
+    from bridges.ros1._bridge import Ros1Bridge
+    from bridges.ros1._parts import RosBridgeOptions
     from mesh.network.metrics import network_families
     from mesh.telemetry.serving import Telemetry
     from schemas import parse_address
@@ -142,8 +157,9 @@ async def _serve(settings: Settings, options: Ros1Options) -> None:
         graph = await _graph(options, stack)
         settings = await settings_with_parameters(graph, settings)
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen if options.agent else ""))
-        agent, network, channel, store, exchange = await _agent(settings, options, stack, telemetry)
+        parts = await _parts(graph, settings, options, stack, telemetry)
         chosen = RosBridgeOptions(
+            name=options.name,
             recording_topics=frozenset(filter(None, map(str.strip, settings.recording_topics.split(",")))),
             as_original=options.original_timing,
             folders=options.folders or (Path(tempfile.gettempdir()),),
@@ -151,20 +167,14 @@ async def _serve(settings: Settings, options: Ros1Options) -> None:
             is_alone=options.serves_master,
             size_limit=settings.objective_size_limit,
         )
-        directory = settings.state_directory / "bridge" / "ros1"
-        bridge = await stack.enter_async_context(
-            Ros1Bridge(
-                network.session, channel, graph, store, exchange,
-                agent=agent, directory=directory, name=options.name, options=chosen,
-            )
-        )  # fmt: skip
-        set_process_source(LogSource("edge", parse_address(agent)))
+        bridge = await stack.enter_async_context(Ros1Bridge(parts, chosen))
+        set_process_source(LogSource("edge", parse_address(parts.agent)))
 
         async def measure() -> Iterable[MetricFamily]:
-            return (*bridge.families(), *network_families(network))
+            return (*bridge.families(), *network_families(parts.network))
 
         stack.enter_context(telemetry.showing(measure=measure, health=bridge.parts))
-        words = f"bridge of {agent}: the ROS master is {graph.master}"
+        words = f"bridge of {parts.agent}: the ROS master is {graph.master}"
         announce(log, "edge-started", words, device=options.name)
         await bridge.run()
 
@@ -184,14 +194,15 @@ async def _graph(options: Ros1Options, stack: AsyncExitStack) -> Ros1Graph:
     return Ros1Graph(uri, options.ros_ip, drops)
 
 
-async def _agent(
-    settings: Settings, options: Ros1Options, stack: AsyncExitStack, telemetry: Telemetry
-) -> tuple[str, Network, Channel, Store, Exchange]:
-    """The agent that is run here, or what is needed beside one that runs elsewhere."""
-
+async def _parts(
+    graph: Ros1Graph, settings: Settings, options: Ros1Options, stack: AsyncExitStack, telemetry: Telemetry
+) -> RosBridgeParts:
+    """Those of the agent that is run here, or what is needed beside one that runs elsewhere."""
+    from bridges.ros1._parts import RosBridgeParts
     from mesh.content import Exchange
     from mesh.role.composition import open_store, watching
 
+    directory = settings.state_directory / "bridge" / "ros1"
     if options.agent is None:
         from mesh import Agent
 
@@ -200,14 +211,28 @@ async def _agent(
                 "there is no agent", hint="name the address of one (--agent), or a keyfile, whose agent is run here"
             )
         agent = await stack.enter_async_context(Agent(settings=settings))
-        return agent.address, agent.network, agent.channel, agent.parts.store, agent.parts.exchange
+        return RosBridgeParts(
+            agent=agent.address,
+            network=agent.network,
+            channel=agent.channel,
+            graph=graph,
+            store=agent.parts.store,
+            exchange=agent.parts.exchange,
+            directory=directory,
+        )
     network, channel = await open_when_ready(
         stack, settings, lambda: watching(settings), role="bridge", on_wait=telemetry.starting
     )
-    directory = settings.state_directory / "bridge" / "ros1" / "content"
-    store = await open_store(stack, settings, directory, limit=settings.objective_size_limit)
-    exchange = await stack.enter_async_context(Exchange(network.session, store))
-    return options.agent, network, channel, store, exchange
+    store = await open_store(stack, settings, directory / "content", limit=settings.objective_size_limit)
+    return RosBridgeParts(
+        agent=options.agent,
+        network=network,
+        channel=channel,
+        graph=graph,
+        store=store,
+        exchange=await stack.enter_async_context(Exchange(network.session, store)),
+        directory=directory,
+    )
 
 
 async def settings_with_parameters(graph: Ros1Graph, settings: Settings) -> Settings:
@@ -219,26 +244,25 @@ async def settings_with_parameters(graph: Ros1Graph, settings: Settings) -> Sett
 
     found, ours = dict[str, Any](), dict[str, str]()
     try:
-        earlier = await _parameter(graph, OURS)
+        listed = await graph.call("getParamNames")
+        names = {name for name in listed if isinstance(name, str)} if isinstance(listed, list) else set()
+        values = {name: await graph.call("getParam", name) for name in names & {OURS, *PARAMETERS}}
+        earlier = values.get(OURS)
+        earlier = earlier if isinstance(earlier, list) else []
         for name, option in PARAMETERS.items():
-            value, mine = await _parameter(graph, name), str(getattr(settings, option))
-            if isinstance(value, str) and value and value != mine and [name, value] not in (earlier or []):
+            value, mine = values.get(name), str(getattr(settings, option))
+            if isinstance(value, str) and value and value != mine and [name, value] not in earlier:
                 found[option] = value
             elif option not in PRIVATE:
                 ours[name] = mine
                 await graph.call("setParam", name, mine)
         await graph.call("setParam", OURS, [list(each) for each in ours.items()])
-        if await _parameter(graph, WITHOUT_MEANING) is not None:
-            ignored = log_event("option-retired", option=WITHOUT_MEANING)
-            log.info("%s has no meaning here: the master is always asked", WITHOUT_MEANING, extra=ignored)
+        if ignored := ", ".join(sorted(names & WITHOUT_MEANING)):
+            facts = log_event("option-retired", option=ignored)
+            log.info("without meaning here, and not read: %s", ignored, extra=facts)
     except Ros1Error as error:
         graph.outage.failed(error, "the parameters of ROS are not read")
     if found:
         facts = log_event("ros1-parameters", names=", ".join(sorted(found)))
         log.info("the parameter server sets %s", ", ".join(sorted(found)), extra=facts)
     return replace(settings, **found)
-
-
-async def _parameter(graph: Ros1Graph, name: str) -> Any:
-    """A parameter; None if it is not set. Raises `Ros1Error` if the master does not answer."""
-    return await graph.call("getParam", name) if await graph.call("hasParam", name) else None

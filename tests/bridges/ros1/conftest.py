@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -12,6 +13,7 @@ from bridges.ros1._definitions import write_workspace
 from bridges.ros1.master import RosMaster
 from bridges.ros1.node import Ros1Graph
 from mesh.base.flood import Drops
+from tests.bridges.ros1.jobs import Scene, bridged
 from tests.bridges.ros1.peers import Ros, RosMasterServer
 from tests.support.market import founded, place
 from tests.support.peers import require
@@ -19,6 +21,8 @@ from tests.support.peers import require
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
     from contextlib import AbstractAsyncContextManager
+
+    from tests.support.market import Place
 
 
 __all__ = ["founded", "place"]
@@ -59,6 +63,29 @@ def graph() -> Callable[[], AbstractAsyncContextManager[Ros1Graph]]:
         drops = Drops()
         async with RosMaster("127.0.0.1", 0, drops) as master:
             yield Ros1Graph(master.uri, drops=drops)
+
+    return opened
+
+
+@pytest.fixture
+def scene(
+    place: Place,
+    graph: Callable[[], AbstractAsyncContextManager[Ros1Graph]],
+    ros: Callable[[str], Ros],
+    messages: dict[str, Path],
+) -> Callable[..., AbstractAsyncContextManager[Scene]]:
+    """Opens a market with a robot behind the bridge, whose options are given, for a minute and a half at most."""
+
+    @asynccontextmanager
+    async def opened(*, open_services: bool = True, **options: Any) -> AsyncIterator[Scene]:
+        robot = place.agent("robot", open_services=open_services)
+        async with (
+            asyncio.timeout(90),
+            graph() as here,
+            place.at_work(robot) as person,
+            bridged(place, robot, here, **options) as bridge,
+        ):
+            yield Scene(place, robot, person, bridge, here, ros(here.master), messages)
 
     return opened
 

@@ -6,30 +6,45 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from bridges.ros1._bridge import Ros1Bridge, RosBridgeOptions
+from bridges.ros1._bridge import Ros1Bridge
+from bridges.ros1._parts import RosBridgeOptions, RosBridgeParts
 from mesh.base.background import Background
 from mesh.content import Exchange, Store
 from mesh.network import Channel, Endpoints, Network
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Mapping
+    from pathlib import Path
 
     from bridges.ros1.node import Ros1Graph
     from mesh import Agent
+    from tests.bridges.ros1.peers import Ros, Ros1NodeProcess
     from tests.support.market import Place
 
 
 @dataclass
-class Bridged:
-    """The bridge at work, and its graph."""
+class Scene:
+    """A robot's agent and a person's at work, the bridge beside the robot, and its ROS graph."""
 
+    place: Place
+    robot: Agent
+    person: Agent
     bridge: Ros1Bridge
     graph: Ros1Graph
-    network: Network
+    tools: Ros
+    """The programs of ROS on this graph."""
+    messages: Mapping[str, Path]
+
+    @asynccontextmanager
+    async def node(self, *words: str, generation: str = "3") -> AsyncIterator[Ros1NodeProcess]:
+        """A node of rospy (a function in `nodes.py` and its arguments) that is ready."""
+        async with self.tools.node(*words, messages=self.messages[generation]) as node:
+            assert await node.hear() == "ready"
+            yield node
 
 
 @asynccontextmanager
-async def bridged(place: Place, robot: Agent, graph: Ros1Graph, **options: Any) -> AsyncIterator[Bridged]:
+async def bridged(place: Place, robot: Agent, graph: Ros1Graph, **options: Any) -> AsyncIterator[Ros1Bridge]:
     """The bridge beside a running robot."""
     async with (
         Network(Endpoints(connect=(place.endpoint,))) as network,
@@ -39,11 +54,19 @@ async def bridged(place: Place, robot: Agent, graph: Ros1Graph, **options: Any) 
         async with (
             Exchange(network.session, store) as exchange,
             Ros1Bridge(
-                network.session, channel, graph, store, exchange,
-                agent=robot.address, directory=place.folder / "played", options=RosBridgeOptions(**options),
+                RosBridgeParts(
+                    agent=robot.address,
+                    network=network,
+                    channel=channel,
+                    graph=graph,
+                    store=store,
+                    exchange=exchange,
+                    directory=place.folder / "played",
+                ),
+                RosBridgeOptions(**options),
             ) as bridge,
             Background() as tasks,
-        ):  # fmt: skip
+        ):
             tasks.start(bridge.run(), "bridge of the test")
-            yield Bridged(bridge, graph, network)
+            yield bridge
         store.close()

@@ -133,8 +133,39 @@ def blink(argument: str = "Empty", fate: str = "finish") -> None:
     rospy.spin()
 
 
-def sensor(reading: str) -> None:
-    """A sensor that answers free demands with a bag of its reading."""
+def hello(model: str) -> None:
+    """The robot of the first tutorial: it greets whoever demands its model, and does a job of that model for money."""
+    from robonomics_liability.msg import Liability
+    from robonomics_liability.srv import FinishLiability, StartLiability
+    from robonomics_msgs.msg import Demand
+
+    offer_for_demands()
+    start = rospy.ServiceProxy("/liability/start", StartLiability)
+    finish = rospy.ServiceProxy("/liability/finish", FinishLiability)
+
+    def on_demand(demand: Demand) -> None:
+        if text(demand.model) == model:
+            say("Hello AIRA")
+
+    def on_ready(liability: Liability) -> None:
+        below = "/liability/eth_" + text(liability.address)
+        data = rospy.Publisher(below + "/data", String, queue_size=10)
+
+        def on_task(task: String) -> None:
+            data.publish(String("Hello " + task.data))
+            finish(address=liability.address, success=True)
+
+        rospy.Subscriber(below + "/task", String, on_task)
+        start(address=liability.address)
+
+    rospy.Subscriber("/liability/infochan/incoming/demand", Demand, on_demand)
+    rospy.Subscriber("/liability/ready", Liability, on_ready)
+    say("ready")
+    rospy.spin()
+
+
+def sensor() -> None:
+    """A sensor that answers free demands with a bag of what its board has measured."""
     import rosbag
     from ipfs_common.msg import Filepath
     from ipfs_common.srv import IpfsUploadFile
@@ -146,7 +177,7 @@ def sensor(reading: str) -> None:
     def on_demand(demand: Demand) -> None:
         path = tempfile.mktemp(".bag")
         with rosbag.Bag(path, "w") as bag:
-            bag.write("/measurements", String(reading))
+            bag.write("/measurements", rospy.wait_for_message("/measurements", String))
         answer = upload(Filepath(path))
         result = Result(success=True, result=answer.ipfs_address)
         result.liability.address = text(demand.lighthouse)

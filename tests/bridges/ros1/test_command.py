@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import TYPE_CHECKING
 
 import pytest
@@ -61,10 +62,12 @@ async def test_a_job_survives_the_death_of_the_bridge(
 
 
 async def test_parameters_are_settings_and_settings_are_parameters(
-    graph: Callable[[], AbstractAsyncContextManager[Ros1Graph]],
+    graph: Callable[[], AbstractAsyncContextManager[Ros1Graph]], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """What a user has set counts; what an earlier bridge has set does not."""
+    """What a user has set counts; what an earlier bridge has set does not; what means nothing here is named."""
+    caplog.set_level(logging.INFO)
     async with graph() as here:
+        await call_api(here.master, "setParam", "/user", "/liability/executor/master_check_interval", 0.1)
         await call_api(here.master, "setParam", "/user", RECORDING, "/odom, /scan")
         settings = await settings_with_parameters(here, Settings(lighthouse_contract="one.lighthouse.3.robonomics.eth"))
         assert settings.recording_topics == "/odom, /scan"
@@ -73,6 +76,7 @@ async def test_parameters_are_settings_and_settings_are_parameters(
         again = await settings_with_parameters(here, Settings(lighthouse_contract="two.lighthouse.3.robonomics.eth"))
         assert again.lighthouse_contract == "two.lighthouse.3.robonomics.eth"
         assert again.recording_topics == "/odom, /scan"
+        assert "not read: /liability/executor/master_check_interval" in caplog.text
         shown = {name for name, _ in await here.call("getParam", OURS)}
         assert shown == {name for name, option in PARAMETERS.items() if option not in PRIVATE} - {RECORDING}
 

@@ -39,6 +39,10 @@ SUMS = {
     "ethereum_common/AccountBalance": {"0f8190e3a314b4f0b718e5fba37da225"},
     "ethereum_common/Accounts": {"031c4bb89ac5ec75fbacab5f05cfa129"},
     "ethereum_common/TransferFrom": {"bdaad270cecdaddc8d27fbf972359604"},
+    "robonomics_msgs/AddedOrderFeedback": {"44a43b54129dbaca91f41f0d5ebc3c02"},
+    "robonomics_msgs/AddedPendingTransactionFeedback": {"8747c87ede16fb045387d990865a5819"},
+    "robonomics_liability/PersistenceContainsLiability": {"24fc6757df6b230be4e2fb404a6dd2db"},
+    "robonomics_liability/PersistenceLiabilityTimestamp": {"7812029465a9c6e94df201af9a1d9cde"},
 }
 POINT = "float64 x\nfloat64 y\n"
 ALL = """\
@@ -78,6 +82,19 @@ def test_a_message_of_many_kinds_of_fields_survives() -> None:
     }
     zero = {"corners": [{"x": 0.0, "y": 0.0}] * 2, "word": bytes(4)}
     assert kind.decode(kind.encode(values)) == values | zero
+
+
+@pytest.mark.parametrize("name", message_types())
+def test_rosbags_finds_the_same_sums_in_the_definitions(name: str) -> None:
+    """Of every message in every version, by the text that goes to recordings and connections."""
+    pytest.importorskip("rosbags")
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    package, _, short = name.partition("/")
+    for md5, kind in message_types()[name].items():
+        store = get_typestore(Stores.ROS1_NOETIC if "Header" in kind.definition else Stores.EMPTY)
+        store.register(get_types_from_msg(kind.definition, f"{package}/msg/{short}"))
+        assert store.generate_msgdef(f"{package}/msg/{short}", ros_version=1)[1] == md5
 
 
 def test_a_definition_read_again_has_the_same_sum() -> None:
