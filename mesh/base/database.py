@@ -27,13 +27,16 @@ class SyncedDatabase:
     """The database in the file at `path` with the tables of `schema`, between `open` and `close`.
 
     Without a path nothing is kept, and everything counts as written. Use it in one event loop; without `sync`, in any
-    threads that take turns. A write waits up to `patience` seconds for that of another process.
+    threads that take turns. A write waits up to `patience` seconds for that of another process. What another process
+    has written may not be on the disk yet: `sync` before you act on it.
     """
 
     def __init__(self, path: Path | None, schema: str, *, patience: float = WAIT) -> None:
         self.path = path
-        self.written = self.synced = 0
-        """The number of the last write, and of the last one that no power failure takes back."""
+        self.written = self.synced = self.foreign = 0
+        """The number of the last write, of the last one that no power failure takes back, and of the last of another
+        process that was read."""
+        self._version = 0
         self._schema = schema
         self._patience = patience
         self._database: sqlite3.Connection | None = None
@@ -54,6 +57,7 @@ class SyncedDatabase:
         try:
             opened.executescript("PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL;")
             self._prepare(opened)
+            self._version = _version(opened)
             self._sync(self.path)
             sync_directory(self.path.parent)
         except BaseException:
@@ -75,7 +79,13 @@ class SyncedDatabase:
 
     def rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """The rows that a statement returns."""
-        return [] if self._database is None else self._database.execute(statement, values).fetchall()
+        if self._database is None:
+            return []
+        rows = self._database.execute(statement, values).fetchall()
+        if (version := _version(self._database)) != self._version:
+            self._version = version
+            self.foreign = self.written = self.written + 1
+        return rows
 
     def write(self, *statements: tuple[str, Iterable[tuple[object, ...]]]) -> int:
         """Run each statement with each of its rows of values: all of them have an effect or, if one fails, none.
@@ -119,6 +129,11 @@ class SyncedDatabase:
     def _sync(self, path: Path) -> None:
         """What was committed is in SQLite's log, or was synced when it left that."""
         sync_file(path.with_name(f"{path.name}-wal"))
+
+
+def _version(database: sqlite3.Connection) -> int:
+    """A number that changes when another connection has written."""
+    return int(database.execute("PRAGMA data_version").fetchone()[0])
 
 
 def transactions_not_kept(place: Path | None, error: Exception) -> ConfigurationError:

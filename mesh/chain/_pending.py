@@ -258,13 +258,16 @@ class PendingTransactions:
         if head is not None and transactions is not None:
             self._counted = _Count(head.number, head.hash, transactions)
 
-    def refresh(self) -> None:
+    async def refresh(self) -> None:
         """See what other processes did to the store."""
         if self._store is None:
             return
         left, self._elsewhere = self._store.read()
-        ours = {nonce: entry for nonce, entry in self._entries.items() if entry.is_watched or entry.is_reserved}
-        self._entries = {nonce: PendingTransaction.of_json(nonce, sent) for nonce, sent in left.items()} | ours
+        ours = [entry for entry in self._entries.values() if entry.is_watched or entry.is_reserved]
+        if left:
+            await self._store.sync()  # before it is sent again: whoever left it may have been killed before its sync
+        kept = {entry.nonce: entry for entry in ours if self._entries.get(entry.nonce) is entry}
+        self._entries = {nonce: PendingTransaction.of_json(nonce, sent) for nonce, sent in left.items()} | kept
 
     @property
     def taken(self) -> Collection[int]:

@@ -336,7 +336,7 @@ class TransactionSender:
     async def last_nonce(self) -> int:
         """The highest nonce that a transaction of the account may have; -1 if it has sent none."""
         async with self._pending.lock:
-            self._pending.refresh()
+            await self._pending.refresh()
         counted = await self.node.transaction_count(self.account.address, block="pending")
         return max((counted - 1, *self._pending.taken, *(entry.nonce for entry in self._pending.abandoned)))
 
@@ -408,7 +408,7 @@ class TransactionSender:
 
     async def _next_nonce(self, refused: set[int]) -> int:
         """The first nonce that no transaction has, neither of those that the node knows nor of those we sent."""
-        self._pending.refresh()
+        await self._pending.refresh()
         counted = self._pending.counted(self.node.heads.latest)
         if counted is None or self._pending.abandoned:
             counted = await self.node.transaction_count(self.account.address, block="pending")
@@ -424,7 +424,7 @@ class TransactionSender:
     async def _sent_before(self, fields: dict[str, Any]) -> PendingTransaction | None:
         """The same transaction, sent before and waited for by nobody, if it is mined or can be."""
         async with self._pending.lock:
-            self._pending.refresh()
+            await self._pending.refresh()
             if not self._pending.abandoned:
                 return None
             mined = await self.node.transaction_count(self.account.address)
@@ -530,7 +530,7 @@ class TransactionSender:
         signed = self.account.sign_transaction({**fields, "nonce": nonce})
         filler = PendingTransaction(nonce=nonce, fields=fields, versions=[signed])
         async with self._pending.lock:
-            self._pending.refresh()
+            await self._pending.refresh()
             if nonce in self._pending.taken or not await self._pending.add(filler):
                 return False
             try:

@@ -94,9 +94,10 @@ class Database:
     async def rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """The rows that a statement returns: nothing that a power loss might still take back, and should not."""
         async with self._usable() as file:
-            if file.synced < self._needed:
+            rows = file.rows(statement, values)
+            if file.synced < max(self._needed, file.foreign):
                 await file.sync()
-            return file.rows(statement, values)
+            return rows
 
     @asynccontextmanager
     async def _usable(self) -> AsyncIterator[SyncedDatabase]:

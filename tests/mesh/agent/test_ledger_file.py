@@ -19,14 +19,14 @@ from mesh.errors import ClosedError, ConfigurationError
 from mesh.role.database import VERSION, Database, LedgerUnusable
 from tests.mesh.agent.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.agent.samples import liability, message
-from tests.support.disks import file_size_limit
+from tests.support.disks import file_size_limit, synced
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
     from pathlib import Path
 
-__all__ = ["ledger", "path"]
+__all__ = ["ledger", "path", "synced"]
 
 
 async def test_everything_survives_reopening(path: Path) -> None:
@@ -38,6 +38,19 @@ async def test_everything_survives_reopening(path: Path) -> None:
         assert [job.result for job in await ledger.jobs()] == [RESULT]
         assert await ledger.outbox(head=0) == [message()]
         assert (await ledger.cursor())[0] == 42
+
+
+async def test_what_another_program_wrote_is_on_the_disk_before_it_is_read(path: Path, synced: list[str]) -> None:
+    """Otherwise a power failure could take back an order that both programs have sent."""
+    async with Ledger(path) as one, Ledger(path) as other:
+        assert not await one.jobs()
+        synced.clear()
+        await one.add_job(liability())
+        assert await one.jobs()
+        assert synced == []
+        assert await other.jobs()
+        assert await other.jobs()
+        assert synced == ["ledger.sqlite-wal"]
 
 
 WRITER = """

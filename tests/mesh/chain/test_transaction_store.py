@@ -14,12 +14,14 @@ import pytest
 from mesh.chain._accounts import SignedTransaction
 from mesh.chain._pending import FILE, PendingTransaction, PendingTransactions, TransactionStore
 from mesh.errors import ConfigurationError
-from tests.support.disks import file_size_limit
+from tests.support.disks import file_size_limit, synced
 from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+__all__ = ["synced"]
 
 
 @pytest.fixture
@@ -162,7 +164,7 @@ async def test_a_full_disk_stops_nobody_who_stops_waiting(one: TransactionStore,
     with file_size_limit(1):
         pending.abandon(entry)
         pending.forget(settled)
-    pending.refresh()
+    await pending.refresh()
     assert pending.abandoned == (entry,)
     assert await pending.take_over(entry)
     pending.abandon(entry)
@@ -171,6 +173,20 @@ async def test_a_full_disk_stops_nobody_who_stops_waiting(one: TransactionStore,
     assert await pending.add(later)
     pending.forget(later)
     assert other.read()[1] == frozenset()
+
+
+async def test_what_another_process_left_behind_is_on_the_disk_before_it_is_sent_again(
+    one: TransactionStore, other: TransactionStore, synced: list[str]
+) -> None:
+    pending = PendingTransactions(other)
+    await pending.refresh()
+    assert one.add(7, _entry(7).as_json)
+    one.release(7)
+    assert synced == []
+    await pending.refresh()
+    assert [entry.nonce for entry in pending.abandoned] == [7]
+    await pending.refresh()
+    assert synced == [f"{FILE}-wal"]
 
 
 def test_what_could_not_be_removed_does_not_block_its_nonce(one: TransactionStore, other: TransactionStore) -> None:
