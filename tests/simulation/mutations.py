@@ -168,8 +168,8 @@ MUTATIONS: Final = (
     Mutation(
         "the recording of a job is not kept",
         "mesh.agent.jobs:Executor.finish",
-        "cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)",
-        'cid = __import__("schemas").cid_of_file(summary.path)',
+        "await asyncio.to_thread(self._store.put_file, summary.path, pin=address)",
+        '__import__("schemas").cid_of_file(summary.path)',
         "late",
     ),
     Mutation(
