@@ -40,9 +40,13 @@ class Unit:
         """As `show`, without the symbol."""
         if amount >= UNLIMITED:
             return "unlimited"
+        whole, point, digits = self.decimal(amount).partition(".")
+        return f"{int(whole):,}{point}{digits}"
+
+    def decimal(self, amount: int) -> str:
+        """An amount of the smallest unit for programs, with all its digits and nothing else: `1000.5`."""
         whole, part = divmod(amount, 10**self.decimals)
-        digits = f".{part:0{self.decimals}}".rstrip("0") if part else ""
-        return f"{whole:,}{digits}"
+        return f"{whole}" + (f".{part:0{self.decimals}}".rstrip("0") if part else "")
 
     def parse(self, text: str) -> int:
         """Parse an amount into the smallest unit. Raises `InvalidAmount`."""

@@ -7,7 +7,7 @@ numbers beyond 2^53. In Python it is an `int`.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
 
 import msgspec
 from msgspec.structs import force_setattr
@@ -82,6 +82,15 @@ class Liability(Record, frozen=True, kw_only=True, rename="camel"):
     validator_fee: UInt256
     is_success: bool
     is_finalized: bool
+
+    @property
+    def state(self) -> Literal["open", "paid", "failed", "called-off"]:
+        """What has become of it; `called-off` if it ended without a result."""
+        if not self.is_finalized:
+            return "open"
+        if self.is_success:
+            return "paid"
+        return "failed" if self.result else "called-off"
 
 
 class PlaybackPosition(Record, frozen=True, kw_only=True):

@@ -38,6 +38,7 @@ from mesh.agent.handlers import (
     repeat,
 )
 from mesh.agent.orders import HANDLED_FOR, OrderState
+from mesh.agent.statement import period, read_statement
 from mesh.agent.validators import ValidatorSilent, check_named
 from mesh.amounts import XRT
 from mesh.base.log_context import log_event
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     from mesh.agent.contracts import Contract, OnProgress
     from mesh.agent.handlers import Job, TopicHandlers
     from mesh.agent.orders import Terms
+    from mesh.agent.statement import Statement
     from mesh.agent.trade import Order
     from mesh.agent.validators import AnnouncedValidator
     from mesh.base.retry import RetryPolicy
@@ -518,6 +520,14 @@ class Agent(Program):
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, of any account; `outcome` waits for its end. Raises `NotALiability`."""
         return await self.runtime.trader.contracts.read(address)
+
+    async def statement(self, first: str = "", last: str = "") -> Statement:
+        """What the account has earned and spent, from a day or month to another one: `"2026-11-30"`, `"2026-11"`.
+
+        Both are included, and in UTC; empty ones are open. Raises `InputError` and the errors of the chain.
+        """
+        since, until = period(first, last)
+        return await read_statement(self.chain, self.address, since=since, until=until)
 
     async def finish(self, address: str, *, success: bool) -> str:
         """End the job of the liability at `address` now; returns the recording's CID. Raises `WrongPhase`."""

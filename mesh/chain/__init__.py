@@ -57,5 +57,5 @@ with needs_extra("chain", "the chain"):
         Reorganisation,
         Transfer,
     )
-    from mesh.chain.liabilities import Created, RefundState, Settled
+    from mesh.chain.liabilities import Created, Dated, GasPaid, Mined, RefundState, Settled
     from mesh.chain.transactions import TransactionSender

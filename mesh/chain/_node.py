@@ -468,6 +468,18 @@ class Node:
         )  # not null: another machine, or another node, may have it
         return header.hash
 
+    async def first_block_since(self, time: int) -> int:
+        """The number of the first block whose timestamp is `time` (Unix) or later; one after the latest if none is."""
+        head = await self.heads.look()
+        first, end = 0, head.number + 1
+        while first < end:
+            middle = (first + end) // 2
+            header = await self.header(middle)
+            if header is None:
+                raise NodeUnreachable(self.endpoint, f"it lacks block {middle}")
+            first, end = (middle + 1, end) if header.timestamp < time else (first, middle)
+        return first
+
     async def logs(
         self, first: int, last: int, *, addresses: Collection[str], topics: Sequence[str], about: str = ""
     ) -> list[Log]:

@@ -188,7 +188,7 @@ class Log(_Answer, frozen=True):
 
 
 class MinedTransaction(_Answer, frozen=True):
-    """The receipt of a transaction. `status` is 1 if it succeeded.
+    """The receipt of a transaction. `status` is 1 if it succeeded, `sender` is who paid its gas.
 
     Some nodes don't say at which price: then `effective_gas_price` is None.
     """
@@ -199,6 +199,7 @@ class MinedTransaction(_Answer, frozen=True):
     status: Count
     logs: Annotated[list[Log], Meta(max_length=MAX_LOGS)]
     effective_gas_price: Quantity | None = None
+    sender: Address | None = msgspec.field(default=None, name="from")
 
 
 class BlockReceipt(_Answer, frozen=True):

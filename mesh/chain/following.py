@@ -261,7 +261,7 @@ ReadRange: TypeAlias = "Callable[[int, int, BlockHeader | None], Awaitable[list[
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventSources:
-    """The contracts whose events are read: the factory, a token, and the factory's liabilities.
+    """The contracts whose events are read: the factory, a token (empty: none), and the factory's liabilities.
 
     The token's transfers and approvals are those that concern `parties` (addresses), or all.
     """
@@ -277,7 +277,7 @@ class EventSources:
     def logs_in(self, header: BlockHeader | None) -> bool:
         """Whether a block may hold a log of the named contracts; with None, it is not known."""
         wanted = [(address_bytes(self.factory), topic) for topic in _topics("Factory")]
-        of_token = [(address_bytes(self.token), topic) for topic in _topics("XRT")]
+        of_token = [(address_bytes(self.token), topic) for topic in _topics("XRT")] if self.token else []
         if self.parties is None:
             return header is None or header.may_log(*wanted, *of_token)
         parties = [bytes(12) + address_bytes(party) for party in self.parties]
@@ -374,7 +374,7 @@ async def read_events(
     """
     logs: list[Log] = []
     if sources.logs_in(header):
-        contracts = [sources.factory, sources.token]
+        contracts = [one for one in (sources.factory, sources.token) if one]
         logs = await _logs(node, first, last, header, contracts, topics_of("Factory", "XRT"))
     decoded = [(log, decode_log(log)) for log in logs]
     for log, event in decoded:
@@ -414,18 +414,30 @@ async def read_created(node: Node, factory: str, first: int, last: int, header: 
 
 async def list_created(node: Node, factory: str, from_block: int) -> list[NewLiability | NewLighthouse]:
     """What the factory created from a block to the latest one. Raises `NodeUnreachable`, `RequestRefused`."""
+    blocks = await list_blocks(node, partial(read_created, node, factory), from_block)
+    events = [event for block in blocks for event in block.events]
+    return [event for event in events if isinstance(event, NewLiability | NewLighthouse)]
+
+
+async def list_blocks(node: Node, read: ReadRange, from_block: int, to_block: int | None = None) -> list[SeenBlock]:
+    """The blocks that `read` finds events in, from one block to another (by default the latest), in order.
+
+    Raises `NodeUnreachable`, `RequestRefused`.
+    """
     for _ in range(LIST_ATTEMPTS):
-        ranges = RangeReader(node, partial(read_created, node, factory))
-        head = await node.heads.look()
+        ranges = RangeReader(node, read)
+        head = await node.heads.look() if to_block is None else await node.header(to_block)
+        if head is None:
+            raise NodeUnreachable(node.endpoint, f"it lacks block {to_block}")
         try:
             async with aclosing(ranges.read_to(from_block, head)) as blocks:
-                events = [event async for block in blocks for event in block.events]
+                found = [block async for block in blocks if block.events]
             if await node.block_hash(head.number) != head.hash:
                 raise ReplacedWhileReading
         except ReplacedWhileReading:
             await asyncio.sleep(node.timing.poll_interval)
         else:
-            return [event for event in events if isinstance(event, NewLiability | NewLighthouse)]
+            return found
     raise NodeUnreachable(node.endpoint, "its blocks are replaced whenever they are read")
 
 

@@ -8,17 +8,31 @@ from functools import partial
 from itertools import compress
 from typing import TYPE_CHECKING, Final
 
+from msgspec.structs import replace
+
 from mesh.chain._contracts import result_arguments
 from mesh.chain._node import getters
 from mesh.chain.answers import LIABILITY_GETTERS, liability_record
-from mesh.chain.errors import NoContracts, NotALiability, OrderAlreadyUsed, Reverted
-from mesh.chain.following import NewLiability, first_event, list_created, retrying, xrt_minted
+from mesh.chain.errors import NoContracts, NodeUnreachable, NotALiability, OrderAlreadyUsed, Reverted
+from mesh.chain.following import (
+    MAX_RANGE,
+    EventSources,
+    Finalized,
+    NewLiability,
+    first_event,
+    list_blocks,
+    list_created,
+    read_created,
+    read_events,
+    retrying,
+    xrt_minted,
+)
 from mesh.errors import InvalidMessage
 from schemas.messages import cancellation_hash, message_hash, order_abi
 from schemas.signing import recover
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from mesh.chain._abi import ContractCall
     from mesh.chain._contracts import Contracts
@@ -29,6 +43,8 @@ if TYPE_CHECKING:
 
 READ_AT_ONCE: Final = 60
 """How many records a listing reads at a time, in ten calls."""
+ASKED_AT_ONCE: Final = 32
+"""How many blocks or receipts are asked for at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +69,32 @@ class Settled:
     gas_used: int
     wei: int
     minted: int
+
+
+@dataclass(frozen=True, slots=True)
+class Mined:
+    """A transaction that created or ended a liability: its block, and that block's Unix time."""
+
+    tx: str
+    block_number: int
+    time: int
+
+
+@dataclass(frozen=True, slots=True)
+class Dated:
+    """A liability, and when it was created and ended (None: it is open)."""
+
+    liability: Liability
+    created: Mined
+    ended: Mined | None
+
+
+@dataclass(frozen=True, slots=True)
+class GasPaid:
+    """What the gas of a transaction cost, wei (None: the node does not say the price), and the account that paid it."""
+
+    wei: int | None
+    payer: str | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,12 +172,88 @@ class Liabilities:
             filters["lighthouse"] = await self._names.lighthouse(lighthouse)
         events = await list_created(self._node, self._contracts.factory, from_block)
         made = [event.liability for event in events if isinstance(event, NewLiability)]
-        for address in made:
+        found = await self._records(made)
+        return [one for one in found if all(getattr(one, name) == whose for name, whose in filters.items())]
+
+    async def history(self, *, from_block: int = 0, party: str = "") -> Sequence[Dated]:
+        """The liabilities that were created or have ended since a block, with the times of both, by their creation.
+
+        Only those of which `party` (an address) is promisee or promisor, if given.
+        """
+        sources = EventSources(factory=self._contracts.factory, token="", version=self._version)
+        made: dict[str, tuple[str, int]] = {}
+        ended: dict[str, tuple[str, int]] = {}
+        for block in await list_blocks(self._node, partial(read_events, self._node, sources), from_block):
+            for event in block.events:
+                if isinstance(event, NewLiability):
+                    made[event.liability] = event.tx, block.block_number
+                elif isinstance(event, Finalized):
+                    ended[event.liability] = event.tx, block.block_number
+        records = [one for one in await self._records([*made, *(set(ended) - set(made))]) if _concerns(one, party)]
+        missing = {one.address for one in records} - set(made)
+        made |= await self._created_before(from_block, missing)
+        blocks = {step[1] for one in records for step in (made[one.address], ended.get(one.address)) if step}
+        times = await self._times(sorted(blocks))
+
+        def mined(step: tuple[str, int]) -> Mined:
+            return Mined(*step, times[step[1]])
+
+        dated = []
+        for one in records:
+            end = ended.get(one.address)
+            # A contract may have ended after the events were read.
+            record = one if end else replace(one, is_finalized=False, is_success=False, result="")
+            dated.append(Dated(record, mined(made[one.address]), mined(end) if end else None))
+        return sorted(dated, key=lambda one: one.created.block_number)
+
+    async def gas_of(self, transactions: Iterable[str]) -> dict[str, GasPaid]:
+        """What each of some mined transactions paid for gas."""
+        found = {}
+        wanted = list(dict.fromkeys(transactions))
+        for start in range(0, len(wanted), ASKED_AT_ONCE):
+            some = wanted[start : start + ASKED_AT_ONCE]
+            for tx, receipt in zip(some, await asyncio.gather(*map(self._node.receipt, some)), strict=True):
+                price = None if receipt is None else receipt.effective_gas_price
+                wei = None if receipt is None or price is None else receipt.gas_used * price
+                found[tx] = GasPaid(wei, None if receipt is None else receipt.sender)
+        return found
+
+    async def _created_before(self, block: int, wanted: set[str]) -> dict[str, tuple[str, int]]:
+        """The transaction and the block of each of these liabilities, which were created before a block.
+
+        They are looked for backwards, in longer and longer ranges: most are a short while old when they end.
+        """
+        found: dict[str, tuple[str, int]] = {}
+        read, span = partial(read_created, self._node, self._contracts.factory), MAX_RANGE
+        while block > 0 and len(found) < len(wanted):
+            first = max(0, block - span)
+            for seen in await list_blocks(self._node, read, first, block - 1):
+                for event in seen.events:
+                    if isinstance(event, NewLiability) and event.liability in wanted:
+                        found[event.liability] = event.tx, seen.block_number
+            block, span = first, 2 * span
+        if len(found) < len(wanted):
+            raise NodeUnreachable(self._node.endpoint, "it lacks the events of contracts that it has")
+        return found
+
+    async def _times(self, numbers: Sequence[int]) -> dict[int, int]:
+        """The Unix times of some blocks."""
+        times: dict[int, int] = {}
+        for start in range(0, len(numbers), ASKED_AT_ONCE):
+            for header in await asyncio.gather(*map(self._node.header, numbers[start : start + ASKED_AT_ONCE])):
+                if header is not None:
+                    times[header.number] = header.timestamp
+        if len(times) < len(numbers):
+            raise NodeUnreachable(self._node.endpoint, "it lacks blocks whose events it has")
+        return times
+
+    async def _records(self, addresses: Sequence[str]) -> Sequence[Liability]:
+        """The records of liabilities that the factory's events name, without those that were reverted since."""
+        for address in addresses:
             self._version.recognise(address)
-        found: list[Liability] = []
-        for start in range(0, len(made), READ_AT_ONCE):
-            records = [record for record, _ in await self._read_existing(made[start : start + READ_AT_ONCE])]
-            found += [one for one in records if all(getattr(one, name) == whose for name, whose in filters.items())]
+        found = []
+        for start in range(0, len(addresses), READ_AT_ONCE):
+            found += [record for record, _ in await self._read_existing(addresses[start : start + READ_AT_ONCE])]
         return found
 
     async def _read_existing(self, addresses: Sequence[str]) -> Sequence[tuple[Liability, tuple[bytes, bytes]]]:
@@ -310,6 +428,10 @@ class Liabilities:
     async def _is_finalized(self, address: str, block: int) -> bool:
         functions = self._node.contract("Liability", address)
         return bool(await self._node.read(functions.isFinalized(), block=block))
+
+
+def _concerns(liability: Liability, party: str) -> bool:
+    return not party or party in (liability.promisee, liability.promisor)
 
 
 def cost_receiver(liability: Liability) -> str:

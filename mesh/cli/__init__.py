@@ -32,6 +32,7 @@ COMMANDS: Final = {
     "rpc": ("mesh.cli.rpc:command", "call a service of an agent"),
     "settings": ("mesh.cli.settings:command", "show the effective settings"),
     "state": ("mesh.cli.state:command", "show, back up and restore the state of agents"),
+    "statement": ("mesh.cli.statement:statement", "show what an account has earned and spent, by contract and month"),
     "status": ("mesh.cli.status:status", "show the status of agents, providers and bridges"),
     "up": ("mesh.cli.up:command", "run a router, a chain and a provider for development"),
     "validator": ("mesh.cli.validator:command", "judge results before they are paid; deploy a validator contract"),

@@ -118,14 +118,20 @@ async def units_of(chain: Chain, paid: Iterable[Liability | Order]) -> dict[str,
     return {token: await _unit_of(chain, token) for token in {one.token for one in paid}}
 
 
-async def _unit_of(chain: Chain, token: str) -> Unit:
-    if token == chain.xrt:
-        return await chain.tokens.unit()
+async def token_unit(chain: Chain, token: str) -> Unit:
+    """The unit of a token as it says itself; without a symbol and decimals if it does not say it."""
     try:
-        unit = await chain.tokens.unit(token)
+        return await chain.tokens.unit(None if token == chain.xrt else token)
     except ChainError:
-        return Unit(f"units of {short_address(token)}", 0)
-    return Unit(f"{unit.symbol} ({short_address(token)})", unit.decimals)
+        return Unit("", 0)
+
+
+async def _unit_of(chain: Chain, token: str) -> Unit:
+    unit = await token_unit(chain, token)
+    if token == chain.xrt:
+        return unit
+    short = short_address(token)
+    return Unit(f"{unit.symbol} ({short})" if unit.symbol else f"units of {short}", unit.decimals)
 
 
 async def check_balance(chain: Chain, unit: Unit, needed: int, *, token: str | None = None) -> None:

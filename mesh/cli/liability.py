@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from contextlib import aclosing
 from dataclasses import replace
 from functools import partial
@@ -28,6 +29,8 @@ from mesh.cli.options import (
     with_signing_settings,
 )
 from mesh.cli.output import (
+    format_time,
+    iso_time,
     plural,
     print_facts,
     print_json,
@@ -47,7 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from mesh.agent.jobs import Reason
-    from mesh.chain import BlockEvents, Chain, RefundState, Settled
+    from mesh.chain import BlockEvents, Chain, Dated, Mined, RefundState, Settled
     from mesh.chain.transactions import Receipt
     from mesh.settings import Settings
     from schemas.records import Liability
@@ -84,39 +87,51 @@ command = LazyGroup(
 async def list_liabilities(
     settings: Settings, *, account: str | None, all_accounts: bool, state: str, from_block: int, as_json: bool
 ) -> None:
-    """List the liabilities of an account: first those in which it is the promisee, then those in which it is the
-    promisor, each oldest first. Without an account in the settings, list all.
+    """List the liabilities of an account with the times of their creation and their end (UTC), oldest first, and the
+    sums of their costs. Without an account in the settings, list all. `aira statement` has fees and gas.
 
     Reading a long chain takes time; --from-block makes it faster.
     """
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
         is_any = all_accounts or (account is None and own is None)
-        whose = None if is_any else await account_of(chain, settings, account)
-        found = await _liabilities_of(chain, whose, from_block)
-        if state != "any":
-            found = [liability for liability in found if liability.is_finalized == (state == "finalized")]
+        whose = "" if is_any else await account_of(chain, settings, account)
+        found = [
+            dated
+            for dated in await chain.liabilities.history(from_block=from_block, party=whose)
+            if dated.created.block_number >= from_block
+            and (state == "any" or dated.liability.is_finalized == (state == "finalized"))
+        ]
         if as_json:
-            print_json([liability_json(liability) for liability in found])
+            print_json([dated_json(dated) for dated in found])
             return
-        units = await units_of(chain, found)
+        units = await units_of(chain, [dated.liability for dated in found])
     if not found:
         print_line(f"no {'' if state == 'any' else state + ' '}liabilities" + (f" of {whose}" if whose else ""))
         return
     rows = []
-    for one in found:
+    costs: Counter[tuple[str, str]] = Counter()
+    for dated in found:
+        one = dated.liability
         parties = short_address(one.promisee, own=own), short_address(one.promisor, own=own)
-        rows.append((one.address, state_of(one), units[one.token].show(one.cost), *parties))
-    print_table(("LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR"), rows, numbers=("COST",))
+        times = format_time(dated.created.time), format_time(dated.ended.time) if dated.ended else "-"
+        rows.append((*times, one.address, one.state, units[one.token].show(one.cost), *parties))
+        costs[one.state, one.token] += one.cost
+    print_table(("CREATED", "ENDED", "LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR"), rows, numbers=("COST",))
+    for (word, token), cost in sorted(costs.items()):
+        number = sum(dated.liability.state == word and dated.liability.token == token for dated in found)
+        print_line(f"{plural(number, 'contract')} {word}: {units[token].show(cost)}")
 
 
-async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> Sequence[Liability]:
-    """All liabilities, or those in which an account is promisee or promisor."""
-    if whose is None:
-        return await chain.liabilities.list(from_block=from_block)
-    paid = await chain.liabilities.list(from_block=from_block, promisee=whose)
-    worked = await chain.liabilities.list(from_block=from_block, promisor=whose)
-    return list({liability.address: liability for liability in (*paid, *worked)}.values())
+def dated_json(dated: Dated) -> dict[str, Any]:
+    """A liability for JSON, with the transactions that created and ended it."""
+    return liability_json(dated.liability) | {"created": _mined_json(dated.created), "ended": _mined_json(dated.ended)}
+
+
+def _mined_json(mined: Mined | None) -> dict[str, Any] | None:
+    if mined is None:
+        return None
+    return {"time": iso_time(mined.time), "block": mined.block_number, "tx": mined.tx}
 
 
 @command.command("show", short_help="show the parties, terms, cost and state of one")
@@ -143,7 +158,7 @@ async def print_liability(
     refund = await refund_state(chain, liability)
     owed = await chain.liabilities.owed_after(liability)
     reports = await reports_on(settings, chain, liability)
-    failure = await _failure(settings, liability.result, reports or ()) if state_of(liability) == "failed" else None
+    failure = await _failure(settings, liability.result, reports or ()) if liability.state == "failed" else None
     if as_json:
         facts = liability_json(liability) | {"refundableFrom": None if refund is None else refund.refundable_from}
         facts |= {"owed": str(owed)} if owed else {}
@@ -214,19 +229,10 @@ OUTCOMES: Final[Mapping[str, str]] = {
 """The states of a liability, and what they mean."""
 
 
-def state_of(liability: Liability) -> str:
-    """One of `OUTCOMES`."""
-    if not liability.is_finalized:
-        return "open"
-    if liability.is_success:
-        return "paid"
-    return "failed" if liability.result else "called-off"
-
-
 def liability_json(liability: Liability) -> dict[str, Any]:
     """A liability for JSON: its record as it is on the wire, and its state."""
     record: dict[str, Any] = decode_json(liability.encode())
-    return record | {"state": state_of(liability)}
+    return record | {"state": liability.state}
 
 
 def describe_liability(
@@ -237,7 +243,7 @@ def describe_liability(
     fee = XRT.show(liability.validator_fee)
     return {
         "liability": liability.address,
-        "state": OUTCOMES[state_of(liability)],
+        "state": OUTCOMES[liability.state],
         "promisee": f"{liability.promisee}{'  (you)' if liability.promisee == own else ''}",
         "promisor": f"{liability.promisor}{'  (you)' if liability.promisor == own else ''}",
         "cost": unit.show(liability.cost),
@@ -272,7 +278,7 @@ async def cancel(settings: Settings, address: str, signatures: tuple[str, ...], 
     async with open_signing_chain(settings) as chain:
         liability = await chain.liabilities.get(address)
         if liability.is_finalized:
-            ended = f"{liability.address} has already ended: {OUTCOMES[state_of(liability)]}"
+            ended = f"{liability.address} has already ended: {OUTCOMES[liability.state]}"
             raise ChainError(ended, code="liability-ended")
         if refund:
             await _print_end(chain, await _refunded(chain, liability), liability, as_json)
@@ -364,7 +370,7 @@ async def _print_end(chain: Chain, settled: Settled, before: Liability, as_json:
     owed = await chain.liabilities.owed_after(liability)
     unit = (await units_of(chain, [liability]))[liability.token]
     paid = {"paid back": f"{unit.show(liability.cost)}  to {liability.promisee}"}
-    facts = {"liability": liability.address, "state": OUTCOMES[state_of(liability)]}
+    facts = {"liability": liability.address, "state": OUTCOMES[liability.state]}
     facts |= {"owed": owed_words(liability, unit, owed)} if owed else paid
     result = liability_json(liability) | {"tx": settled.tx, "gasUsed": settled.gas_used}
     result |= {"owed": str(owed)} if owed else {}
@@ -507,7 +513,7 @@ async def _liability_events(chain: Chain, block: BlockEvents, own: str | None) -
             continue
         is_new, number = isinstance(event, NewLiability), block.block_number
         facts = {"event": "made" if is_new else "ended", "blockNumber": number, "tx": event.tx}
-        word = "created" if is_new else state_of(liability)
+        word = "created" if is_new else liability.state
         parties = f"{short_address(liability.promisor, own=own)} for {short_address(liability.promisee, own=own)}"
         cost = (await units_of(chain, [liability]))[liability.token].show(liability.cost)
         line = f"block {number:,}  {liability.address}  {word:<10}  {parties}, {cost}"

@@ -156,6 +156,16 @@ def format_duration(nanoseconds: int) -> str:
     return f"{hours}:{minutes:02}:{rest:02}"
 
 
+def format_time(seconds: float) -> str:
+    """A Unix time in UTC, as people and spreadsheets read it: `2026-11-28 01:03:23`."""
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(seconds))
+
+
+def iso_time(seconds: float) -> str:
+    """A Unix time in UTC for JSON: `2026-11-28T01:03:23Z`."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds))
+
+
 def announce(log: Logger, event: str, text: str, **fields: object) -> None:
     """Print `text`, which says that a server has started, and log it as `event` at every log level.
 

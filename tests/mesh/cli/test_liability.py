@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import pytest
@@ -90,11 +91,28 @@ def test_the_list_has_the_accounts_liabilities_and_can_be_filtered(served: Serve
     assert listed("--all", by="stranger") == [ended, opened]
     assert listed("--account", served.people["robot"].address, by="stranger") == [ended, opened]
     said = served.aira("liability", "list", "--from-block", str(start), by="robot").stdout
-    head, first, second = (line.split() for line in said.splitlines())
-    assert head == ["LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR"]
+    head, first, second, *sums = (line.split() for line in said.splitlines())
+    assert head == ["CREATED", "ENDED", "LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR"]
     person = served.people["person"].address
-    assert first == [ended, "paid", "1.5", "XRT", f"{person[:6]}…{person[-4:]}", "you"]
-    assert second[:4] == [opened, "open", "0", "XRT"]
+    assert first[4:] == [ended, "paid", "1.5", "XRT", f"{person[:6]}…{person[-4:]}", "you"]
+    assert second[2:7] == ["-", opened, "open", "0", "XRT"]
+    assert [" ".join(line) for line in sums] == ["1 contract open: 0 XRT", "1 contract paid: 1.5 XRT"]
+
+
+def test_the_list_says_when_contracts_were_created_and_ended(served: ServedChain) -> None:
+    start = served.ask("person", lambda chain: chain.block_number()) + 1
+    address = served.create_liability(cost=COST)
+    opened = served.run_json("liability", "list", "--from-block", str(start))[0]
+    served.finalize(address)
+    ended = served.run_json("liability", "list", "--from-block", str(start))[0]
+    assert (opened["created"], opened["ended"]) == (ended["created"], None)
+    for step, number in ((ended["created"], start), (ended["ended"], start + 1)):
+        header = served.ask("person", lambda chain, number=number: chain.node.header(number))
+        assert step["block"] == number
+        assert datetime.fromisoformat(step["time"]).timestamp() == header.timestamp
+        assert bytes.fromhex(step["tx"][2:]) in header.transactions
+    said = served.aira("liability", "list", "--from-block", str(start)).stdout.splitlines()[1]
+    assert said.startswith(ended["created"]["time"].replace("T", " ").replace("Z", "  "))
 
 
 def test_without_an_account_all_liabilities_are_listed(served: ServedChain) -> None:
