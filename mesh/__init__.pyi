@@ -48,6 +48,7 @@ from mesh.settings import Settings as Settings
 from mesh.validator.policies import Evidence as Evidence
 from mesh.validator.validator import Validator as Validator
 from mesh.validator.verification import Finding as Finding
+from mesh.watching.robots import Robot as Robot
 from schemas import (
     STRING as STRING,
     ZERO_ADDRESS as ZERO_ADDRESS,

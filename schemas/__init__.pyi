@@ -33,6 +33,7 @@ from schemas.keys import (
     OfferKey as OfferKey,
     PendingKey as PendingKey,
     PresenceKey as PresenceKey,
+    ProfileKey as ProfileKey,
     ProgressKey as ProgressKey,
     ReadingKey as ReadingKey,
     RejectKey as RejectKey,

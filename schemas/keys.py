@@ -195,6 +195,13 @@ class ReadingKey(BaseKey, frozen=True):
     topic: str
 
 
+class ProfileKey(BaseKey, frozen=True):
+    """What a robot says of itself, a `Profile`; put by the agent when it changes, and answered to queries."""
+
+    pattern: ClassVar = "aira/agent/{agent}/profile"
+    agent: str
+
+
 class RpcKey(BaseKey, frozen=True):
     """A service of the agent, a queryable: `start`, `finish`, `eth/accounts`, …"""
 
@@ -228,6 +235,7 @@ AgentKey: TypeAlias = (
     | LiabilityTopicKey
     | DeviceTopicKey
     | ReadingKey
+    | ProfileKey
     | RpcKey
     | EthEventKey
     | CidKey

@@ -278,7 +278,7 @@ FORMAT: Final = "aira-model/1"
 MAX_MODEL_SIZE: Final = 65_536
 """Bytes of the longest description."""
 MAX_TOPICS: Final = 64
-_PRICE: Final = r"[0-9]{1,30}(\.[0-9]{1,18})? (XRT|wn|units)"
+PRICE: Final = r"[0-9]{1,30}(\.[0-9]{1,18})? (XRT|wn|units)"
 _YEAR: Final = 31_536_000
 
 Seconds: TypeAlias = Annotated[int, Meta(gt=0, le=_YEAR)] | Annotated[float, Meta(gt=0, le=_YEAR)]
@@ -374,7 +374,7 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
     other_topics: bool = False
     result: Annotated[tuple[ModelTopic, ...], Meta(max_length=MAX_TOPICS)] = ()
     success: Prose = ""
-    price: Annotated[str, Meta(max_length=60, extra_json_schema={"pattern": f"^{_PRICE}$"})] = ""
+    price: Annotated[str, Meta(max_length=60, extra_json_schema={"pattern": f"^{PRICE}$"})] = ""
     seconds: Seconds | None = None
     limits: ModelLimits | None = None
 
@@ -383,7 +383,7 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
         require_plain_text(self.title)
         for text in (self.description, self.success):
             require_plain_text(text, lines=True)
-        if self.price and not re.fullmatch(_PRICE, self.price):
+        if self.price and not re.fullmatch(PRICE, self.price):
             raise ValueError("a price is like `5 XRT`, `100 wn` or `3 units`")
         for topics in (self.objective, self.result):
             if len({topic.topic for topic in topics}) != len(topics):

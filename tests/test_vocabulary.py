@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 ROOT: Final = Path(__file__).parents[1]
 PACKAGES: Final = ("schemas", "mesh", "bridges")
-SHARED: Final = {"Log": "the name that Ethereum gives an entry of a receipt, and Foxglove a line of a log"}
+SHARED: Final = {
+    "Log": "the name that Ethereum gives an entry of a receipt, and Foxglove a line of a log",
+    "Robot": "what is present on a market, and what a program that speaks ROS 2 gives its node to",
+}
 """Class names that are defined in several modules on purpose, each with the reason."""
 LEVELS: Final = frozenset({"info", "warning", "error", "exception", "critical"})
 KEBAB: Final = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")

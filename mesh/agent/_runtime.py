@@ -17,6 +17,7 @@ import zenoh
 from msgspec.structs import replace
 
 from mesh.agent._outbox import result_identity
+from mesh.agent._profile import OwnProfile
 from mesh.agent._services import offer_services
 from mesh.agent._status import AgentStatus
 from mesh.agent.contracts import ContractReports, Outcome
@@ -237,7 +238,10 @@ class AgentRuntime(Lifecycle):
         self.executor = Executor(parts, objectives=self.objectives, handlers=topics, on_phase=self._on_phase)
         self.token_events = TokenEvents(parts.channel.put, parts.signer.address)
         self.status = AgentStatus(parts, self.executor, model=model)
+        self.profile = OwnProfile(parts, self.executor, description, model=model)
         self._handlers = handlers
+        # Else it may run beside the account's robot, as the commands of a person do.
+        self._is_robot = bool(handlers.topics) or Demand in handlers.market
         self._new: Created | None = None
         """The only contract that was created in the blocks that were read last."""
         self._model = model
@@ -245,8 +249,10 @@ class AgentRuntime(Lifecycle):
     async def _open(self, stack: AsyncExitStack) -> None:
         await stack.enter_async_context(self.reports)
         await stack.enter_async_context(self.trader)
-        if self._handlers.topics or Demand in self._handlers.market:  # else it may run beside the account's robot
+        if self._is_robot:
             await self.trader.withdraw_earlier_offers()
+            await self.profile.prepare()
+            await stack.enter_async_context(self.profile.serve())
         await stack.enter_async_context(answering_phases(self.parts, self.executor))
         services = self.parts.services
         offer_services(self.parts, self.executor, has_handlers=bool(self._handlers.topics))
@@ -261,6 +267,8 @@ class AgentRuntime(Lifecycle):
         yield "listener", self._follow_chain()
         yield "late results", LateResults(self.parts).run()
         yield "reports on earlier contracts", self._follow_earlier()
+        if self._is_robot:
+            yield "profile", self.profile.run()
 
     async def _do_jobs(self) -> None:
         await self.finalize_ended()
@@ -483,6 +491,7 @@ class AgentRuntime(Lifecycle):
             await call(handler, report)
 
     async def _on_phase(self, phase: Phase, liability: Liability) -> None:
+        self.profile.changed()
         if phase in PUBLISHED:
             key = str(EventKey(self.parts.signer.address, liability.address, PUBLISHED[phase]))
             self.parts.channel.put(key, liability.encode())

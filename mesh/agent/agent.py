@@ -51,6 +51,7 @@ from mesh.role.models import Models, description_in
 from mesh.role.program import RESEND, OpenRole, Program
 from mesh.role.status import WatcherStatus
 from mesh.settings import load
+from mesh.watching.robots import RobotDirectory
 from schemas import (
     ZERO_ADDRESS,
     Demand,
@@ -86,6 +87,7 @@ if TYPE_CHECKING:
     from mesh.network import Channel, Network, Subscription
     from mesh.recording import Objective
     from mesh.settings import Settings
+    from mesh.watching import Robot
     from schemas.model import ModelLimits
     from schemas.payloads import PayloadType
 
@@ -509,6 +511,23 @@ class Agent(Program):
             named = (whose.message if isinstance(whose, Verified) else whose).validator
             return None if named == ZERO_ADDRESS else await self.runtime.validators.find(named)
         return await self.runtime.validators.find(await self.parts.chain.names.address(whose))
+
+    async def robots(self, model: str = "") -> list[Robot]:
+        """The robots that are present now, or those of a `model` (CID or name), by name; each as it presents itself.
+
+        An agent with an account also counts what the chain's latest contracts paid them (`Robot.paid`, `refunded`).
+        Anybody may choose any name: `Robot.address` says who it is. Raises what a model's name raises, `ClosedError`.
+        """
+        network, channel = self._opened()
+        if self._runtime is None:
+            return await RobotDirectory(network.session, channel).present(model)
+        chain, directory = self.parts.chain, self.parts.robots
+        robots = await directory.present(await chain.names.model(model) if model else "")
+        try:
+            return await directory.count(chain, robots)
+        except ChainError as error:  # then the records are not known
+            log.debug("the records of robots can't be counted now: %s", error)
+            return robots
 
     def orders(self, *states: OrderState) -> list[Order]:
         """The account's orders in these states, oldest first; by default the open ones, those of earlier runs included.

@@ -12,6 +12,7 @@ from mesh.base.private_files import make_private_folder
 from mesh.errors import ConfigurationError
 from mesh.role.composition import RoleParts, open_parts, opened_chain
 from mesh.role.program import RESEND
+from mesh.watching.robots import RobotDirectory
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -31,6 +32,7 @@ class AgentComponents(RoleParts[Ledger]):
     """The open components of an agent with an account."""
 
     outbox: Outbox
+    robots: RobotDirectory
 
     @property
     def recordings(self) -> Path:
@@ -53,7 +55,8 @@ async def working(
         shared = await open_parts(stack, settings, account, chain, ledger=ledger, drops=drops)
         head = shared.chain_head
         outbox = Outbox(shared.ledger, shared.channel, shared.network, head=lambda: head.head, policy=resend)
-        parts = AgentComponents(**vars(shared), outbox=outbox)
+        robots = RobotDirectory(shared.network.session, shared.channel)
+        parts = AgentComponents(**vars(shared), outbox=outbox, robots=robots)
         try:
             make_private_folder(parts.recordings)
         except OSError as error:

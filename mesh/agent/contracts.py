@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
     from mesh.agent.components import AgentComponents
     from mesh.chain import Chain
-    from mesh.network import Channel, Subscription
+    from mesh.network import Subscription
     from schemas import Demand
 
 
@@ -180,13 +180,13 @@ def report(on_progress: OnProgress, progress: Progress) -> None:
 
 
 @asynccontextmanager
-async def seen_offers(channel: Channel, order: Demand | Offer, on_progress: OnProgress) -> AsyncIterator[None]:
+async def seen_offers(parts: AgentComponents, order: Demand | Offer, on_progress: OnProgress) -> AsyncIterator[None]:
     """Meanwhile report the offers of a demand's model and objective, also with other terms; equal ones once."""
     if on_progress is nothing or isinstance(order, Offer):
         yield
         return
-    async with channel.subscribe(Offer, model=order.model) as offers, Background() as tasks:
-        tasks.start(_report_offers(offers, order, on_progress), "offers seen")
+    async with parts.channel.subscribe(Offer, model=order.model) as offers, Background() as tasks:
+        tasks.start(_report_offers(parts, offers, order, on_progress), "offers seen")
         tasks.start(offers.recall(), "recall offers")
         yield
 
@@ -198,12 +198,15 @@ def stated(statement: Rejection | Decline) -> Progress:
     return Progress(kind="rejected", agent=statement.provider, code=statement.reason, detail=statement.detail)
 
 
-async def _report_offers(offers: Subscription[Offer], demand: Demand, on_progress: OnProgress) -> None:
+async def _report_offers(
+    parts: AgentComponents, offers: Subscription[Offer], demand: Demand, on_progress: OnProgress
+) -> None:
     seen: set[Progress] = set()
     async for offer in offers:
         said = _offered(offer.signer, offer.message, demand)
         if offer.message.objective == demand.objective and said not in seen and len(seen) < 64:
             seen.add(said)
+            await parts.robots.find(offer.signer)  # for those who show its name
             report(on_progress, said)
 
 

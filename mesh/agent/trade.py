@@ -113,7 +113,9 @@ async def received_declines(
     async def check(decline: Decline) -> None:
         if not limiter.allow(decline.agent) or not await agents.is_present(decline.agent):
             parts.drops.count("declines", decline.agent)
-        elif (order := orders.get(decline.order)) is not None and order.is_open and order.decline(decline):
+            return
+        await parts.robots.find(decline.agent)  # for those who show its name
+        if (order := orders.get(decline.order)) is not None and order.is_open and order.decline(decline):
             facts = log_event("order-declined", order=decline.order, agent=decline.agent, code=decline.code)
             log.info("agent %s declines the %s (%s)", decline.agent, order, decline.code, extra=facts)
 
@@ -417,8 +419,9 @@ class Trader(Lifecycle):
         elif not (order.is_open and self.is_open):
             raise ENDED() if order.is_open else order.why_closed
         else:
-            async with seen_offers(self._parts.channel, order.signed, on_progress):
+            async with seen_offers(self._parts, order.signed, on_progress):
                 contract = await order.contract(on_progress)
+        await self._parts.robots.find(contract.liability.promisor)  # for those who show its name
         report(on_progress, Progress(kind="contract", agent=contract.liability.promisor, detail=contract.address))
         return contract
 

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from schemas.messages import Demand, Offer, Order, Result
     from schemas.records import Liability
 
+OUTCOME_GETTERS: Final = ("promisor", "isFinalized", "isSuccess")
 READ_AT_ONCE: Final = 60
 """How many records a listing reads at a time, in ten calls."""
 ASKED_AT_ONCE: Final = 32
@@ -254,6 +255,23 @@ class Liabilities:
         found = []
         for start in range(0, len(addresses), READ_AT_ONCE):
             found += [record for record, _ in await self._read_existing(addresses[start : start + READ_AT_ONCE])]
+        return found
+
+    async def outcomes(self, *, blocks: int, most: int) -> dict[str, tuple[int, int]]:
+        """How many contracts paid each promisor (by address), and how many were refunded.
+
+        Counted are those that have ended of the `most` latest ones that were created in the last `blocks` blocks.
+        """
+        head = await self._node.block_number()
+        events = await list_created(self._node, self._contracts.factory, max(0, head - blocks + 1))
+        made = [event.liability for event in events if isinstance(event, NewLiability)][-most:]
+        calls = [call for address in made for call in getters("Liability", address, OUTCOME_GETTERS)]
+        values = iter(await self._node.read_all(calls, block="latest"))
+        found: dict[str, tuple[int, int]] = {}
+        for promisor, is_finalized, is_success in zip(values, values, values, strict=True):
+            if is_finalized:
+                paid, refunded = found.get(promisor, (0, 0))
+                found[promisor] = (paid + 1, refunded) if is_success else (paid, refunded + 1)
         return found
 
     async def _read_existing(self, addresses: Sequence[str]) -> Sequence[tuple[Liability, tuple[bytes, bytes]]]:

@@ -28,6 +28,7 @@ COMMANDS: Final = {
     "peers": ("mesh.cli.status:peers", "list the peers on a lighthouse's channel"),
     "provider": ("mesh.cli.provider:command", "match the orders of a lighthouse and settle them"),
     "replay": ("mesh.cli.replay:command", "publish the messages of a recording again"),
+    "robots": ("mesh.cli.robots:command", "list the robots on a lighthouse's channel"),
     "router": ("mesh.cli.router:command", "run a Zenoh router for the mesh"),
     "rpc": ("mesh.cli.rpc:command", "call a service of an agent"),
     "settings": ("mesh.cli.settings:command", "show the effective settings"),

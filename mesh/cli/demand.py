@@ -29,6 +29,7 @@ from mesh.cli.order import withdraw_orders, withdrawal_lines
 from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress, wait_for_broken_pipe
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
+from mesh.watching.robots import labelled
 from schemas.address import ZERO_ADDRESS
 from schemas.decoding import decode_json
 
@@ -127,11 +128,13 @@ async def _equal(
 class JobPrinter:
     """Prints what happens to a demand and its job: lines, and a bar on a terminal; or, `as_json`, an object for each.
 
-    `unit` is that of the demand's token. Use it as `on_progress`, and `close` it at the end.
+    `unit` is that of the demand's token, and `name_of` says what the robot at an address calls itself. Use it as
+    `on_progress`, and `close` it at the end.
     """
 
-    def __init__(self, unit: Unit, *, as_json: bool) -> None:
+    def __init__(self, unit: Unit, *, as_json: bool, name_of: Callable[[str], str] = lambda _address: "") -> None:
         self._unit = unit
+        self._name_of = name_of
         self.as_json = as_json
         self.awaited = "the payment"
         """What follows the robot's result."""
@@ -152,7 +155,7 @@ class JobPrinter:
         if seen.kind == "declined":
             self._declines[seen.agent] = seen.code
         if self.as_json:
-            print_json(_json(seen))
+            print_json(_json(seen, self._name_of(seen.agent)))
         elif seen.kind == "playing":
             self._playing(seen)
         elif words := self._words(seen):
@@ -183,7 +186,10 @@ class JobPrinter:
         return f"{plural(len(self._offers), 'robot')} offered, {declines}"
 
     def _words(self, seen: Progress) -> str:
-        who, why = seen.agent, f"{printable(seen.detail)} ({printable(seen.code)})".lstrip()
+        who, why = (
+            labelled(seen.agent, self._name_of(seen.agent)),
+            f"{printable(seen.detail)} ({printable(seen.code)})".lstrip(),
+        )
         match seen.kind:
             case "offer":
                 return f"offer by {who}{self._difference(seen)}"
@@ -234,8 +240,8 @@ class JobPrinter:
             print_line(f"playing: {percent} %, {seen.position:,} of {plural(seen.total, 'message')}")
 
 
-def _json(seen: Progress) -> dict[str, Any]:
-    facts: dict[str, Any] = {"kind": seen.kind, "agent": seen.agent}
+def _json(seen: Progress, name: str) -> dict[str, Any]:
+    facts: dict[str, Any] = {"kind": seen.kind, "agent": seen.agent} | ({"name": name} if name else {})
     if seen.kind == "playing":
         return facts | {"position": seen.position, "total": seen.total}
     if seen.kind in ("judged", "unjudged"):
@@ -503,7 +509,7 @@ async def demand(
     # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(model.name, settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
         unit = await agent.parts.chain.tokens.unit(agent.settings.erc20_token)
-        with closing(JobPrinter(unit, as_json=as_json)) as printer:
+        with closing(JobPrinter(unit, as_json=as_json, name_of=agent.parts.robots.name)) as printer:
             changes = print_connection_changes(agent.parts.network, before=printer.close)
             tasks.start(changes, "network losses")
             tasks.start(wait_for_broken_pipe(), "readers of stdout")
@@ -564,6 +570,7 @@ async def _contract(agent: Agent, order: Order | Contract, printer: JobPrinter, 
     from mesh.agent.trade import Order
 
     if isinstance(order, Contract):
+        await agent.parts.robots.find(order.liability.promisor)
         printer(Progress(kind="contract", agent=order.liability.promisor, detail=order.address))
         return order
     try:

@@ -46,13 +46,14 @@ async def status(settings: Settings, address: str | None, timeout: float, as_jso
     """
     from mesh.network import no_answer
     from mesh.role.composition import watching
-    from mesh.watching import status_of
+    from mesh.watching import RobotDirectory, status_of
 
     if address is None:
         await _show_all(settings, timeout=timeout, as_json=as_json)
         return
     address = parse_address(address)
     async with watching(settings) as (network, channel):
+        profile = await RobotDirectory(network.session, channel).find(address)
         found = await status_of(network.session, address, channel.lighthouse, timeout=timeout)
     if not found:
         raise no_answer(address)
@@ -62,12 +63,12 @@ async def status(settings: Settings, address: str | None, timeout: float, as_jso
     for place, status in enumerate(found):
         if place:
             print_line()
-        print_facts(describe_status(status))
+        print_facts(({"name": profile.name} if profile is not None and profile.name else {}) | describe_status(status))
 
 
 async def _show_all(settings: Settings, *, timeout: float, as_json: bool) -> None:
     from mesh.role.composition import watching
-    from mesh.watching import BRIDGE, PROVIDER, present, statuses
+    from mesh.watching import BRIDGE, PROVIDER, RobotDirectory, present, statuses
 
     drops = Drops()
     async with watching(settings, drops=drops) as (network, channel):
@@ -76,14 +77,21 @@ async def _show_all(settings: Settings, *, timeout: float, as_json: bool) -> Non
         found = await statuses(network.session, channel, first, timeout=timeout)
         others = set(await present(channel)).difference(first)
         found |= await statuses(network.session, channel, sorted(others), timeout=timeout)
-    peers = sorted(found)
+        robots = await RobotDirectory(network.session, channel).present(timeout=timeout)
+    peers, names = sorted(found), {("agent", robot.address): robot.name for robot in robots if robot.name}
     if as_json:
-        listed = [{"role": peer.role, "address": peer.address, "status": _status_json(found[peer])} for peer in peers]
+        listed = [
+            {"role": peer.role, "address": peer.address}
+            | ({"name": names[peer]} if peer in names else {})
+            | {"status": _status_json(found[peer])}
+            for peer in peers
+        ]
         print_json({"lighthouse": channel.lighthouse, "peers": listed, "unlisted": _unlisted(drops)})
         return
     if peers:
-        rows = [(peer.role, peer.address, summarize_status(found[peer])) for peer in peers]
-        print_table(("role", "address", "status"), rows)
+        rows = [(peer.role, peer.address, names.get(peer, ""), summarize_status(found[peer])) for peer in peers]
+        head = ("role", "address", "name", "status")
+        print_table(head, rows) if names else print_table((*head[:2], head[3]), [(*row[:2], row[3]) for row in rows])
     else:
         print_line(f"no peers on {channel.lighthouse}")
     _unlisted(drops)

@@ -24,7 +24,7 @@ from mesh.network import Reading
 from mesh.role.running import run_until_stopped
 from mesh.settings import NetworkSettings
 from mesh.telemetry.logs import configure_logging
-from mesh.watching import JobEvent, PresenceChange
+from mesh.watching import JobEvent, PresenceChange, labelled
 from schemas import Demand, InvalidAddress, Result, Verified, parse_address
 from schemas.decoding import decode_json
 from schemas.signing import Decline, Rejection
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from mesh.network import Channel, Network
     from mesh.recording import Recorder
     from mesh.settings import Settings
-    from mesh.watching import MarketCounters, MarketEvent, MarketWatch
+    from mesh.watching import MarketCounters, MarketEvent, MarketWatch, RobotDirectory
     from schemas import Offer, PresenceKey
 
 
@@ -50,8 +50,18 @@ EVENT_WIDTH: Final = 9
 """Columns of the event's name."""
 
 
-def event_json(seen: MarketEvent | PresenceChange, *, time: str) -> dict[str, Any]:
-    """An event at `time` (ISO 8601) for JSON. Amounts are text, in the smallest unit."""
+def robot_in(seen: MarketEvent | PresenceChange) -> str:
+    """The address of the robot that an event is about; empty if it is about none."""
+    match seen:
+        case Verified():
+            return "" if isinstance(seen.message, Demand) else seen.signer
+        case Decline() | Reading() | JobEvent():
+            return seen.agent
+    return ""
+
+
+def event_json(seen: MarketEvent | PresenceChange, *, time: str, name: str = "") -> dict[str, Any]:
+    """An event at `time` (ISO 8601) for JSON. Amounts are text, in the smallest unit. `name` is that of its robot."""
     match seen:
         case Verified():
             message = seen.message
@@ -77,7 +87,7 @@ def event_json(seen: MarketEvent | PresenceChange, *, time: str) -> dict[str, An
             about = {"event": "present" if is_present else "gone", "role": role, "agent": address}
         case JobEvent(agent, event, liability):
             about = {"event": event, "agent": agent, "liability": decode_json(liability.encode())}
-    return {"time": time} | about
+    return {"time": time} | about | ({"name": name} if name else {})
 
 
 def _order_facts(order: Demand | Offer) -> dict[str, Any]:
@@ -101,33 +111,34 @@ class EventFormatter:
     def __init__(self, xrt: str | None) -> None:
         self._xrt = xrt
 
-    def line(self, seen: MarketEvent | PresenceChange) -> str:
-        """The line of an event, without the time."""
+    def line(self, seen: MarketEvent | PresenceChange, name: str = "") -> str:
+        """The line of an event, without the time. `name` is what the robot calls itself that it is about."""
+        robot = robot_in(seen)
+        who = labelled(robot, name) if name else short_address(robot)
         match seen:
             case Verified():
                 message, kind = seen.message, type(seen.message).__name__.lower()
                 if isinstance(message, Result):
-                    signer = short_address(seen.signer)
-                    words = f"{message.result}  {_ended(message.success)}, for {message.liability}, signed by {signer}"
+                    words = f"{message.result}  {_ended(message.success)}, for {message.liability}, signed by {who}"
                 else:
-                    words = self._order(seen)
+                    words = self._order(seen, labelled(seen.signer, name))
             case Rejection():
                 why = printable(seen.detail[:LONGEST_TEXT] or seen.reason[:LONGEST_TEXT])
                 kind, words = "rejected", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.provider)}: {why}"
             case Decline():
                 why = f"{printable(seen.detail[:LONGEST_TEXT])} ({seen.code})".lstrip()
-                kind, words = "declined", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.agent)}: {why}"
+                kind, words = "declined", f"{seen.order[:HASH_DIGITS]} by {who}: {why}"
             case ValidatorReport():
                 why = printable(verdict_words(seen)[:LONGEST_TEXT])
                 kind, words = "judged", f"{seen.liability} by juror {short_address(seen.juror)}: {why}"
             case Reading():
                 text = seen.value if isinstance(seen.value, str) else json_text(seen.value)
                 shown = printable(text[:LONGEST_TEXT] + ("…" if len(text) > LONGEST_TEXT else ""))
-                kind, words = "reading", f"{printable(seen.topic)}  {shown}, from {short_address(seen.agent)}"
+                kind, words = "reading", f"{printable(seen.topic)}  {shown}, from {who}"
             case PresenceChange((role, address), is_present):
                 kind, words = "present" if is_present else "gone", f"{printable(role)} {address}"
             case JobEvent(_, kind, liability):
-                parties = f"{short_address(liability.promisor)} for {short_address(liability.promisee)}"
+                parties = f"{who} for {short_address(liability.promisee)}"
                 words = f"{liability.address}  {parties}, {self.cost(liability.cost, liability.token)}"
                 if liability.result:
                     words += f", {_ended(liability.is_success)}: {liability.result}"
@@ -137,7 +148,7 @@ class EventFormatter:
         """An amount of a token with its unit."""
         return (XRT if token == self._xrt else Unit(f"units of {short_address(token)}", 0)).show(amount)
 
-    def _order(self, seen: Verified[Any]) -> str:
+    def _order(self, seen: Verified[Any], who: str) -> str:
         order: Demand | Offer = seen.message
         if isinstance(order, Demand):
             does, fee = "pays", ""
@@ -146,7 +157,7 @@ class EventFormatter:
             fee = f" and {XRT.show(order.lighthouse_fee)} to the provider" if order.lighthouse_fee else ""
         terms = f"{self.cost(order.cost, order.token)}{fee}, model {_short_cid(order.model)}"
         more = f"objective {_short_cid(order.objective)}, until block {order.deadline:,}"
-        return f"{seen.hash.hex()[:HASH_DIGITS]}  {seen.signer} {does} {terms}, {more}"
+        return f"{seen.hash.hex()[:HASH_DIGITS]}  {who} {does} {terms}, {more}"
 
 
 def _short_cid(cid: str) -> str:
@@ -204,7 +215,7 @@ async def watch(
     out: Path | None = None,
 ) -> None:
     from mesh.role.composition import watching
-    from mesh.watching import MarketWatch, ReadingFetcher
+    from mesh.watching import MarketWatch, ReadingFetcher, RobotDirectory
 
     if model is not None:
         model = (await asyncio.to_thread(model_named, model)).cid()
@@ -212,7 +223,8 @@ async def watch(
         network, channel = await stack.enter_async_context(watching(settings))
         formatter = None if as_json else EventFormatter(await _xrt(settings, network.session, channel))
         recorder = None if out is None else await stack.enter_async_context(_recording(out, channel.lighthouse))
-        show = partial(_show_event, formatter, recorder)
+        robots = RobotDirectory(network.session, channel)
+        show = partial(_show_event, formatter, recorder, robots)
         fetcher = await stack.enter_async_context(ReadingFetcher(network.session, show)) if readings else None
         watched = MarketWatch(network.session, channel, model=model or "*", readings=readings)
         seen = await stack.enter_async_context(watched)
@@ -224,6 +236,8 @@ async def watch(
         if with_open:
             tasks.start(seen.recall(), "open orders")
         async for event in seen:
+            if robot := robot_in(event):
+                await robots.find(robot)
             show(event)
             if fetcher is not None:
                 fetcher.handle(event)
@@ -258,16 +272,20 @@ async def _recording(out: Path, lighthouse: str) -> AsyncIterator[Recorder]:
 
 
 def _show_event(
-    formatter: EventFormatter | None, recorder: Recorder | None, event: MarketEvent | PresenceChange
+    formatter: EventFormatter | None,
+    recorder: Recorder | None,
+    robots: RobotDirectory,
+    event: MarketEvent | PresenceChange,
 ) -> None:
     """Print an event: as a line by `formatter`, without one as JSON. Record it if it is a reading."""
     if isinstance(event, Reading) and recorder is not None:
         recorder.record(f"/{event.agent.lower()}{event.topic}", event.payload, event.type)
-    now = datetime.now(UTC)
+    now, name = datetime.now(UTC), robots.name(robot_in(event))
     if formatter is None:
-        print_json(event_json(event, time=now.isoformat(timespec="milliseconds").replace("+00:00", "Z")))
+        time = now.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        print_json(event_json(event, time=time, name=name))
     else:
-        print_line(f"{now.astimezone():%H:%M:%S}  {formatter.line(event)}")
+        print_line(f"{now.astimezone():%H:%M:%S}  {formatter.line(event, name)}")
 
 
 @asynccontextmanager

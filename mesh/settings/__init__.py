@@ -13,6 +13,7 @@ from mesh.settings.groups import (
     IpfsSettings,
     MarketSettings,
     NetworkSettings,
+    ProfileSettings,
     Ros2Settings,
     Settings,
     StorageSettings,

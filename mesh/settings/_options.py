@@ -17,6 +17,9 @@ Interval = Annotated[float, Meta(gt=0, le=LONGEST)]
 SecondsOrEver = Annotated[float, Meta(ge=-1, le=LONGEST)]
 Gwei = Annotated[float, Meta(ge=1e-9, le=1e9)]
 
+Line = Annotated[str, Meta(max_length=80)]
+Sentence = Annotated[str, Meta(max_length=200)]
+
 T = TypeVar("T")
 
 

@@ -11,7 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from mesh.errors import ConfigurationError
-from mesh.settings._options import Gwei, Interval, NaturalInt, PositiveInt, Seconds, SecondsOrEver, option
+from mesh.settings._options import (
+    Gwei,
+    Interval,
+    Line,
+    NaturalInt,
+    PositiveInt,
+    Seconds,
+    SecondsOrEver,
+    Sentence,
+    option,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -231,6 +241,16 @@ class ExecutionSettings(ContentSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ProfileSettings:
+    """How a robot presents itself to those who order."""
+
+    name: Line = option("", "the robot's name, for people; anybody may choose the same")
+    about: Sentence = option("", "one sentence about the robot, for people")
+    picture: str = option("", "picture of the robot: a PNG, JPEG or WebP file of at most 512 KiB, or its CID")
+    place: Line = option("", "where the robot is, for people")
+
+
+@dataclass(frozen=True, kw_only=True)
 class IpfsSettings:
     """How to reach IPFS."""
 
@@ -286,6 +306,7 @@ class Settings(
     Ros2Settings,
     IpfsSettings,
     ValidatorSettings,
+    ProfileSettings,
     ExecutionSettings,
     MarketSettings,
     AccountSettings,

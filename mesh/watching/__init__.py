@@ -13,3 +13,4 @@ from mesh.watching.presence import (
     status_of,
     statuses,
 )
+from mesh.watching.robots import Robot, RobotDirectory, labelled, robot_address

@@ -104,6 +104,7 @@ _READ_MARKET: Final = (
 _READ_CONTENT: Final = _grant("get", "aira/agent/*/cid/*")
 """Who holds content serves it in its own space."""
 _READINGS: Final = _grant("subscribe", "aira/agent/*/reading/**")
+_PROFILES: Final = _grant("get subscribe", "aira/agent/*/profile")
 
 ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
     {
@@ -114,6 +115,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _presence("agent"),
             _READ_CONTENT,
             _READINGS,
+            _PROFILES,
         ),
         # A person who orders work also runs an agent.
         "person": (
@@ -123,6 +125,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _presence("agent", "person"),
             _READ_CONTENT,
             _READINGS,
+            _PROFILES,
         ),
         "provider": (
             _OWN_SPACE,
@@ -161,7 +164,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _presence("bridge", "bridge-turn-$*"),
             _READ_CONTENT,
         ),
-        "watcher": (*_READ_MARKET, _READ_CONTENT, _grant("subscribe presence", "aira/agent/**")),
+        "watcher": (*_READ_MARKET, _READ_CONTENT, _PROFILES, _grant("subscribe presence", "aira/agent/**")),
         # Another router of the site forwards what it has admitted itself.
         "router": (_grant(" ".join(right.value for right in Right), "aira/**", "aira/*/@agent/*/*"),),
     }

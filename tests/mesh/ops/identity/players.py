@@ -22,6 +22,7 @@ from schemas import (
     OfferKey,
     PendingKey,
     PresenceKey,
+    ProfileKey,
     ReadingKey,
     RejectKey,
     ReportKey,
@@ -65,6 +66,7 @@ def space(agent: str, device: str) -> dict[str, str]:
         "topic": str(LiabilityTopicKey(agent, LIABILITY, "/a/b")),
         "device": str(DeviceTopicKey(agent, device, "/a/b")),
         "reading": str(ReadingKey(agent, "/a/b")),
+        "profile": str(ProfileKey(agent)),
         "rpc": str(RpcKey(agent, "eth/transfer")),
         "eth": str(EthEventKey(agent, "transfer")),
         "cid": str(CidKey(agent, MODEL)),
@@ -114,13 +116,14 @@ def keys_of(who: str) -> dict[str, str]:
 
 
 KEYS = {who: keys_of(who) for who in WHO}
-OWN = {"own event", "own objective", "own topic", "own device", "own reading", "own rpc", "own eth", "own cid"}
+OWN = {f"own {name}" for name in space(ADDRESSES["arm"], "arm")}
 OTHER = {
     "other event",
     "other objective",
     "other topic",
     "other device",
     "other reading",
+    "other profile",
     "other rpc",
     "other eth",
     "other cid",
@@ -165,18 +168,18 @@ TOKEN = NOBODY | {
     "bridge": OWN | {"as bridge", "as bridge-turn-0-00000000000000ff"},
 }
 GET = NOBODY | {
-    "arm": OWN | MARKETS | {"other cid"},
-    "ann": OWN | MARKETS | {"other cid"},
+    "arm": OWN | MARKETS | {"other cid", "other profile"},
+    "ann": OWN | MARKETS | {"other cid", "other profile"},
     "miner": OWN | MARKETS,
     "judge": OWN | MARKETS | {"other cid"},
     "boss": OWN | OTHER | MARKETS,
     "board": {"robot device"},
     "bridge": OWN | MARKETS | {"other cid"},
-    "screen": MARKETS | {"own cid", "other cid"},
+    "screen": MARKETS | {"own cid", "other cid", "own profile", "other profile"},
 }
 SUBSCRIBE = NOBODY | {
-    "arm": OWN | MARKETS | {"other reading"},
-    "ann": OWN | MARKETS | {"other reading"},
+    "arm": OWN | MARKETS | {"other reading", "other profile"},
+    "ann": OWN | MARKETS | {"other reading", "other profile"},
     "miner": OWN | MARKETS,
     "judge": OWN | MARKETS,
     "boss": OWN | OTHER | MARKETS,

@@ -1,0 +1,160 @@
+"""The profile of a robot: what its settings and its model say of it, and what it is doing now.
+
+It answers queries of `ProfileKey`, and is put there when it changes. A profile is signed anew for each, so that its
+time says how old it is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+
+from mesh.agent.ledger import Phase
+from mesh.base.flood import Rate
+from mesh.errors import ChainError, ConfigurationError
+from mesh.network.services import answering
+from schemas import ProfileKey
+from schemas.cid import is_cid
+from schemas.profiles import MOST_WAITING, Profile, ProfileState, text_fault
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
+    import zenoh
+
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.jobs import Executor
+    from mesh.settings import ProfileSettings
+    from schemas.model import ModelDescription
+
+LARGEST_PICTURE: Final = 512 * 1024
+"""Bytes of a robot's picture."""
+ASKED: Final = Rate(per_second=20.0, burst=100)
+"""Queries for the profile that are answered."""
+INTERVAL: Final = 1.0
+"""Seconds between two profiles that are put, at least."""
+
+Mark: TypeAlias = Literal["stopped", "closed"]
+
+
+class OwnProfile:
+    """The profile of one robot. Call `prepare` once, then `serve` and `run`; `changed` and `mark` at any time."""
+
+    def __init__(
+        self, parts: AgentComponents, executor: Executor, description: ModelDescription | None, *, model: str
+    ) -> None:
+        self._parts = parts
+        self._executor = executor
+        self._model = model
+        self._picture = ""
+        self._price = "" if description is None else description.price
+        self._seconds = float((None if description is None else description.seconds) or 0)
+        self._marks: set[Mark] = set()
+        self._changed = asyncio.Event()
+
+    async def prepare(self) -> None:
+        """Check the settings, put the picture into the store, and find the model's CID.
+
+        Raises `ConfigurationError` (`profile-invalid`, `picture-unusable`).
+        """
+        settings = self._parts.settings
+        for field in ("name", "about", "place"):
+            if why := text_fault(field, getattr(settings, field)):
+                raise ConfigurationError(f"the setting {field} can't be used: {why}", code="profile-invalid")
+        if settings.picture:
+            self._picture = await asyncio.to_thread(self._keep_picture, settings)
+        if self._model and not is_cid(self._model):
+            with suppress(ChainError):  # a name that can't be resolved now
+                self._model = await self._parts.chain.names.model(self._model)
+            self._model = self._model if is_cid(self._model) else ""
+
+    def _keep_picture(self, settings: ProfileSettings) -> str:
+        """The CID of the picture, which the store has if a file is given. Blocks on the disk."""
+        path = Path(settings.picture).expanduser()
+        if is_cid(settings.picture) and not path.exists():
+            return settings.picture
+        try:
+            with path.open("rb") as file:
+                data = file.read(LARGEST_PICTURE + 1)
+        except OSError as error:
+            raise _unusable(f"can't read the picture {settings.picture}: {error.strerror}") from None
+        if len(data) > LARGEST_PICTURE:
+            raise _unusable(f"the picture {settings.picture} has more than {LARGEST_PICTURE:,} bytes")
+        if not data.startswith((b"\x89PNG\r\n", b"\xff\xd8\xff")) and (data[:4], data[8:12]) != (b"RIFF", b"WEBP"):
+            raise _unusable(f"{settings.picture} is no picture that others can show")
+        self._parts.store.release("picture")  # that of an earlier run
+        return self._parts.store.put_bytes(data, pin="picture")
+
+    def mark(self, state: Mark, *, on: bool) -> None:
+        """Say from now on that the robot is stopped or closed, or (`on` false) that it is so no more."""
+        (self._marks.add if on else self._marks.discard)(state)
+        self.changed()
+
+    def changed(self) -> None:
+        """Something that the profile says may have changed."""
+        self._changed.set()
+
+    async def queue(self) -> tuple[int, int]:
+        """How many jobs wait, and after how many seconds a new one would begin, estimated.
+
+        The estimate is by the `seconds` of the model's description; 0 without one.
+        """
+        jobs, runs = await self._parts.ledger.jobs_by_phase(), self._executor.runs.values()
+        waiting, running = sum(jobs.get(phase, 0) for phase in (Phase.INCOMING, Phase.READY)), jobs.get("running", 0)
+        played = sum(one.position / one.total for run in runs if (one := run.playback) is not None and one.total)
+        return waiting, math.ceil(self._seconds * max(0.0, waiting + running - played))
+
+    async def present(self) -> Profile:
+        """The signed profile of this moment."""
+        settings, signer = self._parts.settings, self._parts.signer
+        waiting, seconds = await self.queue()
+        profile = Profile(
+            agent=signer.address,
+            model=self._model,
+            name=settings.name,
+            about=settings.about,
+            picture=self._picture,
+            place=settings.place,
+            price=self._price,
+            state=await self._state(),
+            queue=min(waiting, MOST_WAITING),
+            wait=min(seconds, MOST_WAITING),
+            time=int(time.time()),
+        )
+        return profile.signed_by(signer)
+
+    async def _state(self) -> ProfileState:
+        for mark in ("stopped", "closed"):
+            if mark in self._marks:
+                return mark
+        return "working" if (await self._parts.ledger.jobs_by_phase()).get("running") else "idle"
+
+    def serve(self) -> AbstractAsyncContextManager[None]:
+        """Meanwhile answer queries for the profile."""
+        key = str(ProfileKey(self._parts.signer.address))
+
+        async def answer(query: zenoh.Query) -> None:
+            query.reply(key, (await self.present()).encode(), encoding="application/json")
+
+        return answering(self._parts.network.session, key, answer, ASKED, self._parts.drops)
+
+    async def run(self) -> None:
+        """Put the profile when it has changed, at most once in `INTERVAL` seconds, until cancelled."""
+        key, said = str(ProfileKey(self._parts.signer.address)), dict[str, Any]()
+        while True:
+            self._changed.clear()
+            profile = await self.present()
+            facts = {"state": profile.state, "queue": profile.queue, "wait": profile.wait}
+            if facts != said:
+                said = facts
+                self._parts.channel.put(key, profile.encode())
+            await asyncio.sleep(INTERVAL)
+            await self._changed.wait()
+
+
+def _unusable(why: str) -> ConfigurationError:
+    return ConfigurationError(why, hint="name a PNG, JPEG or WebP file", code="picture-unusable")

@@ -1,0 +1,89 @@
+"""`aira robots`: the robots on a lighthouse's channel, as they present themselves."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import click
+import msgspec
+
+from mesh.cli.chain_client import open_chain
+from mesh.cli.files import model_named
+from mesh.cli.options import CHAIN_SETTINGS, with_json, with_settings, with_timeout
+from mesh.cli.output import format_duration, plural, print_json, print_line, print_table
+from mesh.errors import ChainError
+from mesh.settings import NetworkSettings
+from schemas.address import is_ens_name
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from mesh.network import Channel
+    from mesh.settings import Settings
+    from mesh.watching import Robot
+
+
+@click.command("robots")
+@click.option("--model", help="list only robots of this model: its file, CID or ENS name")
+@with_timeout()
+@with_json
+@with_settings(NetworkSettings, "lighthouse_contract", *CHAIN_SETTINGS)
+async def command(settings: Settings, model: str | None, timeout: float, as_json: bool) -> None:
+    """List the robots that are present on the lighthouse's channel: name, address, what each is doing, what a job
+    costs, and how its latest contracts ended.
+
+    Names, places and prices are the owners' words: anybody may choose any name, so the address says who it is. The
+    record counts the contracts of about a week, the 500 latest, that paid the robot or were refunded; it needs the
+    chain's node, and is left out without one.
+    """
+    from mesh.role.composition import watching
+
+    named = None if model is None else (await asyncio.to_thread(model_named, model)).name
+    async with watching(settings) as (network, channel):
+        robots = await _list(settings, network.session, channel, named, timeout=timeout)
+    if as_json:
+        print_json({"lighthouse": channel.lighthouse, "robots": [msgspec.to_builtins(robot) for robot in robots]})
+    elif robots:
+        rows = [
+            (robot.name, robot.address, doing(robot), robot.price, record_of(robot), robot.place) for robot in robots
+        ]
+        print_table(("name", "address", "doing", "price", "record", "place"), rows)
+    else:
+        print_line(f"no robots{' of this model' if named else ''} on {channel.lighthouse}")
+
+
+async def _list(
+    settings: Settings, session: zenoh.Session, channel: Channel, model: str | None, *, timeout: float
+) -> list[Robot]:
+    """The robots with their records, as far as the node answers. Raises `UnknownName` and its like for a model."""
+    from mesh.watching import RobotDirectory
+
+    directory = RobotDirectory(session, channel)
+    if model is not None and is_ens_name(model):
+        async with open_chain(settings) as chain:
+            model = await chain.names.model(model)
+    robots = await directory.present(model or "", timeout=timeout)
+    try:
+        async with open_chain(settings) as chain:
+            return await directory.count(chain, robots)
+    except ChainError as error:
+        click.echo(f"aira: no records: {error}", err=True)
+        return robots
+
+
+def doing(robot: Robot) -> str:
+    """What a robot is doing, and how long a new job would wait, for people."""
+    words: list[str] = [robot.state]
+    if robot.queue:
+        words.append(f"{plural(robot.queue, 'job')} wait{'s' if robot.queue == 1 else ''}")
+    if robot.wait:
+        words.append(f"about {format_duration(robot.wait * 10**9)}")
+    return ", ".join(words)
+
+
+def record_of(robot: Robot) -> str:
+    """How a robot's latest contracts ended, for people."""
+    if robot.paid is None or robot.refunded is None:
+        return "unknown"
+    return f"{robot.paid:,} paid, {robot.refunded:,} refunded"

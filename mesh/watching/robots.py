@@ -1,0 +1,212 @@
+"""The robots that are present on a lighthouse's channel: their profiles, their names, and their addresses by name.
+
+A name is its owner's word, and anybody may choose any. So a name stands beside the address, and resolves to one only
+while no other robot that is present has it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from mesh.base.flood import BoundedDict, Rate, RateLimiter
+from mesh.errors import InputError
+from mesh.watching.market import TIMEOUT, query_all
+from mesh.watching.presence import BATCH, PATIENCE, present
+from schemas import InvalidRecord, ProfileKey, parse_address
+from schemas.profiles import LARGEST_PROFILE, Profile, ProfileState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    import zenoh
+
+    from mesh.chain import Chain
+    from mesh.network import Channel
+
+KEPT: Final = 60.0
+"""Seconds for which the profile of a robot is not asked for again, …"""
+KEPT_SILENCE: Final = 5.0
+"""… and that of one that has none."""
+PROFILES_KEPT: Final = 1024
+"""Robots whose profiles are kept."""
+LOOKUP_TIMEOUT: Final = 0.5
+"""Seconds that a robot has to say its name."""
+LOOKUPS: Final = Rate(per_second=20.0, burst=200)
+"""Robots that are asked for their names."""
+REST: Final = 10.0
+"""How many times as long as a robot was silent no other is asked: strangers who are silent may take a tenth of the
+time."""
+OLDEST: Final = 24 * 3600.0
+"""Seconds since a robot signed a profile after which it does not count."""
+CLOCK_ERROR: Final = 300.0
+"""Seconds by which a robot's clock may be ahead."""
+COUNTED_BLOCKS: Final = 50_000
+"""Blocks, a week where one takes 12 seconds, whose contracts count for the records of robots …"""
+COUNTED: Final = 500
+"""… and the most contracts, the latest ones."""
+LISTED: Final = 10
+"""Robots that an error lists."""
+
+
+class Robot(msgspec.Struct, frozen=True, kw_only=True):
+    """A robot that is present, as it presents itself; `str(robot)` is its name, or its short address."""
+
+    address: str
+    """EIP-55."""
+    model: str
+    """A CIDv0; empty if it has none."""
+    name: str
+    """What its owner calls it; anybody may choose the same."""
+    about: str
+    """One sentence, plain text; may be empty."""
+    picture: str
+    """The CID of an image, or empty."""
+    place: str
+    """Where it says that it is; may be empty."""
+    price: str
+    """What a job usually costs, as `5 XRT`; may be empty."""
+    state: ProfileState
+    """`idle`, `working`, `stopped` by somebody, or `closed`: it takes no jobs now."""
+    queue: int
+    """Jobs that wait."""
+    wait: int
+    """Seconds after which a new job would begin, estimated."""
+    time: int
+    """When it said this, by its clock: Unix seconds."""
+    paid: int | None = None
+    """Contracts that paid it, of the 500 latest on the chain of a week; None if this side did not count them."""
+    refunded: int | None = None
+    """Contracts that were refunded, in the same way."""
+
+    def __str__(self) -> str:
+        return self.name or shortened(self.address)
+
+
+def robot_of(profile: Profile) -> Robot:
+    """The robot that a profile presents."""
+    facts = msgspec.structs.asdict(profile)
+    return Robot(address=facts.pop("agent"), **{name: facts[name] for name in facts if name != "signature"})
+
+
+def shortened(address: str) -> str:
+    """An address shortened to its ends."""
+    return f"{address[:6]}…{address[-4:]}"
+
+
+def labelled(address: str, name: str) -> str:
+    """A robot for people: its name with the short address, or the full address if it has no name."""
+    return f"{name} ({shortened(address)})" if name else address
+
+
+class RobotDirectory:
+    """Asks robots for their profiles: `await directory.find(address)`. What they say is kept for a minute."""
+
+    def __init__(self, session: zenoh.Session, channel: Channel) -> None:
+        self._session = session
+        self._channel = channel
+        self._known: BoundedDict[str, tuple[Profile | None, float]] = BoundedDict(PROFILES_KEPT)
+        self._outcomes: tuple[Mapping[str, tuple[int, int]], float] = ({}, 0.0)
+        self._limiter = RateLimiter(per_sender=LOOKUPS)
+        self._rests_until = 0.0
+
+    async def present(self, model: str = "", *, timeout: float = TIMEOUT) -> list[Robot]:
+        """The robots that are present on the channel, or those of a model (CID): by name, then by address.
+
+        They are asked now, for `timeout` seconds each and `PATIENCE` in all. Not listed is who does not answer.
+        """
+        asked = [peer.address for peer in await present(self._channel, "agent")]
+        until, found = time.monotonic() + PATIENCE, dict[str, Profile]()
+        for start in range(0, len(asked), BATCH):
+            if time.monotonic() > until:
+                break
+            found |= await self._ask(asked[start : start + BATCH], timeout)
+        for address, profile in found.items():
+            self._known[address] = profile, time.monotonic() + KEPT
+        robots = [robot_of(profile) for profile in found.values() if model in ("", profile.model)]
+        return sorted(robots, key=lambda robot: (not robot.name, robot.name.casefold(), robot.address))
+
+    async def count(self, chain: Chain, robots: Iterable[Robot]) -> list[Robot]:
+        """The same robots, with how the chain's latest contracts ended; what the chain says is kept for a minute.
+
+        Raises `ChainError`.
+        """
+        outcomes, until = self._outcomes
+        if time.monotonic() >= until:
+            outcomes = await chain.liabilities.outcomes(blocks=COUNTED_BLOCKS, most=COUNTED)
+            self._outcomes = outcomes, time.monotonic() + KEPT
+        counted = []
+        for robot in robots:
+            paid, refunded = outcomes.get(robot.address, (0, 0))
+            counted.append(msgspec.structs.replace(robot, paid=paid, refunded=refunded))
+        return counted
+
+    async def find(self, address: str) -> Profile | None:
+        """The profile of the robot at an address (EIP-55); None if it has none, or if too many were asked for."""
+        profile, until = self._known.get(address, (None, 0.0))
+        now = time.monotonic()
+        if now < until or now < self._rests_until or not self._limiter.allow(""):
+            return profile
+        profile = (await self._ask([address], LOOKUP_TIMEOUT)).get(address)
+        self._known[address] = profile, time.monotonic() + (KEPT_SILENCE if profile is None else KEPT)
+        if profile is None and (silent := time.monotonic() - now) >= LOOKUP_TIMEOUT:
+            self._rests_until = now + silent * (1 + REST)
+        return profile
+
+    def name(self, address: str) -> str:
+        """What the robot at an address calls itself, as far as that is known; or an empty text."""
+        profile, _ = self._known.get(address, (None, 0.0))
+        return "" if profile is None else profile.name
+
+    async def _ask(self, addresses: Iterable[str], timeout: float) -> Mapping[str, Profile]:
+        """The latest profile that each robot has signed on its key."""
+        wanted = {str(ProfileKey(address)): address for address in addresses}
+        replies, now = await query_all(self._session, wanted, timeout=timeout), time.time()
+
+        def read() -> Mapping[str, Profile]:
+            found: dict[str, Profile] = {}
+            for sample in (reply.ok for reply in replies if reply.ok is not None):
+                address = wanted.get(str(sample.key_expr))
+                if address is None or len(sample.payload) > LARGEST_PROFILE:
+                    continue
+                with suppress(InvalidRecord):
+                    one, before = Profile.decode(sample.payload.to_bytes()), found.get(address)
+                    is_recent = now - OLDEST <= one.time <= now + CLOCK_ERROR
+                    is_new = before is None or before.time < one.time
+                    if one.agent == address and is_recent and is_new and one.is_signed:
+                        found[address] = one
+            return found
+
+        return await asyncio.to_thread(read)
+
+
+async def robot_address(session: zenoh.Session, channel: Channel, named: str, *, model: str = "") -> str:
+    """The address (EIP-55) of the robot with a name, or an address as it is given.
+
+    A name is that of a robot that is present now, of the `model` (CID) if one is given; upper and lower case are the
+    same. Raises `InputError`: `robot-unknown` if none has this name, `robot-ambiguous` if several have it;
+    `InvalidAddress`.
+    """
+    if named[:2].lower() == "0x":
+        return parse_address(named)
+    robots = await RobotDirectory(session, channel).present(model)
+    found = [robot for robot in robots if robot.name.casefold() == named.strip().casefold()] if named.strip() else []
+    if len(found) == 1:
+        return found[0].address
+    shown = [f"{robot.name or 'without a name'} {robot.address}" for robot in (found or robots)[:LISTED]]
+    if found:
+        raise InputError(
+            f"{len(found)} robots are called {named[:80]!r}: {', '.join(shown)}",
+            hint="give the address of the one that you mean",
+            code="robot-ambiguous",
+        )
+    there = f"these are present: {', '.join(shown)}" if shown else "no robot is present that says who it is"
+    raise InputError(
+        f"no robot is called {named[:80]!r}",
+        hint=f"{there}; `aira robots` lists them",
+        code="robot-unknown",
+    )

@@ -1,0 +1,85 @@
+"""What a robot says of itself: who it is, what it is doing, and how long its queue is."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, ClassVar, Final, Literal, TypeAlias
+
+from msgspec import Meta
+
+from schemas.address import parse_address
+from schemas.cid import is_cid
+from schemas.errors import InvalidAddress, InvalidRecord
+from schemas.model import PRICE, require_plain_text
+from schemas.records import Record
+from schemas.signing import SignedRecord
+
+ProfileState: TypeAlias = Literal["idle", "working", "stopped", "closed"]
+
+LONGEST_NAME: Final = 80
+"""Characters of a robot's name, and of its place."""
+LONGEST_ABOUT: Final = 200
+"""Characters of what a robot says of itself."""
+LARGEST_PROFILE: Final = 4096
+"""Bytes of an encoded profile; receivers refuse more."""
+MOST_WAITING: Final = 1_000_000
+"""Jobs in a queue, and seconds of a wait, that a profile can state."""
+
+_Waiting: TypeAlias = Annotated[int, Meta(ge=0, le=MOST_WAITING)]
+_Name: TypeAlias = Annotated[str, Meta(max_length=LONGEST_NAME)]
+
+
+class Profile(SignedRecord, frozen=True, kw_only=True):
+    """A robot as its account presents it. The robot answers queries of `ProfileKey`, and puts it there when it changes.
+
+    `agent` is the EIP-55 address of its account, `model` a CIDv0 or empty. `name`, `about` and `place` are plain text
+    that the owner chose: two robots may have one name. `picture` is the CID of an image, `price` what a job usually
+    costs (`5 XRT`); both may be empty. `queue` jobs wait, and a new one would begin in about `wait` seconds. `stopped`
+    says that somebody stopped the robot, `closed` that it takes no jobs now. `time` is the robot's time of day in Unix
+    seconds. Trust it only if it `is_signed`, and is on the agent's key.
+    """
+
+    domain: ClassVar = b"aira profile\0"
+    author: ClassVar = "agent"
+
+    agent: str
+    model: str = ""
+    name: _Name = ""
+    about: Annotated[str, Meta(max_length=LONGEST_ABOUT)] = ""
+    picture: str = ""
+    place: _Name = ""
+    price: Annotated[str, Meta(max_length=60)] = ""
+    state: ProfileState = "idle"
+    queue: _Waiting = 0
+    wait: _Waiting = 0
+    time: int
+
+    def __post_init__(self) -> None:
+        Record.__post_init__(self)
+        for field in ("name", "about", "place"):
+            if why := text_fault(field, getattr(self, field)):
+                raise InvalidRecord("Profile", f"{field}: {why}")
+        for field in ("model", "picture"):
+            if (cid := getattr(self, field)) and not is_cid(cid):
+                raise InvalidRecord("Profile", f"{field}: expected a CIDv0")
+        if self.price and not re.fullmatch(PRICE, self.price):
+            raise InvalidRecord("Profile", "price: expected one like `5 XRT`")
+        try:
+            if parse_address(self.agent) != self.agent:
+                raise InvalidRecord("Profile", "agent: expected the address in EIP-55 form")
+        except InvalidAddress as error:
+            raise InvalidRecord("Profile", f"agent: {error}") from None
+
+
+def text_fault(field: str, text: str) -> str:
+    """Why a text can't be the `name`, `about` or `place` of a robot, in a few words; empty if it can."""
+    most = LONGEST_ABOUT if field == "about" else LONGEST_NAME
+    if len(text) > most:
+        return f"it has {len(text)} characters; the most are {most}"
+    if field == "name" and text[:2].lower() == "0x":
+        return "a name does not begin with 0x, as addresses do"
+    try:
+        require_plain_text(text)
+    except ValueError as error:
+        return str(error)
+    return ""

@@ -1,0 +1,177 @@
+"""The profile of a robot: from its settings and its model, by what it does, and how others see it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from mesh import Agent, ConfigurationError
+from mesh.agent._profile import INTERVAL, LARGEST_PICTURE
+from mesh.agent.handlers import Job, JobFailed
+from mesh.network import Endpoints, Network
+from mesh.watching.robots import Robot, RobotDirectory
+from schemas import Empty, ProfileKey, cid_of_bytes
+from schemas.profiles import Profile
+from tests.mesh.agent.test_own_model import DRIVE, Move, driving
+from tests.support.market import MODEL, Place, offering
+from tests.support.objectives import objective
+from tests.support.raising import raises_with
+from tests.support.waiting import until, until_answered, until_found, until_heard
+
+if TYPE_CHECKING:
+    import zenoh
+
+PNG = b"\x89PNG\r\n\x1a\n and more"
+LIFT = {"name": "Lift 1", "about": "Lifts 1.2 t.", "place": "Hall 3"}
+
+
+def robot_at(at: Place, model: Any = MODEL, **settings: Any) -> Agent:
+    account, chain = at.market.accounts["robot"], at.chains["robot"]
+    return Agent(model, settings=at.settings("robot", **settings), account=account, chain=chain)
+
+
+async def profile_of(robot: Agent, asker: Agent) -> Profile:
+    """What a robot says to another agent now."""
+    await until_answered(asker.network.session, str(ProfileKey(robot.address)))
+    found = await RobotDirectory(asker.network.session, asker.channel).find(robot.address)
+    assert found is not None
+    return found
+
+
+async def test_a_robot_says_what_its_settings_and_its_model_say(place: Place) -> None:
+    picture = place.save(PNG, "lift.png")
+    robot = driving(robot_at(place, place.save(DRIVE.encode(), "model.json"), picture=str(picture), **LIFT))
+    async with robot, place.agent("person") as person:
+        said = await profile_of(robot, person)
+        assert {name: getattr(said, name) for name in LIFT} == LIFT
+        assert (said.agent, said.model, said.price) == (robot.address, DRIVE.cid, "5 XRT")
+        assert (said.state, said.queue, said.wait) == ("idle", 0, 0)
+        assert abs(said.time - time.time()) < 60
+        assert said.picture == cid_of_bytes(PNG)
+        assert robot.parts.store.has(said.picture)
+        (seen,) = await person.robots(DRIVE.cid)
+        assert (str(seen), seen.address, seen.price) == ("Lift 1", robot.address, "5 XRT")
+        assert seen.paid is not None
+        assert await person.robots(MODEL) == []
+
+
+async def test_an_agent_that_only_orders_is_no_robot(place: Place) -> None:
+    async with offering(place.agent("robot")) as robot, place.agent("person", name="Ann") as person:
+        await profile_of(robot, person)
+        assert [one.address for one in await person.robots()] == [robot.address]
+
+
+@pytest.mark.parametrize(
+    ("settings", "code"),
+    [
+        ({"name": "n" * 81}, "profile-invalid"),
+        ({"about": "\x1b[2J"}, "profile-invalid"),
+        ({"picture": "lift.png"}, "picture-unusable"),
+        ({"picture": "text"}, "picture-unusable"),
+        ({"picture": "large"}, "picture-unusable"),
+    ],
+)
+async def test_what_nobody_could_show_ends_the_start(place: Place, settings: dict[str, str], code: str) -> None:
+    files = {"text": b"a text", "large": PNG + bytes(LARGEST_PICTURE)}
+    named = {key: str(place.save(files[text], text)) if text in files else text for key, text in settings.items()}
+    with raises_with(ConfigurationError, code=code):
+        await offering(robot_at(place, **named)).__aenter__()
+
+
+async def test_a_job_changes_the_state_and_the_queue(place: Place) -> None:
+    """Both jobs are paid or refunded in the end, and counted for those who ask."""
+    go_on, robot = asyncio.Event(), robot_at(place, place.save(DRIVE.encode(), "model.json"), name="Lift")
+
+    @robot.on("/drive")
+    async def drive(job: Job, move: Move) -> None: ...
+
+    @robot.on("/stop")
+    async def stop(job: Job, nothing: Empty) -> None:
+        await go_on.wait()
+        if job.liability.cost == 2:
+            raise JobFailed("it is broken")
+
+    async with place.at_work(offering(robot)) as person:
+        counted = await person.chain.liabilities.outcomes(blocks=50_000, most=500)
+        before = counted.get(robot.address, (0, 0))
+        contracts = [
+            await person.demand(
+                place.save(objective(("/drive", {"speed": speed}), ("/stop", Empty()))), cost=cost, model=DRIVE.cid
+            )
+            for speed, cost in ((1.0, 1), (1.5, 2))
+        ]
+        directory = RobotDirectory(person.network.session, person.channel)
+
+        async def is_busy() -> bool:
+            (one,) = await directory.present()
+            return (one.state, one.queue, one.wait) == ("working", 1, 3)  # 2 s each, half of one is done
+
+        await until_found(is_busy, what="the second job")
+        go_on.set()
+        outcomes = [await contract.outcome() for contract in contracts]
+        assert [outcome.success for outcome in outcomes] == [True, False]
+
+        async def is_idle() -> bool:
+            (one,) = await directory.present()
+            return (one.state, one.queue, one.wait) == ("idle", 0, 0)
+
+        await until_found(is_idle, what="an idle robot")
+        paid, refunded = (await person.chain.liabilities.outcomes(blocks=50_000, most=500))[robot.address]
+        assert (paid, refunded) == (before[0] + 1, before[1] + 1)
+        (seen,) = await directory.count(person.chain, await directory.present())
+        assert (seen.paid, seen.refunded) == (paid, refunded)
+        last = await person.chain.liabilities.outcomes(blocks=50_000, most=1)
+        assert last == {robot.address: (0, 1)}
+
+
+async def test_a_robot_can_be_marked_as_stopped(place: Place) -> None:
+    async with offering(place.agent("robot")) as robot, place.agent("person") as person:
+        robot.runtime.profile.mark("closed", on=True)
+        robot.runtime.profile.mark("stopped", on=True)
+        assert (await profile_of(robot, person)).state == "stopped"
+        robot.runtime.profile.mark("stopped", on=False)
+        assert (await profile_of(robot, person)).state == "closed"
+        robot.runtime.profile.mark("closed", on=False)
+        assert (await profile_of(robot, person)).state == "idle"
+
+
+async def test_a_change_is_put_once_a_second_at_most(place: Place) -> None:
+    heard: list[tuple[float, Profile]] = []
+
+    def hear(sample: zenoh.Sample) -> None:
+        heard.append((time.monotonic(), Profile.decode(sample.payload.to_bytes())))
+
+    robot = offering(place.agent("robot"))
+    key = str(ProfileKey(place.address("robot")))
+    async with Network(Endpoints(connect=(place.endpoint,))) as network:
+        subscriber = network.session.declare_subscriber(key, hear)
+        async with robot:
+            await until_heard(robot.network.session, key)
+            for number in range(50):
+                robot.runtime.profile.mark("stopped", on=number % 2 == 0)
+                await asyncio.sleep(0.02)
+            robot.runtime.profile.mark("stopped", on=True)
+            await until(lambda: bool(heard) and heard[-1][1].state == "stopped", what="the last state")
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    assert all(profile.is_signed for _, profile in heard)
+    assert all(later - earlier > INTERVAL / 2 for (earlier, _), (later, _) in pairwise(heard))
+    assert len(heard) <= 4
+
+
+async def test_an_agent_without_an_account_lists_robots_without_records(place: Place) -> None:
+    async with offering(robot_at(place, name="Lift")) as robot, place.agent("person") as person:
+        await profile_of(robot, person)
+        async with Agent(MODEL, settings=place.settings("watcher")) as watcher:
+            (seen,) = await watcher.robots()
+    assert isinstance(seen, Robot)
+    assert (str(seen), seen.paid, seen.refunded) == ("Lift", None, None)
+
+
+def test_a_robot_has_all_that_its_profile_says() -> None:
+    names = {"agent", "signature"} ^ {field.name for field in msgspec.structs.fields(Profile)}
+    assert names | {"address", "paid", "refunded"} == {field.name for field in msgspec.structs.fields(Robot)}
