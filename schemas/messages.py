@@ -377,7 +377,7 @@ MAX_MESSAGE_SIZE: Final = 16_384
 """The longest payload, in bytes, that is decoded. Real messages have about 700."""
 
 _TYPE_OF_MARK: Final[dict[str, type[Message]]] = {kind.mark: kind for kind in MESSAGE_TYPES}
-_MARKS: Final = tuple((f'"{mark}"'.encode(), kind) for mark, kind in _TYPE_OF_MARK.items())
+_MARKS: Final = tuple((f'"{mark}":'.encode(), kind) for mark, kind in _TYPE_OF_MARK.items())
 _FIELDS: Final = {kind: msgspec.structs.fields(kind) for kind in MESSAGE_TYPES}
 _FIELD_COUNTS: Final = {kind: len(fields) for kind, fields in _FIELDS.items()}
 _NEW_CIDS: Final[dict[type[Any], bytes]] = {Demand: b'"objective":"', Offer: b'"objective":"', Result: b'"result":"'}
@@ -527,8 +527,8 @@ def order_abi(order: Order) -> bytes:
 
 
 def _type_of(payload: bytes) -> type[Message]:
-    # No value of a well-formed message contains a quotation mark, so a mark that is found is a key. A writer may spell
-    # keys with escapes; then none is found and the object is parsed.
+    # No text of a well-formed message contains a quotation mark, so a mark before a colon is a key. A writer may spell
+    # keys with escapes, or with spaces behind them; then none is found and the object is parsed.
     for mark, kind in _MARKS:
         if mark in payload:
             return kind

@@ -533,7 +533,7 @@ class Trader(Lifecycle):
         known = self.contracts.created(liability, next(iter(lasting), ""))
         for (identity, order), lasts in zip(orders.items(), lasting, strict=True):
             if order is not None:
-                log.info("matched our %s %s", order.state, order, extra=log_event("contract-created", order=identity))
+                log.info("matched our %s %s", order.state, order, extra=log_event("order-matched", order=identity))
                 order.state, order.liability = OrderState.MATCHED, liability.address
                 self._forget(order)
             await self._parts.outbox.spend(identity if order is None else order.identity, liability.address)

@@ -96,6 +96,10 @@ def test_the_fields_determine_the_kind() -> None:
     assert decode(payload(TRANSACTION_JSON)) == TransactionFeedback(tx=NONCE)
 
 
+def test_a_text_like_a_field_of_another_kind_determines_nothing() -> None:
+    assert reason(b'{"tx":"accepted"}') == "hash"
+
+
 def test_keys_may_be_spelled_with_escapes() -> None:
     escaped = payload(DEMAND_JSON).replace(b"validatorFee", b"validator\\u0046ee").replace(b"model", b"\\u006dodel")
     assert decode(escaped) == DEMAND

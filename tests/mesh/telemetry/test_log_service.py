@@ -93,7 +93,7 @@ async def test_agent_and_provider_serve_the_events_of_a_liability(place: Place, 
     assert {"the lamp is on", "the lamp is off"} <= set(words)
     events = [entry.event for entry in reply.entries if entry.event]
     assert events == [
-        "contract-created",
+        "order-matched",
         "job-accepted",
         "job-ready",
         "job-started",
@@ -112,7 +112,7 @@ async def test_agent_and_provider_serve_the_events_of_a_liability(place: Place, 
         place.market.deployment.lighthouse_name
     }
     created, ended = asked.entries
-    assert (created.event, ended.event) == ("contract-created", "contract-ended")
+    assert (created.event, ended.event) == ("order-matched", "contract-ended")
     assert created.facts["order"] == provided.entries[0].facts["demand"]
 
 

@@ -18,8 +18,8 @@ export interface Wish {
   cost: bigint;
   validator: Address;
   validatorFee: bigint;
-  /** How long it waits for a robot. */
-  minutes: number;
+  /** How long it waits for a robot; null for as long as orders usually do. */
+  minutes: number | null;
   /** Throws if the validator does not judge for this fee any more. */
   confirm?: () => Promise<void>;
 }
@@ -30,11 +30,9 @@ export interface Draft extends Omit<Wish, "model" | "objective" | "confirm" | "m
   lifetime: number;
 }
 
-export const USUAL_MINUTES = 10;
-
 /** For how many blocks an order is valid that waits so long. */
-export function blocksOf(minutes: number, market: Market): number {
-  if (minutes === USUAL_MINUTES) return market.defaultLifetime;
+export function blocksOf(minutes: number | null, market: Market): number {
+  if (minutes === null) return market.defaultLifetime;
   return Math.max(2, Math.round((minutes * 60) / Math.max(market.blockTime, 0.1)));
 }
 

@@ -4,7 +4,7 @@ import { useApp, useData, wordsOf } from "../app";
 import { isCid } from "../cid";
 import { amount, duration, ether, plain } from "../format";
 import { parseAmount } from "../numbers";
-import { USUAL_MINUTES, blocksOf, contractsOf, orderLocally, prepare, signAndPost } from "../ordering";
+import { blocksOf, contractsOf, orderLocally, prepare, signAndPost } from "../ordering";
 import type { Prepared, Wish } from "../ordering";
 import { calls } from "../contracts";
 import { texts } from "../texts";
@@ -16,7 +16,7 @@ import { Fit, ObjectiveChoice, firstChoice, useObjective, withoutDescription } f
 import { NOBODY, ValidatorChoice } from "./validator";
 import type { Judge } from "./validator";
 
-const LIFETIMES = [5, 10, 60, 720];
+const LIFETIMES = [5, 60, 720];
 
 /** The page for ordering: a model, an objective, a price, a signature. */
 export function OrderPage(props: { model: string }) {
@@ -107,7 +107,7 @@ function OrderForm({ model }: { model: Model }) {
   const { market, account } = useApp();
   const [choice, setChoice] = useState(() => firstChoice(model));
   const [price, setPrice] = useState(typicalPrice(model.description?.price, market.token.symbol) || "1");
-  const [minutes, setMinutes] = useState(USUAL_MINUTES);
+  const [minutes, setMinutes] = useState<number | null>(null);
   const [judge, setJudge] = useState<Judge | null>(NOBODY);
   const make = useObjective(model, choice);
   const cost = parseAmount(price, market.token.decimals);
@@ -127,8 +127,9 @@ function OrderForm({ model }: { model: Model }) {
           <NumberField label={texts.youPay(plain(market.token.symbol, 12))} text={price} change={setPrice} error={cost === null ? texts.notAnAmount : ""} hint={texts.youPayHint} class="big number" />
           <Field label={texts.waitFor} hint={texts.waitForHint}>
             {(id, described) => (
-              <select id={id} aria-describedby={described} class="big" value={minutes} onChange={(event) => setMinutes(Number(event.currentTarget.value))}>
-                {LIFETIMES.filter((one) => one <= USUAL_MINUTES || blocksOf(one, market) <= market.limits.lifetime).map((one) => <option key={one} value={one}>{duration(one * 60)}</option>)}
+              <select id={id} aria-describedby={described} class="big" value={minutes ?? ""} onChange={(event) => setMinutes(Number(event.currentTarget.value) || null)}>
+                <option value="">{duration(market.defaultLifetime * (market.blockTime || 1))}</option>
+                {LIFETIMES.filter((one) => blocksOf(one, market) <= market.limits.lifetime).map((one) => <option key={one} value={one}>{duration(one * 60)}</option>)}
               </select>
             )}
           </Field>

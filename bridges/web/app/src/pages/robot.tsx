@@ -3,7 +3,6 @@ import { zeroAddress } from "viem";
 import { useApp, useData } from "../app";
 import { amount, plain } from "../format";
 import { parseAmount } from "../numbers";
-import { USUAL_MINUTES } from "../ordering";
 import type { Wish } from "../ordering";
 import { texts } from "../texts";
 import type { Model, Robot } from "../types";
@@ -39,7 +38,7 @@ function RobotOrder({ robot, model }: { robot: Robot; model: Model }) {
   const cost = robot.cost !== null ? BigInt(robot.cost) : typical;
   const wish = useMemo<Wish | null>(() => {
     const objective = robot.objective ? () => objectiveOf(robot.objective!, model) : chosen;
-    return objective && { model, objective, cost, validator: zeroAddress, validatorFee: 0n, minutes: USUAL_MINUTES };
+    return objective && { model, objective, cost, validator: zeroAddress, validatorFee: 0n, minutes: null };
   }, [model, robot.objective, chosen, cost]);
   return (
     <>
