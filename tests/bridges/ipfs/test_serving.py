@@ -97,11 +97,12 @@ async def test_a_legacy_page_orders_a_job_without_ipfs(place: Place, client: str
     assert found["result"] == found["result message"]
 
 
+@pytest.mark.parametrize("has_node", [False, True])
 @pytest.mark.parametrize(("client", "generation"), [("robonomics-3", 3), ("robonomics-5", 5)])
-async def test_a_legacy_page_orders_a_job_on_a_daemon(
-    place: Place, js_ipfs: JsIpfs, client: str, generation: Literal[3, 5]
+async def test_a_legacy_page_orders_a_job_on_js_ipfs(
+    place: Place, js_ipfs: JsIpfs, client: str, generation: Literal[3, 5], has_node: bool
 ) -> None:
-    """robonomics-js with its own IPFS provider and the daemon's own client; the bridge is at the same daemon."""
+    """robonomics-js with its own IPFS provider, on the daemon of the bridge or on a node in the page."""
     lighthouse = f"airalab.lighthouse.{generation}.robonomics.eth"
     options: Any = {"generation": generation, "lighthouse_contract": lighthouse}
     robot = offering(place.agent("robot", **options))
@@ -112,7 +113,7 @@ async def test_a_legacy_page_orders_a_job_on_a_daemon(
 
     content = b64encode(objective(("/blink", None))).decode()
     settings = place.settings("bridge", ipfs_http_provider=js_ipfs.api, **options)
-    http_client = require("js-ipfs").parents[2] / "ipfs-http-client" / "src" / "index.js"
+    packages = require("js-ipfs").parents[2]
     async with (
         Network(Endpoints(connect=(place.endpoint,))) as network,
         IpfsBridge(network, settings, chain=lambda: place.chain("provider")) as bridge,
@@ -126,7 +127,8 @@ async def test_a_legacy_page_orders_a_job_on_a_daemon(
         tasks.start(provider.run(), "provider of the test")
         await until(lambda: bridge.channels[0].status().state in ("alone", "connected"))
         ens = place.market.deployment.ens
-        found = await run(client, node.url, ens, js_ipfs.api, MODEL, content, str(http_client))
+        ipfs = js_ipfs.swarm_address if has_node else js_ipfs.api
+        found = await run(client, node.url, ens, ipfs, MODEL, content, str(packages))
         assert cid_of_bytes(await daemon.cat(found["result"])) == found["result"]
     assert found["offer"] == place.address("robot")
     assert found["result"] == found["result message"]

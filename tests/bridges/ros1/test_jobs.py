@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import ExitStack, suppress
+from re import findall
 from typing import TYPE_CHECKING
 
 import pytest
@@ -75,6 +76,29 @@ async def test_the_node_of_the_first_tutorial_greets_and_is_paid(scene: Opened) 
             ("/data", "std_msgs/String", "Hello person"),
         ]
         assert await here.place.balance("robot") == before + 42
+
+
+async def test_a_tutorial_node_answers_a_bag_with_a_bag(
+    place: Place, graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
+) -> None:
+    """With `bag_results`: what it played and said, with the names that it has in the ROS graph."""
+    robot = place.agent("robot", open_services=True, bag_results=True)
+    async with (
+        asyncio.timeout(60),
+        graph() as here,
+        place.at_work(robot) as person,
+        bridged(place, robot, here),
+        ros(here.master).node("blink", "String", messages=messages["5"]) as node,
+    ):
+        assert await node.hear() == "ready"
+        task = Bag([BagMessage("/blink", String("red").encode(), 1)]).encode()
+        contract = await person.demand(place.save(task, "objective.bag"))
+        assert (await contract.outcome()).success
+        result = await contract.recording()
+        info = await ros(here.master).run("rosbag", "info", "-y", str(result))
+    below = f"/liability/eth_{contract.address}"
+    assert [found.removeprefix("topic: ") for found in findall("topic: .*", info)] == [f"{below}/blink", f"{below}/led"]
+    assert info.count("type: std_msgs/String") == 3  # once in the list of types
 
 
 async def test_a_sensor_answers_a_free_demand_with_a_bag_of_what_its_board_says(scene: Opened) -> None:

@@ -1,11 +1,32 @@
-// The client of the daemon: ipfs-api, as pages of 2018 had it, or the ipfs-http-client at a path, for today's daemons.
+// What a page reaches IPFS by: ipfs-api, as in 2018, with a daemon at `url`; or what belongs to today's js-ipfs, from the
+// folder of its packages: its client with a daemon at `url`, or a node in the page that connects to the swarm address.
+const { mkdtempSync } = require('fs')
+const { tmpdir } = require('os')
+const { join } = require('path')
 
-async function open(url, httpClient) {
-  if (httpClient) {
-    const { create } = await import(httpClient)
-    const ipfs = create({ url })
-    return { ipfs, add: async (bytes) => String((await ipfs.add(bytes)).cid) }
-  }
+async function open(url, packages) {
+  if (!packages) return opened2018(url)
+  const ipfs = await (url.startsWith('http') ? client(url, packages) : node(url, packages))
+  return { ipfs, add: async (bytes) => String((await ipfs.add(bytes)).cid) }
+}
+
+async function client(url, packages) {
+  const { create } = await import(join(packages, 'ipfs-http-client/src/index.js'))
+  return create({ url })
+}
+
+async function node(address, packages) {
+  const { create } = await import(join(packages, 'ipfs-core/src/index.js'))
+  const { multiaddr } = await import(join(packages, '@multiformats/multiaddr/dist/src/index.js'))
+  const Discovery = { MDNS: { Enabled: false }, webRTCStar: { Enabled: false } }
+  const Addresses = { Swarm: ['/ip4/127.0.0.1/tcp/0'], Delegates: [] }
+  const repo = mkdtempSync(join(tmpdir(), 'page-'))
+  const ipfs = await create({ repo, silent: true, config: { Addresses, Bootstrap: [], Discovery } })
+  await ipfs.swarm.connect(multiaddr(address))
+  return ipfs
+}
+
+function opened2018(url) {
   const IPFS = require('ipfs-api')
   const { hostname, port } = new URL(url)
   const ipfs = new IPFS(hostname, port)

@@ -1,7 +1,7 @@
 // Run by node: order a job with robonomics-js 0.3.0 and its own IPFS provider, as a page of 2018 did.
 //
-//     NODE_PATH=… node order_3.cjs NODE_URL ENS IPFS_URL MODEL OBJECTIVE [HTTP_CLIENT]
-const [url, ens, ipfsUrl, model, content, httpClient] = process.argv.slice(2)
+//     NODE_PATH=… node order_3.cjs NODE_URL ENS IPFS_URL MODEL OBJECTIVE [JS_IPFS_PACKAGES]
+const [url, ens, ipfsUrl, model, content, packages] = process.argv.slice(2)
 
 // The client waits 3 to 10 s between two looks at the chain.
 const later = global.setTimeout
@@ -20,7 +20,7 @@ const report = (name, value) => console.log(JSON.stringify({ name, value }))
 async function main() {
   const web3 = new Web3(new Web3.providers.HttpProvider(url))
   const account = web3.eth.accounts[2]
-  const { ipfs, add } = await open(ipfsUrl, httpClient)
+  const { ipfs, add } = await open(ipfsUrl, packages)
   report('daemon', [(await ipfs.version()).version, (await ipfs.id()).id])
   const hash = await add(Buffer.from(content, 'base64'))
   const provider = new MessageProviderIpfsApi(ipfs)
@@ -29,15 +29,20 @@ async function main() {
   await robonomics.setLighthouse('airalab')
   await new Promise((resolve, reject) =>
     robonomics.xrt.send('approve', [robonomics.factory.address, 42], { from: account }).then(resolve, reject))
-  robonomics.getOffer(model, (offer) => report('offer', offer.account))
-  robonomics.getResult((message) => report('result message', message.result))
+  const offered = new Promise((resolve) => robonomics.getOffer(model, resolve))
+  const results = []
+  robonomics.getResult((message) => results.push(message.result))
   const terms = { objective: hash, token: robonomics.xrt.address, cost: 42, deadline: web3.eth.blockNumber + 1000 }
   const made = new Promise((resolve) => robonomics.watchLiability(null, resolve))
   const posted = robonomics.postDemand(model, terms)
-  // It waits for a callback that the clients of today's daemons do not call.
-  const liability = await (httpClient ? made : posted)
+  // It waits for a callback that today's js-ipfs does not call.
+  const liability = await (packages ? made : posted)
   report('liability', liability.address)
-  report('result', await new Promise((resolve) => liability.watchResult(resolve)))
+  const result = await new Promise((resolve) => liability.watchResult(resolve))
+  report('result', result)
+  report('offer', (await offered).account)
+  while (!results.includes(result)) await new Promise((resolve) => setTimeout(resolve, 100))
+  report('result message', result)
 }
 
 main().then(() => process.exit(0), (error) => { console.error(error); process.exit(1) })
