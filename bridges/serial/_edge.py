@@ -212,8 +212,10 @@ class Edge:
 
     def _board_ready(self, info: DeviceInfo) -> None:
         """Declare the board's topics in the mesh, and its presence."""
-        named = tuple(self._valid_names(info))
-        self._name_of = dict.fromkeys(info.topics, "") | dict(named)
+        self._name_of = {}
+        for topic in info.topics:
+            self._name_of[topic] = self._valid_name(topic)
+        named = [(topic, name) for topic, name in self._name_of.items() if name]
         accepting = [(topic, name) for topic, name in named if topic.flow in (Flow.SUBSCRIBES, Flow.SERVES)]
         self._commandable = {name: topic for topic, name in reversed(accepting)}
         for topic, name in accepting:
@@ -233,29 +235,24 @@ class Edge:
         title = " ".join(filter(None, ("the board", info.name, info.version)))
         log.info("%s is present: %s", title, topics, extra=ready)
 
-    def _valid_names(self, info: DeviceInfo) -> Iterator[tuple[BoardTopic, str]]:
-        """The board's topics with their names in the mesh.
-
-        Left out are those without a valid name, and with another type than an earlier one of that name and direction.
-        """
-        types: dict[tuple[str, Flow], PayloadType] = {}
-        for topic in info.topics:
-            try:
-                name = topic_chunks(self.options.rename(topic.name))
-            except InvalidKey as error:
-                self._reject(topic, str(error))
-                continue
-            first = types.setdefault((name, topic.flow), topic.type)
+    def _valid_name(self, topic: BoardTopic) -> str:
+        """The name of a topic in the mesh; empty if that is invalid, or an earlier topic of that direction has it with
+        another type."""
+        why = ""
+        try:
+            name = topic_chunks(self.options.rename(topic.name))
+        except InvalidKey as error:
+            why = str(error)
+        else:
+            same = ((one.type, one.flow) for one, taken in self._name_of.items() if taken == name)
+            first = next((type for type, flow in same if flow is topic.flow), topic.type)
             if first == topic.type:
-                yield topic, name
-            else:
-                kinds = f"{first.schema_name or first.encoding} and {topic.type.schema_name or topic.type.encoding}"
-                self._reject(topic, f"it has two types, {kinds}; the first one is used, so rename the other topic")
-
-    @staticmethod
-    def _reject(topic: BoardTopic, why: str) -> None:
+                return name
+            kinds = f"{first.schema_name or first.encoding} and {topic.type.schema_name or topic.type.encoding}"
+            why = f"it has two types, {kinds}; the first one is used, so rename the other topic"
         rejected = log_event("topic-rejected", topic=topic.name, id=topic.id)
         log.error("topic %s of the board is not used: %s", topic.name, why, extra=rejected)
+        return ""
 
     def _declare(self, name: str) -> list[Any]:
         """Subscribe to commands and calls on a topic, in jobs and outside."""
@@ -363,9 +360,8 @@ class Edge:
 
     def _publish(self, topic: BoardTopic, payload: bytes) -> None:
         """Put a board's message on its topic of the current job, or of the device; or forward its request."""
-        if topic not in self._name_of:
-            self._name_of[topic] = ""
-            self._reject(topic, "the board has not announced it")
+        if topic not in self._name_of:  # a dialect may publish on topics that no board announces
+            self._name_of[topic] = self._valid_name(topic)
         if not (name := self._name_of[topic]):
             return
         if topic.flow is Flow.REQUESTS:

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
+import zenoh
 
 from bridges.serial._device import Device
 from bridges.serial._edge import Edge, EdgeOptions
 from bridges.serial.dialect import BoardTopic, CallFailed, CallStatus, Flow, MessageReceived
 from schemas import String
+from schemas.keys import any_topic_selector
 from schemas.payloads import STRING
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, ROSSERIAL_TWINS, board, edge
 from tests.support.commands import aira
@@ -24,6 +26,7 @@ from tests.support.market import founded, place
 from tests.support.orders import ROBOT
 from tests.support.ports import free_port
 from tests.support.raising import raises_with
+from tests.support.routers import client_config
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -208,10 +211,17 @@ def test_an_invalid_option_is_one_clear_line(arguments: tuple[str, ...], reporte
     assert "Traceback" not in done.stderr
 
 
-def test_a_topic_that_the_board_has_not_announced_is_named_once_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_topic_that_no_board_has_announced_is_published_if_its_name_is_valid(
+    router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
+) -> None:
     edge = Edge(EdgeOptions(agent=ROBOT.address, port="/dev/ttyNONE", protocol="frames", baud=57_600))
-    for _ in range(2):
-        edge._on_event(MessageReceived(BoardTopic("/late", Flow.PUBLISHES, STRING, 7), String("late").encode()))
-    edge.stop()
-    edge._line.run()  # closes what it has opened
+    heard: list[zenoh.Sample] = []
+    with zenoh.open(client_config(router.endpoint)) as session:
+        edge.stop()
+        edge.run(session)  # ends at once
+        session.declare_subscriber(any_topic_selector(ROBOT.address, "/late"), heard.append)
+        for name in ("/no name", "/no name", "/late"):
+            edge._on_event(MessageReceived(BoardTopic(name, Flow.PUBLISHES, STRING, 7), String("x").encode()))
+        await until(lambda: heard, what="the message", seconds=LONG)
+    assert heard[0].payload.to_bytes() == String("x").encode()
     assert [record.event for record in caplog.records] == ["topic-rejected"]  # type: ignore[attr-defined]
