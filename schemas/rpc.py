@@ -23,6 +23,7 @@ from schemas.records import (
     Record,
     UInt256,
 )
+from schemas.signing import Decline, SignedRecord  # msgspec reads the annotations
 from schemas.status import LogsRead, ReadLogs, Status
 
 if TYPE_CHECKING:
@@ -113,6 +114,49 @@ class SendResult(SignResult, frozen=True, kw_only=True):
     """Publish a signed Result."""
 
     signature: str
+
+
+class AcceptDemand(SignedRecord, frozen=True, kw_only=True):
+    """Ask a robot for its offer for a demand that is for it alone; nothing of it is published.
+
+    The demand's signature is empty: the robot gets nothing that another could use. `maker` (EIP-55) signs the request,
+    and the demand later.
+    """
+
+    domain: ClassVar = b"aira accept\0"
+    author: ClassVar = "maker"
+
+    demand: SendDemand
+    robot: str
+    maker: str
+
+
+class Accepted(Record, frozen=True, kw_only=True, omit_defaults=True):
+    """The robot's signed offer for the demand, or why it makes none; one of the two."""
+
+    offer: SendOffer | None = None
+    decline: Decline | None = None
+
+
+class OrderPair(SignedRecord, frozen=True, kw_only=True):
+    """Ask a provider to create the contract of a demand and an offer, and to match neither with anything else.
+
+    The demand's `maker` (EIP-55) signs this, too: so nobody else can bind a demand to an offer.
+    """
+
+    domain: ClassVar = b"aira pair\0"
+    author: ClassVar = "maker"
+
+    demand: SendDemand
+    offer: SendOffer
+    maker: str
+
+
+class PairTaken(Record, frozen=True, omit_defaults=True):
+    """The provider creates the contract when its turn comes; or, with a `code` and a `detail`, why it does not."""
+
+    code: str = ""
+    detail: str = ""
 
 
 class Published(Record, frozen=True):
@@ -256,6 +300,8 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "read": Service(LiabilityRequest, LiabilityRead),
         "status": Service(Nothing, Status),
         "logs": Service(ReadLogs, LogsRead),
+        "accept": Service(AcceptDemand, Accepted),
+        "pair": Service(OrderPair, PairTaken),
         "sign/demand": Service(SignDemand, Published),
         "sign/offer": Service(SignOffer, Published),
         "sign/result": Service(SignResult, Published),

@@ -48,14 +48,15 @@ def result_identity(liability: str) -> str:
     return f"result {liability}"
 
 
-def outgoing(message: SignedMessage) -> Outgoing:
-    """The outbox's entry for a signed message."""
+def outgoing(message: SignedMessage, *, robot: str = "") -> Outgoing:
+    """The outbox's entry for a signed message; with a `robot` (address) for an order that is for that one alone."""
     deadline = None if isinstance(message, Result) else message.deadline
     return Outgoing(
         identity=outgoing_identity(message),
         kind=type(message).__name__.lower(),
         payload=encode(message),
         deadline=deadline,
+        robot=robot,
     )
 
 
@@ -65,6 +66,7 @@ class _Attempts:
 
     message: SignedMessage
     backoff: Backoff
+    robot: str = ""
     next_at: float = 0.0
 
     def is_open(self, head: int) -> bool:
@@ -80,6 +82,9 @@ class Outbox:
     market: it starts with an empty order book, or has missed a Result. Beyond `rate` messages wait: the oldest longest,
     and offers behind all others.
     `clock` (seconds) and `chance` (0 to 1, for jitter) are injected by tests.
+
+    An order that is for one robot alone is not put on the channel: `send_alone` is called with a demand and its robot,
+    and an offer stays here.
     """
 
     def __init__(
@@ -109,12 +114,13 @@ class Outbox:
         self._fresh: set[str] = set()
         """Messages that were never sent, in this run or an earlier one."""
         self._limiter = RateLimiter(per_sender=rate)
+        self.send_alone: Callable[[Demand, str], object] = lambda _demand, _robot: None
         self._changed = asyncio.Event()
 
-    async def post(self, message: SignedMessage) -> None:
-        """Keep a signed message until `settle`, and send it now."""
+    async def post(self, message: SignedMessage, *, robot: str = "") -> None:
+        """Keep a signed message until `settle`, and send it now; with a `robot`, an order for that one alone."""
         self._fresh.add(outgoing_identity(message))
-        await self._ledger.post(outgoing(message))
+        await self._ledger.post(outgoing(message, robot=robot))
         await self.send_new()
 
     async def settle(self, identity: str) -> bool:
@@ -141,9 +147,9 @@ class Outbox:
             await self._ledger.withdraw({withdrawal.order: outgoing(withdrawal) for withdrawal in withdrawals})
         await self.send_new()
 
-    async def replace(self, identity: str, message: SignedMessage) -> None:
+    async def replace(self, identity: str, message: SignedMessage, *, robot: str = "") -> None:
         """Send a signed message instead of the one called `identity`."""
-        await self._without(identity, partial(self._ledger.replace, identity, outgoing(message)))
+        await self._without(identity, partial(self._ledger.replace, identity, outgoing(message, robot=robot)))
         await self.send_new()
 
     def hold(self, identities: Iterable[str]) -> None:
@@ -177,7 +183,10 @@ class Outbox:
             wait = 0.5  # it exceeded the rate
             if identity in self._fresh or self._limiter.allow(""):
                 self._fresh.discard(identity)
-                self._channel.publish(one.message)
+                if not one.robot:
+                    self._channel.publish(one.message)
+                elif isinstance(one.message, Demand):
+                    self.send_alone(one.message, one.robot)
                 wait = one.backoff.next_delay() or 0.0
             one.next_at = now + wait
         self._changed.set()
@@ -205,7 +214,11 @@ class Outbox:
     def _sendable(self) -> Iterator[tuple[str, _Attempts]]:
         """The messages that are neither held nor expired, the oldest first."""
         head = self._head()
-        return ((key, one) for key, one in self._attempts.items() if key not in self._held and one.is_open(head))
+        return (
+            (key, one)
+            for key, one in self._attempts.items()
+            if key not in self._held and one.is_open(head) and not (one.robot and isinstance(one.message, Offer))
+        )
 
     async def _without(self, identity: str, remove: Callable[[], Awaitable[T]]) -> T:
         """Call what removes a message from the ledger."""
@@ -216,7 +229,7 @@ class Outbox:
     def _first_attempt(self, one: Outgoing) -> _Attempts:
         message = decode(one.payload)
         assert isinstance(message, Demand | Offer | Withdrawal | Result)
-        return _Attempts(message, Backoff(self._policy, chance=self._chance))
+        return _Attempts(message, Backoff(self._policy, chance=self._chance), one.robot)
 
     async def _wait(self) -> None:
         """Wait until the next attempt is due."""

@@ -21,7 +21,7 @@ from mesh.agent._profile import OwnProfile
 from mesh.agent._services import offer_services
 from mesh.agent._status import AgentStatus
 from mesh.agent.contracts import ContractReports, Outcome
-from mesh.agent.demands import DemandDispatcher
+from mesh.agent.demands import Acceptance, DemandDispatcher
 from mesh.agent.handlers import call
 from mesh.agent.jobs import Executor
 from mesh.agent.ledger import TO_BE_DONE, UNFINISHED, Phase, advance
@@ -256,6 +256,8 @@ class AgentRuntime(Lifecycle):
         await stack.enter_async_context(answering_phases(self.parts, self.executor))
         services = self.parts.services
         offer_services(self.parts, self.executor, has_handlers=bool(self._handlers.topics))
+        if decide := self._handlers.market.get(Demand):
+            services.offer("accept", Acceptance(self.parts, self.trader, decide, model=self._model).accept)
         services.offer("logs", LogService("agent", self.parts.signer.address).logs)
         services.offer("status", self.status.status)
 

@@ -202,6 +202,7 @@ class DemandTerms(TypedDict, total=False):
     validator: str
     validator_fee: int | str | None
     lifetime: int | None
+    robot: str
 
 
 ASK_SECONDS: Final = 60.0
@@ -457,6 +458,7 @@ class Agent(Program):
         validator: str = "",
         validator_fee: int | str | None = None,
         lifetime: int | None = None,
+        robot: str = "",
     ) -> Order:
         """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
 
@@ -464,6 +466,9 @@ class Agent(Program):
         as `[("/blink", "red"), ("/stop", Empty())]`; the agent serves it. The other terms are as for `offer`;
         `validator_fee` is `"0.1 XRT"`, or wn; by default what the validator announces. The factory gets the allowance
         that they need. A restarted agent sends the order again.
+
+        With a `robot` (address) only that one gets the job: it is asked for its offer, and the demand is not published.
+        Raises `DemandDeclined` with its reason if it makes none, `ServiceFailed` if it does not answer.
 
         Raises `InputError`, `InsufficientTokens`, `ObjectiveUnfit` if a file is not playable, or
         if the model's description is available and excludes the objective, `UnsafeValidator` and its like for a
@@ -476,7 +481,8 @@ class Agent(Program):
         )
         await self.runtime.require_fit(cid, terms["model"])
         fee = await self._announced_fee(terms) if validator_fee is None else XRT.amount(validator_fee)
-        return await self.runtime.trader.post(Demand, terms, validator_fee=fee)
+        named = parse_address(robot) if robot else ""
+        return await self.runtime.trader.post(Demand, terms, robot=named, validator_fee=fee)
 
     async def demand(
         self, objective: str | Path | Messages, *, on_progress: OnProgress = nothing, **terms: Unpack[DemandTerms]
@@ -484,7 +490,8 @@ class Agent(Program):
         """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
 
         The terms are those of `order`, `on_progress` that of `Order.contract`. Cancelling withdraws the demand. Raises
-        `OrderExpired`, `OrderClosed` (withdrawn elsewhere) and `InsufficientTokens`.
+        `OrderExpired`, `OrderClosed` (withdrawn elsewhere), `InsufficientTokens`, and `OtherRobot` if another one than
+        the `robot` that was named has the contract.
         """
         order = await self.order(objective, **terms)
         try:

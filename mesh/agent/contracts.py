@@ -587,6 +587,8 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True, repr_omit_defaults=True
     reason: str = ""
     code: str = ""
     reports: tuple[ValidatorReport, ...] = ()
+    robot: str = ""
+    """The robot that did the job, or should have: its address."""
 
 
 class Contract:
@@ -616,6 +618,11 @@ class Contract:
         """The contract's address (EIP-55)."""
         return self.liability.address
 
+    @property
+    def robot(self) -> str:
+        """The robot that does the job: its address."""
+        return self.liability.promisor
+
     async def outcome(self, *, on_progress: OnProgress = nothing) -> Outcome:
         """Wait until the contract is finalized. Cancelling the wait changes nothing.
 
@@ -631,7 +638,7 @@ class Contract:
             followed_job(self._parts, self.liability, on_progress),
         ):
             ended = await asyncio.shield(self._ended)
-            ended = msgspec.structs.replace(ended, reports=await self._last_reports())
+            ended = msgspec.structs.replace(ended, robot=self.robot, reports=await self._last_reports())
         if not ended.success:
             if self._failure is None:
                 self._failure = await self._reason(ended)

@@ -12,16 +12,20 @@ import logging
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from msgspec.structs import replace
+
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call
 from mesh.agent.objectives import Buyer, ObjectiveNotFetched, ObjectiveUnfit
-from mesh.agent.orders import DEMAND_TAKEN, EQUAL_DECLINED, HANDLED_FOR, TooManyOffers
+from mesh.agent.orders import ALONE, DEMAND_TAKEN, EQUAL_DECLINED, HANDLED_FOR, TooManyOffers
 from mesh.base.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.content import ContentTooLarge, ContentUnavailable
-from mesh.errors import ContentError, public_text
+from mesh.errors import ContentError, InvalidMessage, public_text
 from mesh.role.database import LedgerUnusable
-from schemas import DeclineKey
+from schemas import DeclineKey, Offer, Verified, message_hash
+from schemas.cid import is_cid
+from schemas.rpc import Accepted, SendOffer
 from schemas.signing import LONGEST_DETAIL, Decline
 
 if TYPE_CHECKING:
@@ -33,7 +37,8 @@ if TYPE_CHECKING:
     from mesh.base.flood import Drops
     from mesh.errors import AiraError
     from mesh.network import Channel, Subscription
-    from schemas import Demand, Signer, Verified
+    from schemas import Demand, Signer
+    from schemas.rpc import AcceptDemand
 
 
 log = logging.getLogger(__name__)
@@ -70,6 +75,15 @@ def grounds_of(error: AiraError) -> Grounds | None:
     return None
 
 
+def signed_decline(demand: Verified[Demand], grounds: Grounds, signer: Signer) -> Decline:
+    """The statement of an agent that it does not work for a demand, which is logged."""
+    order, code = demand.hash.hex(), grounds.code
+    facts = log_event("demand-declined", order=order, maker=demand.signer, code=code)
+    log.info("declined the demand %s of %s (%s): %s", order, demand.signer, code, grounds.detail, extra=facts)
+    detail = public_text(grounds.detail, longest=LONGEST_DETAIL)
+    return Decline(order=order, code=code, detail=detail, agent=signer.address).signed_by(signer)
+
+
 class DeclinePublisher:
     """Publishes an agent's declines on its market's `channel`; beyond a rate they are only counted in `drops`."""
 
@@ -84,13 +98,8 @@ class DeclinePublisher:
         if not self._limiter.allow(demand.signer):
             self._drops.count("declines", demand.signer)
             return
-        order, code = demand.hash.hex(), grounds.code
-        facts = log_event("demand-declined", order=order, maker=demand.signer, code=code)
-        log.info("declined the demand %s of %s (%s): %s", order, demand.signer, code, grounds.detail, extra=facts)
-        detail = public_text(grounds.detail, longest=LONGEST_DETAIL)
-        decline = Decline(order=order, code=code, detail=detail, agent=self._signer.address)
         key = str(DeclineKey(self._channel.lighthouse, demand.signer))
-        self._channel.put(key, decline.signed_by(self._signer).encode())
+        self._channel.put(key, signed_decline(demand, grounds, self._signer).encode())
 
 
 HANDLED: Final = 32
@@ -272,3 +281,67 @@ def _may_pass(error: AiraError) -> bool:
     from mesh.chain.following import NODE_ERRORS
 
     return isinstance(error, (*NODE_ERRORS, TransactionTimeout, LedgerUnusable, TooManyOffers))
+
+
+NO_MONEY: Final = "ERC20InsufficientBalance"
+"""What a maker lacks who can't pay; its allowance follows the robot's offer."""
+
+
+class Acceptance:
+    """The service `accept` of a robot: its `handlers` decide on a demand that is for it alone.
+
+    What they offer is not published, and is the reply. A demand that was answered before gets the same offer.
+    """
+
+    def __init__(self, parts: AgentComponents, trader: Trader, handlers: Sequence[Handler], *, model: str) -> None:
+        self._parts = parts
+        self._trader = trader
+        self._handlers = handlers
+        self._model = model
+        self._limiter = RateLimiter(per_sender=PER_MAKER, total=TOTAL)
+        self._places = asyncio.Semaphore(FREE_HANDLED)
+
+    async def accept(self, request: AcceptDemand) -> Accepted:
+        """The reply. Raises `InvalidMessage` for a request that is not for this robot, or not signed by its maker."""
+        demand = await self._checked(request)
+        grounds = await self._grounds(demand)
+        if isinstance(grounds, Offer):
+            return Accepted(offer=SendOffer.of(grounds))
+        return Accepted(decline=signed_decline(demand, grounds, self._parts.signer))
+
+    async def _checked(self, request: AcceptDemand) -> Verified[Demand]:
+        message: Demand = request.demand.message()
+        if not request.is_signed or request.robot != self._parts.signer.address:
+            raise InvalidMessage("signature", "its maker has not signed it for this robot")
+        if message.sender not in (None, request.maker):
+            raise InvalidMessage("sender", f"the order names {message.sender} as its sender")
+        if message.lighthouse != self._parts.channel.address:
+            raise InvalidMessage("lighthouse", f"made for {message.lighthouse}, not for this market")
+        if message.deadline <= self._parts.chain_head.head:
+            raise InvalidMessage("deadline", f"block {message.deadline} has passed")
+        await self._parts.chain.validators.check(message)
+        return Verified(replace(message, signature=""), message_hash(message), request.maker)
+
+    async def _grounds(self, demand: Verified[Demand]) -> Offer | Grounds:
+        """The offer, or why there is none."""
+        if is_cid(self._model) and demand.message.model != self._model:
+            return Grounds("other-model", f"it works for the model {self._model}")
+        answered = self._trader.answered.note(demand)
+        if answered.offer is None or not answered.offer.is_open:
+            if not self._limiter.allow(demand.signer):
+                return BUSY
+            ask = partial(self._parts.chain.funds.shortages, [demand])
+            if NO_MONEY in await self._parts.chain.retrying(ask, outages=self._parts.outages):
+                return Grounds("unfunded", "its maker lacks the money")
+            async with self._places:
+                ALONE.set(answered)
+                HANDLED_FOR.set(Buyer(demand.signer, pays=demand.message.cost > 0))
+                errors = [await call(handler, demand) for handler in self._handlers]
+            if answered.offer is None or not answered.offer.is_open:
+                self._trader.answered.forget(answered)
+                found = [grounds for error in errors if error is not None and (grounds := grounds_of(error))]
+                failed = any(errors)
+                return (found or [Grounds("failed" if failed else "no-offer", "its handlers made no offer")])[0]
+        offer = answered.offer.signed
+        assert isinstance(offer, Offer)
+        return offer

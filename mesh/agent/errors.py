@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from mesh.errors import AiraError, InputError
+from typing import TYPE_CHECKING
+
+from mesh.errors import AiraError, InputError, RemoteError, public_text
 from schemas.signing import LONGEST_DETAIL, is_word
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from schemas.signing import Decline
 
 
 class OrderClosed(AiraError, code="order-closed"):
@@ -33,6 +40,40 @@ class Declined(AiraError, code="declined"):
         super().__init__(f"declined ({reason}): {detail}" if detail else f"declined ({reason})")
         self.reason = reason
         self.detail = detail[:LONGEST_DETAIL]
+
+
+class DemandDeclined(RemoteError, code="demand-declined"):
+    """The robot that a demand is for, or all that are present, do not work for it: `declines` has the word of each.
+
+    `order` is the demand's hash.
+    """
+
+    def __init__(self, order: str, declines: Sequence[Decline]) -> None:
+        said = "; ".join(f"{one.agent}: {public_text(one.detail) or one.code} ({one.code})" for one in declines[:3])
+        more = f"; and {len(declines) - 3} more" if len(declines) > 3 else ""
+        super().__init__(
+            f"declined by {said}{more}",
+            hint="offer other terms, or ask another robot; `aira robots` shows who is present",
+        )
+        self.order = order
+        self.declines = tuple(declines)
+
+
+class OtherRobot(AiraError, code="other-robot"):
+    """A demand for `robot` (address) alone became the contract `liability` with another one, `promisor`.
+
+    A provider has broken its word, or somebody read the pair on its way to it.
+    """
+
+    def __init__(self, order: str, *, robot: str, promisor: str, liability: str) -> None:
+        super().__init__(
+            f"the order {order[:16]}… for {robot} became the contract {liability} with {promisor}",
+            hint="who sent its transaction is the provider that broke its word; `aira liability show` has more",
+        )
+        self.order = order
+        self.robot = robot
+        self.promisor = promisor
+        self.liability = liability
 
 
 class OrderExpired(AiraError, code="order-expired"):

@@ -106,11 +106,20 @@ CREATE TABLE IF NOT EXISTS spent (
     withdrawn INTEGER NOT NULL,
     liability TEXT NOT NULL
 );
+CREATE TABLE IF NOT EXISTS alone (
+    identity TEXT PRIMARY KEY,
+    robot TEXT NOT NULL
+);
 """
 """A withdrawn order is not sent, but may become a contract all the same, unless the transaction `tx` prevents that. The
-orders that became contracts are in `spent`."""
+orders that became contracts are in `spent`; those that are for one robot alone have it in `alone`."""
 COLUMNS: Final = "identity, kind, payload, deadline, posted, withdrawn"
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
+ALONE: Final = "INSERT OR IGNORE INTO alone (identity, robot) SELECT ?, ? WHERE ? != ''"
+ROBOT: Final = "COALESCE((SELECT robot FROM alone WHERE alone.identity = {0}.identity), '')"
+FORGET_ALONE: Final = (
+    "DELETE FROM alone WHERE identity NOT IN (SELECT identity FROM outbox UNION SELECT identity FROM spent)"
+)
 
 
 class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -130,12 +139,16 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Outgoing(msgspec.Struct, frozen=True):
-    """A signed message that is sent until its effect is seen, or until block `deadline` (None: without end)."""
+    """A signed message that is sent until its effect is seen, or until block `deadline` (None: without end).
+
+    An order with a `robot` (address) is for that one alone, and never published.
+    """
 
     identity: str
     kind: str
     payload: bytes
     deadline: int | None
+    robot: str = ""
 
 
 class StoredOrder(msgspec.Struct, frozen=True):
@@ -146,6 +159,8 @@ class StoredOrder(msgspec.Struct, frozen=True):
     posted: float
     is_withdrawn: bool
     tx: str
+    robot: str
+    """The only robot that it is for; empty for any."""
 
 
 class Ledger(RoleLedger):
@@ -239,7 +254,7 @@ class Ledger(RoleLedger):
 
     async def post(self, outgoing: Outgoing) -> None:
         """Keep a signed message for sending, until `settle`."""
-        await self._database.run(POST, _posted(outgoing))
+        await self._database.run_together((POST, _posted(outgoing)), _alone(outgoing))
 
     async def settle(self, identity: str) -> bool:
         """Remove a message whose effect was seen. False if it was not in the outbox."""
@@ -258,7 +273,7 @@ class Ledger(RoleLedger):
 
     async def spent(self, liability: str) -> list[Outgoing]:
         """The orders that became the contract at this address, withdrawn ones included."""
-        statement = "SELECT identity, kind, payload, deadline FROM spent WHERE liability = ?"
+        statement = f"SELECT identity, kind, payload, deadline, {ROBOT.format('spent')} FROM spent WHERE liability = ?"
         return [Outgoing(*row) for row in await self._database.rows(statement, (liability,))]
 
     async def contracts(self, kind: str) -> list[tuple[bytes, str]]:
@@ -296,7 +311,7 @@ class Ledger(RoleLedger):
     async def replace(self, identity: str, outgoing: Outgoing) -> None:
         """Keep a message for sending instead of the one called `identity`."""
         remove = ("DELETE FROM outbox WHERE identity = ?", (identity,))
-        await self._database.run_together(remove, (POST, _posted(outgoing)))
+        await self._database.run_together(remove, (POST, _posted(outgoing)), _alone(outgoing))
 
     async def orders(self) -> list[StoredOrder]:
         """The orders that may still become contracts, oldest first, the withdrawn ones behind the others.
@@ -306,11 +321,11 @@ class Ledger(RoleLedger):
         return await self._stored("kind IN ('demand', 'offer') AND tx = '' ORDER BY withdrawn, posted")
 
     async def _stored(self, condition: str, values: tuple[Any, ...] = ()) -> list[StoredOrder]:
-        columns = "identity, payload, posted, withdrawn, tx"
+        columns = f"identity, payload, posted, withdrawn, tx, {ROBOT.format('outbox')}"
         rows = await self._database.rows(f"SELECT {columns} FROM outbox WHERE {condition}", values)
         return [
-            StoredOrder(identity, payload, posted, bool(withdrawn), tx)
-            for identity, payload, posted, withdrawn, tx in rows
+            StoredOrder(identity, payload, posted, bool(withdrawn), tx, robot)
+            for identity, payload, posted, withdrawn, tx, robot in rows
         ]
 
     async def outbox(self, *, head: int) -> list[Outgoing]:
@@ -320,13 +335,15 @@ class Ledger(RoleLedger):
         """
         last = head - self._reorg_depth
         rows = await self._database.rows(
-            "SELECT identity, kind, payload, deadline, withdrawn FROM outbox WHERE NOT withdrawn OR deadline <= ?"
+            f"SELECT identity, kind, payload, deadline, {ROBOT.format('outbox')}, withdrawn FROM outbox"
+            " WHERE NOT withdrawn OR deadline <= ?"
             " ORDER BY rowid",
             (last,),
         )
         if any(row[3] is not None and row[3] <= last for row in rows):
-            await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (last,), sync=False)
-        return [Outgoing(*row[:4]) for row in rows if not row[4] and (row[3] is None or row[3] > head)]
+            expired = ("DELETE FROM outbox WHERE deadline <= ?", (last,))
+            await self._database.run_together(expired, (FORGET_ALONE, ()), sync=False)
+        return [Outgoing(*row[:5]) for row in rows if not row[5] and (row[3] is None or row[3] > head)]
 
     async def waiting_by_kind(self, *, head: int) -> dict[str, int]:
         """The messages to send of each kind (`demand`, `offer`, `withdrawal`, `result`) that has any."""
@@ -348,4 +365,8 @@ def _job(row: Any) -> JobRecord:
 
 
 def _posted(outgoing: Outgoing) -> tuple[Any, ...]:
-    return (*astuple(outgoing), time.time())
+    return (*astuple(outgoing)[:4], time.time())
+
+
+def _alone(outgoing: Outgoing) -> tuple[str, tuple[Any, ...]]:
+    return ALONE, (outgoing.identity, outgoing.robot, outgoing.robot)

@@ -89,6 +89,8 @@ class TradedOrder:
     declines: dict[str, Decline] = field(default_factory=dict)
     """The last decline by each agent."""
     on_progress: list[OnProgress] = field(default_factory=list)
+    robot: str = ""
+    """The only robot (address) that it is for: it is not published then. Empty for any."""
     is_ours: bool = False
     """Whether this agent has posted it, in this run: not an earlier one, nor another program of the account."""
 
@@ -300,6 +302,10 @@ EQUAL_DECLINED: Final = "equal-declined"
 
 HANDLED_FOR: Final[ContextVar[Buyer | None]] = ContextVar("handled for", default=None)
 """Whose demand the running handler handles; None outside of a demand's handler."""
+
+
+ALONE: Final[ContextVar[AnsweredDemand | None]] = ContextVar("alone", default=None)
+"""The demand for this robot alone that the running handler handles; None for one that all robots see."""
 
 
 class TooManyOffers(AiraError, code="too-many-offers"):

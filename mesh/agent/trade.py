@@ -26,8 +26,10 @@ from mesh.agent.contracts import (
     report,
     seen_offers,
 )
-from mesh.agent.errors import Declined
+from mesh.agent.errors import Declined, OtherRobot
+from mesh.agent.hiring import Hiring
 from mesh.agent.orders import (
+    ALONE,
     EQUAL_DECLINED,
     HANDLED_FOR,
     AnsweredDemand,
@@ -253,6 +255,8 @@ class Trader(Lifecycle):
             log.info("the %s of an earlier run is open until block %d", order, order.deadline, extra=facts)
         await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
         self._tasks = await stack.enter_async_context(Background())
+        self.hiring = Hiring(self._parts, self._tasks, rejected=self._pair_rejected, declined=self._pair_declined)
+        self._parts.outbox.send_alone = self.hiring.send
         self._send_covered(resumed)
         stack.push_async_callback(self._withdraw_at_end)
 
@@ -287,14 +291,28 @@ class Trader(Lifecycle):
         self.contracts.fail(ENDED())
 
     async def post(
-        self, kind: type[Demand | Offer], terms: Terms, answers: AnsweredDemand | None = None, **fee: Any
+        self,
+        kind: type[Demand | Offer],
+        terms: Terms,
+        answers: AnsweredDemand | None = None,
+        *,
+        robot: str = "",
+        **fee: Any,
     ) -> Order:
         """Sign an order, which perhaps answers a demand, ensure its allowance, and post it. Cancelling withdraws it.
+
+        A demand for one `robot` (address) alone is posted once that has agreed; raises `DemandDeclined`, `RemoteError`.
 
         Raises `InsufficientTokens`, and for an offer that answers a demand `TooManyOffers`, the error of a demand that
         is taken, and `Declined` while a demand with equal terms is open that the agent has declined.
         """
-        order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time(), is_ours=True)
+        order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time(), robot=robot, is_ours=True)
+        if isinstance(order.signed, Demand) and robot:
+            await self.hiring.agree(order.signed, robot)
+        if kind is Offer and (asked := ALONE.get()) is not None:
+            if equal_terms(order.signed) != equal_terms(asked.demand.message):
+                raise Declined("other-terms", f"it asks for other terms: a cost of {order.signed.cost}")
+            order.robot, answers = self._address, asked
         if answers is not None:
             if answers.is_over:
                 raise demand_taken(answers.demand.hash.hex())
@@ -316,7 +334,7 @@ class Trader(Lifecycle):
             raise
         try:
             if order.is_open:
-                await self._parts.outbox.post(order.signed)
+                await self._parts.outbox.post(order.signed, robot=order.robot)
         except asyncio.CancelledError:
             await self.withdraw(order)
             raise
@@ -419,10 +437,14 @@ class Trader(Lifecycle):
         elif not (order.is_open and self.is_open):
             raise ENDED() if order.is_open else order.why_closed
         else:
-            async with seen_offers(self._parts, order.signed, on_progress):
+            heard = nothing if order.robot else on_progress
+            async with seen_offers(self._parts, order.signed, heard):
                 contract = await order.contract(on_progress)
-        await self._parts.robots.find(contract.liability.promisor)  # for those who show its name
-        report(on_progress, Progress(kind="contract", agent=contract.liability.promisor, detail=contract.address))
+        promisor, address = contract.liability.promisor, contract.address
+        await self._parts.robots.find(promisor)  # for those who show its name
+        report(on_progress, Progress(kind="contract", agent=promisor, detail=address))
+        if isinstance(order.signed, Demand) and order.robot not in ("", promisor):
+            raise OtherRobot(order.identity, robot=order.robot, promisor=promisor, liability=address)
         return contract
 
     async def withdraw(self, order: TradedOrder) -> Order:
@@ -584,7 +606,7 @@ class Trader(Lifecycle):
                 if signed.deadline <= self._parts.chain_head.head:
                     continue
                 if order is None:
-                    order = self._orders[stored.identity] = TradedOrder(signed, stored.posted)
+                    order = self._orders[stored.identity] = TradedOrder(signed, stored.posted, robot=stored.robot)
                     self._allowances.count(order, self._chain.funds.cost_of(signed))
                     if isinstance(signed, Demand) and self._hear_declines is not None:
                         self._hear_declines()
@@ -621,6 +643,18 @@ class Trader(Lifecycle):
             facts = log_event("order-rejected", order=identity, provider=provider, reason=reason)
             log.warning("%s can't use the %s now (%s: %s)", provider, order, reason, rejection.detail, extra=facts)
 
+    def _pair_rejected(self, rejection: Rejection) -> None:
+        """A provider does not take an order with the offer of its robot now. The pair is sent again."""
+        if (order := self._orders.get(rejection.order)) is not None and order.is_open and order.reject(rejection):
+            facts = log_event("order-rejected", order=rejection.order, provider=rejection.provider)
+            why = rejection.reason, rejection.detail
+            log.warning("%s can't use the %s now (%s: %s)", rejection.provider, order, *why, extra=facts)
+
+    def _pair_declined(self, decline: Decline) -> None:
+        """The robot that an order is for has agreed before, and does not any more."""
+        if (order := self._orders.get(decline.order)) is not None and order.is_open:
+            order.decline(decline)
+
     async def _renew_overtaken(self, used: int | None) -> None:
         """Sign the orders of generation 5 again whose nonce another order of the account has used."""
         for order in [one for one in self._orders.values() if one.is_open and one.is_overtaken(used)]:
@@ -644,7 +678,7 @@ class Trader(Lifecycle):
                 return
             order.signed = signed
             self._orders[order.identity] = order
-            await self._parts.outbox.replace(identity, signed)
+            await self._parts.outbox.replace(identity, signed, robot=order.robot)
         facts = log_event("order-renewed", order=identity, renewed=order.identity)
         log.info("the order %s is signed again as %s", identity, order.identity, extra=facts)
 

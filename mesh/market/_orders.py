@@ -98,6 +98,8 @@ class Orders:
         """The results that wait for others, in order of arrival."""
         self._used: deque[tuple[int, bytes]] = deque()
         """Block and message of each event that was read, the oldest first."""
+        self._pairs: BoundedDict[bytes, bytes] = BoundedDict(REMEMBERED)
+        """Of each order of a pair (identity), the other one."""
 
     def state(self, identity: bytes) -> OrderStage | None:
         """Where the message with this identity is; None if there is no record of it."""
@@ -125,6 +127,36 @@ class Orders:
         if isinstance(outcome, Match):
             self.begin(*outcome)
         return outcome
+
+    def pair(self, pair: Match, *, head: int) -> Refusal | None:
+        """Bind a demand and an offer to each other by the will of the demand's maker, and begin to settle them.
+
+        From now on neither is matched with another order. Its maker may bind a demand to a later offer; an offer stays
+        with its first demand. Returns why that can't be.
+        """
+        demand, offer = (order_id(order) for order in pair)
+        if self._pairs.get(offer, demand) != demand or any(self.settling(one) for one in (demand, offer)):
+            return Refusal.DUPLICATE
+        for order in pair:
+            self._note(order)
+            if order.message.deadline <= self.book.head:
+                return Refusal.EXPIRED
+            if (refusal := self.taken_back(order, head)) is not None:
+                return refusal
+        for identity in (demand, offer):
+            self.book.remove(identity, OrderStage.REPLACED)
+        self._pairs.pop(self._pairs.get(demand, b""), None)
+        self._pairs[demand], self._pairs[offer] = offer, demand
+        self.begin(*pair)
+        return None
+
+    def is_pair(self, pair: Match) -> bool:
+        """Whether this demand is bound to this offer."""
+        return self._pairs.get(order_id(pair.demand)) == order_id(pair.offer)
+
+    def is_paired(self, order: Verified[Order]) -> bool:
+        """Whether an order is bound to another one, so that the book must not have it."""
+        return order_id(order) in self._pairs
 
     def taken_back(self, order: Verified[Order], head: int) -> Refusal | None:
         """Whether an order was withdrawn, or another version of it stands in its way, at block `head`."""

@@ -14,11 +14,16 @@ import mesh
 from mesh.base.background import call_in_loop
 from mesh.base.flood import Rate, RateLimiter
 from mesh.chain.metrics import CachedMetrics, reading_families
+from mesh.errors import public_text
+from mesh.market.book import Match
 from mesh.network import message_key
 from mesh.network.metrics import drop_family, message_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled, public_parts
-from schemas import encode, lighthouse_selector
+from schemas import InvalidMessage, encode, lighthouse_selector
 from schemas.keys import ORDER
+from schemas.messages import equal_terms
+from schemas.rpc import PairTaken
+from schemas.signing import Refusal
 from schemas.status import ALIVE, MarketStatus, Status
 
 if TYPE_CHECKING:
@@ -26,12 +31,12 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from mesh.base.flood import Drops
-    from mesh.market._settlement import SettlementParts
+    from mesh.market._settlement import Settlement, SettlementParts
     from mesh.market.book import Order, OrderBook
     from mesh.market.withdrawals import Withdrawals
     from mesh.network import Subscription
     from schemas import Withdrawal
-    from schemas.rpc import Nothing
+    from schemas.rpc import Nothing, OrderPair
 
 THREADS: Final = 2
 """Threads that answer queries: a book can be large, and a client may take the answers slowly."""
@@ -126,6 +131,36 @@ class OrderBookService:
                     return
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):
                     query.reply(key, encode(message), encoding="application/json")
+
+
+class PairService:
+    """The service `pair`: creates the contract of a demand with the offer that its maker chose."""
+
+    def __init__(self, parts: SettlementParts, settlement: Settlement) -> None:
+        self._parts = parts
+        self._settlement = settlement
+
+    async def pair(self, request: OrderPair) -> PairTaken:
+        """Check a pair as strangers' messages are, and settle it."""
+        try:
+            if not request.is_signed:
+                raise InvalidMessage("signature", "the pair is not signed by its maker")
+            demand = await self._parts.channel.verified(request.demand.message())
+            offer = await self._parts.channel.verified(request.offer.message())
+            if demand.signer != request.maker:
+                raise InvalidMessage("maker", "only the demand's maker can bind it to an offer")
+            if equal_terms(demand.message) != equal_terms(offer.message):
+                raise InvalidMessage("terms", "the demand and the offer don't agree")
+        except InvalidMessage as error:
+            return PairTaken(error.reason, public_text(error))
+        if not self._parts.queue.has_room_for(self._parts.chain.funds.worth(demand.message)):
+            return PairTaken(Refusal.FULL, "too many transactions wait; try again later")
+        pair = Match(demand, offer)
+        for signer, shortage in zip((demand.signer, offer.signer), await self._settlement.shortages(pair), strict=True):
+            if shortage:
+                return PairTaken(shortage, f"{signer} lacks the money, or the factory may not take it")
+        refusal = self._settlement.pair(pair)
+        return PairTaken() if refusal is None else PairTaken(refusal, f"the provider refuses it: {refusal}")
 
 
 class ProviderStatus:

@@ -562,16 +562,16 @@ class Settlement:
         if order.signer in self.blocked:
             self._drop_blocked(order)
             return Refusal.BLOCKED
+        if self._parts.orders.is_paired(order):  # somebody else has published it, or its pair comes again
+            self._parts.drops.count("paired", order.signer)
+            self._parts.forget(order, after=self._pause)
+            return Refusal.DUPLICATE
         outcome = self._parts.orders.add(order, head=self._parts.head.head)
         for evicted in outcome.evicted if isinstance(outcome, Added) else ():
             self._parts.drops.count("book-full", evicted.signer)
             self._parts.forget(evicted, after=2 * self._pause)  # in a flood, such copies cost the most
         if isinstance(outcome, Match):
-            facts = {"demand": outcome.demand.hash.hex(), "offer": outcome.offer.hash.hex()}
-            log.info("matched demand %(demand)s and offer %(offer)s", facts, extra=log_event("orders-matched", **facts))
-            self._parts.earnings.matched()
-            self._matched(outcome)
-            self._tasks.create_task(self._create(outcome))
+            self._begin(outcome)
         elif isinstance(outcome, Refusal):
             is_no_promise = outcome is Refusal.WITHDRAWN and not self._may_promise(order_id(order))
             if outcome is not Refusal.DUPLICATE and not is_no_promise:
@@ -581,6 +581,27 @@ class Settlement:
             return outcome
         return None
 
+    def pair(self, pair: Match) -> Refusal | None:
+        """Settle a demand with the offer that its maker names, and match neither with another order; or say why not.
+
+        Nothing of a pair waits in the book: its maker sends it again until the contract is on the chain.
+        """
+        if any(order.signer in self.blocked for order in pair):
+            return Refusal.BLOCKED
+        refusal = self._parts.orders.pair(pair, head=self._parts.head.head)
+        if refusal is None:
+            self._begin(pair)
+        elif refusal is Refusal.DUPLICATE and self._parts.orders.is_pair(pair):
+            return None  # it is under settlement
+        return refusal
+
+    def _begin(self, match: Match) -> None:
+        facts = {"demand": match.demand.hash.hex(), "offer": match.offer.hash.hex()}
+        log.info("matched demand %(demand)s and offer %(offer)s", facts, extra=log_event("orders-matched", **facts))
+        self._parts.earnings.matched()
+        self._matched(match)
+        self._tasks.create_task(self._create(match))
+
     def set_aside(
         self,
         order: Verified[Order],
@@ -589,7 +610,9 @@ class Settlement:
     ) -> None:
         """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
         now = asyncio.get_running_loop().time()
-        if self._parts.orders.set_aside(order, now=now, head=self._parts.head.head):
+        if self._parts.orders.is_paired(order):
+            self.rejections.reject(order, reason, detail)
+        elif self._parts.orders.set_aside(order, now=now, head=self._parts.head.head):
             self.rejections.reject(order, reason, detail)  # each copy, because an earlier rejection may have been lost
         self._parts.forget(order, after=self._pause)
 
@@ -704,7 +727,9 @@ class Settlement:
         self._parts.drops.count("unpaid", match.offer.signer)
         self._parts.forget(match.offer, after=4 * self._pause)
         self.add(match.demand)
-        for order in match if order_id(match.demand) in self._parts.orders.book else (match.offer,):
+        orders = self._parts.orders
+        is_waiting = order_id(match.demand) in orders.book or orders.is_paired(match.demand)
+        for order in match if is_waiting else (match.offer,):
             self.rejections.reject(order, Refusal.UNPAID, why(match, self._parts.chain.xrt))
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[CreatedContract]]:

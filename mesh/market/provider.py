@@ -22,7 +22,7 @@ from mesh.chain import InsufficientFunds
 from mesh.chain.transactions import TransactionSender
 from mesh.market._earnings import A_DAY, Earnings, EarningsLedger, FreeContracts
 from mesh.market._orders import Orders
-from mesh.market._services import OrderBookService, ProviderStatus
+from mesh.market._services import OrderBookService, PairService, ProviderStatus
 from mesh.market._settlement import OPEN_LIABILITIES, Settlement, SettlementParts
 from mesh.market.book import LIMIT, Match
 from mesh.market.store import MarketStore
@@ -292,6 +292,7 @@ class Provider(Role):
         subscriptions = (self._demands, self._offers, self._withdrawn, self.results)
         self.status = ProviderStatus(self._session, parts, subscriptions=subscriptions)
         services = await stack.enter_async_context(Services(self._session, self.address, drops=self.drops))
+        self._services, self._pairs = services, PairService(parts, self.settlement)
         with source_context(self._source):
             services.offer("status", self.status.status)
             services.offer("logs", LogService("provider", self.address).logs)
@@ -331,6 +332,7 @@ class Provider(Role):
                 tasks.create_task(arrivals.take_orders(self._offers), name="provider offers")
                 tasks.create_task(arrivals.take_results(self.results), name="provider results")
                 tasks.create_task(arrivals.run(), name="provider arrivals")
+                self._services.offer("pair", self._pairs.pair)
 
     def earnings(self) -> Earnings:
         """What was done, earned and spent so far."""

@@ -264,6 +264,11 @@ class Channel:
             self._session, selector, MessageValidator(kind, self._rules), self._drops, self.answer_timeout
         )
 
+    async def verified(self, message: M) -> Verified[M]:
+        """A message that came another way, checked as a subscription does. Raises `InvalidMessage`."""
+        self._check_open()
+        return await self._rules.verified(message)
+
     def announce(self, role: str, address: str) -> None:
         """Announce the agent at `address` as present in `role`, for as long as the channel is open."""
         self._check_open()

@@ -1,0 +1,116 @@
+"""Orders for one robot alone: its offer is asked for first, then a provider gets the demand and the offer together.
+
+A demand can't name who may do it, so it is not published. The robot decides on the demand without its signature, and
+only providers with a stake ever see the signed pair: see "Orders for one robot" in docs/reliability.md.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Final
+
+from msgspec.structs import replace
+
+from mesh.agent.errors import DemandDeclined
+from mesh.base.log_context import log_event
+from mesh.errors import AiraError, RemoteError
+from mesh.network.services import call
+from schemas import message_hash, verify_message
+from schemas.messages import equal_terms
+from schemas.rpc import AcceptDemand, Accepted, OrderPair, SendDemand, SendOffer
+from schemas.signing import Decline, Rejection
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mesh.agent.components import AgentComponents
+    from mesh.base.background import Background
+    from schemas import Demand, Offer, Verified
+    from schemas.rpc import PairTaken
+
+log = logging.getLogger(__name__)
+
+ACCEPT_TIMEOUT: Final = 30.0
+"""Seconds that a robot has to decide: it may fetch the objective first."""
+PROVIDERS: Final = 32
+"""Providers that get a pair, at most."""
+
+
+class Hiring:
+    """Sends the demands of an account that are for one robot alone, in `tasks`.
+
+    `rejected` is called with what a provider says against a pair, `declined` with what the robot says.
+    """
+
+    def __init__(
+        self,
+        parts: AgentComponents,
+        tasks: Background,
+        *,
+        rejected: Callable[[Rejection], object],
+        declined: Callable[[Decline], object],
+    ) -> None:
+        self._parts = parts
+        self._tasks = tasks
+        self._rejected = rejected
+        self._declined = declined
+        self._under_way: set[str] = set()
+        self._offers: dict[str, Offer] = {}
+        """Offers that robots have just made, by the demand's hash."""
+
+    async def agree(self, demand: Demand, robot: str) -> None:
+        """Get the robot's offer for a demand that is sent next. Raises `DemandDeclined`, `RemoteError`."""
+        self._offers[message_hash(demand).hex()] = await self._offer_of(demand, robot)
+
+    def send(self, demand: Demand, robot: str) -> None:
+        """Send a demand with the robot's offer to the providers, in a task, unless one does so already."""
+        order = message_hash(demand).hex()
+        if order not in self._under_way:
+            self._under_way.add(order)
+            task = self._tasks.start(self._send(order, demand, robot), f"pair {order}")
+            task.add_done_callback(lambda _task: self._under_way.discard(order))
+
+    async def _send(self, order: str, demand: Demand, robot: str) -> None:
+        try:
+            offer = self._offers.pop(order, None) or await self._offer_of(demand, robot)
+            lighthouse = await self._parts.chain.lighthouses.get(self._parts.settings.lighthouse_contract)
+            providers = [*lighthouse.stakes][:PROVIDERS]
+            await asyncio.gather(*(self._send_to(provider, order, demand, offer) for provider in providers))
+        except DemandDeclined as error:
+            self._declined(error.declines[0])
+        except AiraError as error:  # it is sent again
+            facts = log_event("pair-not-sent", order=order, robot=robot, code=error.code)
+            log.warning("the demand %s for %s can't be sent now: %s", order, robot, error, extra=facts)
+
+    async def _send_to(self, provider: str, order: str, demand: Demand, offer: Offer) -> None:
+        signer, session = self._parts.signer, self._parts.network.session
+        pair = OrderPair(demand=SendDemand.of(demand), offer=SendOffer.of(offer), maker=signer.address)
+        try:
+            taken: PairTaken = await call(session, provider, "pair", pair.signed_by(signer))
+            code, detail = taken.code, taken.detail
+        except RemoteError as error:
+            code, detail = error.code, "it does not answer, or takes no pairs"
+        if code:
+            self._rejected(Rejection(order=order, reason=code, detail=detail, provider=provider))
+
+    async def _offer_of(self, demand: Demand, robot: str) -> Offer:
+        """The robot's offer for a demand, of which it gets no signature."""
+        signer, order = self._parts.signer, message_hash(demand).hex()
+        unsigned = SendDemand.of(replace(demand, signature=""))
+        request = AcceptDemand(demand=unsigned, robot=robot, maker=signer.address).signed_by(signer)
+        session = self._parts.network.session
+        accepted: Accepted = await call(session, robot, "accept", request, timeout=ACCEPT_TIMEOUT)
+        match accepted:
+            case Accepted(offer=SendOffer() as sent, decline=None):
+                answer: Verified[Offer] = verify_message(sent.message())
+                if answer.signer == robot and equal_terms(answer.message) == equal_terms(demand):
+                    return answer.message
+            case Accepted(offer=None, decline=Decline() as said):
+                if said.agent == robot and said.order == order and said.is_signed:
+                    raise DemandDeclined(order, (said,))
+        raise RemoteError(
+            f"what answers for the robot {robot} is neither its offer nor its refusal",
+            hint="somebody else answers on its key; a router with a roster prevents that",
+            code="not-its-answer",
+        )
