@@ -75,6 +75,11 @@ def grounds_of(error: AiraError) -> Grounds | None:
     return None
 
 
+def is_expected(error: AiraError) -> bool:
+    """Whether a handler that ended with this error has decided on the demand, and not failed."""
+    return isinstance(error, ObjectiveNotFetched | Declined) or error.code == DEMAND_TAKEN
+
+
 def signed_decline(demand: Verified[Demand], grounds: Grounds, signer: Signer) -> Decline:
     """The statement of an agent that it does not work for a demand, which is logged."""
     order, code = demand.hash.hex(), grounds.code
@@ -266,8 +271,7 @@ class DemandDispatcher:
         return not answered.is_declined
 
     def _is_logged(self, error: AiraError) -> bool:
-        is_expected = isinstance(error, ObjectiveNotFetched | Declined) or error.code == DEMAND_TAKEN
-        return not is_expected and self._logged.allow(error.code)
+        return not is_expected(error) and self._logged.allow(error.code)
 
     def _drop(self, demand: Verified[Demand], reason: str, *, after: float = 0.0) -> None:
         """Count a demand that is not handled now, and let its next copy through, `after` seconds."""
@@ -283,10 +287,6 @@ def _may_pass(error: AiraError) -> bool:
     return isinstance(error, (*NODE_ERRORS, TransactionTimeout, LedgerUnusable, TooManyOffers))
 
 
-NO_MONEY: Final = "ERC20InsufficientBalance"
-"""What a maker lacks who can't pay; its allowance follows the robot's offer."""
-
-
 class Acceptance:
     """The service `accept` of a robot: its `handlers` decide on a demand that is for it alone.
 
@@ -299,6 +299,7 @@ class Acceptance:
         self._handlers = handlers
         self._model = model
         self._limiter = RateLimiter(per_sender=PER_MAKER, total=TOTAL)
+        self._logged = RateLimiter(per_sender=LOGGED)
         self._places = asyncio.Semaphore(FREE_HANDLED)
 
     async def accept(self, request: AcceptDemand) -> Accepted:
@@ -308,6 +309,9 @@ class Acceptance:
         if isinstance(grounds, Offer):
             return Accepted(offer=SendOffer.of(grounds))
         return Accepted(decline=signed_decline(demand, grounds, self._parts.signer))
+
+    def _is_logged(self, error: AiraError) -> bool:
+        return not is_expected(error) and self._logged.allow(error.code)
 
     async def _checked(self, request: AcceptDemand) -> Verified[Demand]:
         message: Demand = request.demand.message()
@@ -330,13 +334,13 @@ class Acceptance:
         if answered.offer is None or not answered.offer.is_open:
             if not self._limiter.allow(demand.signer):
                 return BUSY
-            ask = partial(self._parts.chain.funds.shortages, [demand])
-            if NO_MONEY in await self._parts.chain.retrying(ask, outages=self._parts.outages):
+            ask = partial(self._parts.chain.tokens.balance, demand.signer, token=demand.message.token)
+            if await self._parts.chain.retrying(ask, outages=self._parts.outages) < demand.message.cost:
                 return Grounds("unfunded", "its maker lacks the money")
             async with self._places:
                 ALONE.set(answered)
                 HANDLED_FOR.set(Buyer(demand.signer, pays=demand.message.cost > 0))
-                errors = [await call(handler, demand) for handler in self._handlers]
+                errors = [await call(handler, demand, logged=self._is_logged) for handler in self._handlers]
             if answered.offer is None or not answered.offer.is_open:
                 self._trader.answered.forget(answered)
                 found = [grounds for error in errors if error is not None and (grounds := grounds_of(error))]

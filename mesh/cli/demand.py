@@ -437,6 +437,9 @@ async def agreed_fee(
     show_default=True,
     help="what you pay: whole tokens (1.5), or the smallest unit (1500000000wn for XRT, 15units for other tokens)",
 )
+@click.option(
+    "--robot", default="", help="address of the only robot that gets the job; the demand is not published then [any]"
+)
 @click.option("--validator", type=ADDRESS, default="", help="address or ENS name of the validator of the result [none]")
 @click.option(
     "--validator-fee", type=AmountText(), help="the validator's fee, in XRT (or wn) [what the validator announces]"
@@ -472,6 +475,7 @@ async def demand(
     out: Path | None,
     as_json: bool,
     confirmed: bool = False,
+    robot: str = "",
     existing: str | None = None,
     withdraw_on_exit: bool = False,
     **terms: Any,
@@ -480,6 +484,8 @@ async def demand(
     objective check` does. What happens is printed as it happens: offers, robots that decline and why, the contract, the
     playback, the result. The recording is kept in the account's store, so that `aira verify` and `aira objective show`
     need no robot.
+
+    With --robot only that robot gets the job. It is asked first, and if it declines the command ends with its reason.
 
     Ctrl-C stops waiting, but does not withdraw the demand (--withdraw-on-exit or `aira order withdraw` does) or cancel
     the contract. A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks
@@ -525,7 +531,7 @@ async def demand(
             order = await take_existing(agent, cid, existing, quiet=as_json, **terms)
             if order is None:
                 await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
-                order = await _post(agent, cid, checked, printer, **terms)
+                order = await _post(agent, cid, checked, printer, robot=robot, **terms)
             contract = await _contract(agent, order, printer, withdraw_on_exit=withdraw_on_exit)
             await _wait_for_end(agent, contract, printer, out)
 

@@ -26,6 +26,8 @@ from tests.support.orders import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from schemas import Verified
 
 DEPTH = 3
@@ -49,6 +51,33 @@ def test_a_message_without_an_event_leaves_when_its_transaction_ends() -> None:
     assert not orders.is_read(demand, until=100)
     assert not orders.end(demand)
     assert states(orders, demand) == [None]
+
+
+def test_an_offer_stays_with_its_first_demand_and_a_demand_may_get_another_offer() -> None:
+    orders, (demand, other), (offer, later) = orders_with(), _two(verified_demand), _two(verified_offer)
+    assert orders.pair(Match(demand, offer), head=0) is None
+    assert orders.pair(Match(demand, offer), head=0) is Refusal.DUPLICATE
+    assert not orders.end(demand)
+    assert not orders.end(offer)
+    assert orders.pair(Match(other, offer), head=0) is Refusal.DUPLICATE
+    assert not orders.is_paired(other)
+    assert orders.pair(Match(demand, later), head=0) is None
+    assert orders.is_pair(Match(demand, later))
+    assert [orders.is_paired(one) for one in (demand, later, offer)] == [True, True, False]
+
+
+def test_a_pair_takes_its_orders_out_of_the_book() -> None:
+    orders, (demand, other), (offer, _) = orders_with(), _two(verified_demand), _two(verified_offer)
+    assert isinstance(orders.add(demand, head=0), Added)
+    assert orders.pair(Match(demand, offer), head=0) is None
+    assert states(orders, demand, offer) == [OrderStage.MATCHED] * 2
+    assert len(orders.book) == 0
+    orders.book.expire(2_000_000)
+    assert orders.pair(Match(other, verified_offer()), head=0) is Refusal.EXPIRED
+
+
+def _two(make: Callable[[], Verified[Any]]) -> tuple[Verified[Any], Verified[Any]]:
+    return make(), make()
 
 
 def test_a_match_is_under_settlement_and_no_copy_of_it_is_taken() -> None:
