@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from mesh.agent._hiring import Hiring
 from mesh.agent.contracts import (
     Contract,
     Progress,
@@ -27,7 +28,6 @@ from mesh.agent.contracts import (
     seen_offers,
 )
 from mesh.agent.errors import Declined, OtherRobot
-from mesh.agent.hiring import Hiring
 from mesh.agent.orders import (
     ALONE,
     EQUAL_DECLINED,
