@@ -51,7 +51,7 @@ from mesh.role.models import Models, description_in
 from mesh.role.program import RESEND, OpenRole, Program
 from mesh.role.status import WatcherStatus
 from mesh.settings import load
-from mesh.watching.robots import RobotDirectory
+from mesh.watching.robots import RobotDirectory, robot_address
 from schemas import (
     ZERO_ADDRESS,
     Demand,
@@ -467,8 +467,9 @@ class Agent(Program):
         `validator_fee` is `"0.1 XRT"`, or wn; by default what the validator announces. The factory gets the allowance
         that they need. A restarted agent sends the order again.
 
-        With a `robot` (address) only that one gets the job: it is asked for its offer, and the demand is not published.
-        Raises `DemandDeclined` with its reason if it makes none, `ServiceFailed` if it does not answer.
+        With a `robot` (its name or address) only that one gets the job: it is asked for its offer, and the demand is
+        not published. Raises `DemandDeclined` with its reason if it makes none, `ServiceFailed` if it does not answer,
+        and as `robot_address` for a name.
 
         Raises `InputError`, `InsufficientTokens`, `ObjectiveUnfit` if a file is not playable, or
         if the model's description is available and excludes the objective, `UnsafeValidator` and its like for a
@@ -481,7 +482,9 @@ class Agent(Program):
         )
         await self.runtime.require_fit(cid, terms["model"])
         fee = await self._announced_fee(terms) if validator_fee is None else XRT.amount(validator_fee)
-        named = parse_address(robot) if robot else ""
+        named = ""
+        if robot:
+            named = await robot_address(self.network.session, self.channel, robot, model=terms["model"])
         return await self.runtime.trader.post(Demand, terms, robot=named, validator_fee=fee)
 
     async def demand(

@@ -438,7 +438,7 @@ async def agreed_fee(
     help="what you pay: whole tokens (1.5), or the smallest unit (1500000000wn for XRT, 15units for other tokens)",
 )
 @click.option(
-    "--robot", default="", help="address of the only robot that gets the job; the demand is not published then [any]"
+    "--robot", default="", help="name or address of the only robot that gets the job; nobody else sees the demand [any]"
 )
 @click.option("--validator", type=ADDRESS, default="", help="address or ENS name of the validator of the result [none]")
 @click.option(

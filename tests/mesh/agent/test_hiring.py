@@ -11,7 +11,7 @@ import pytest
 from mesh import Agent
 from mesh.agent.errors import Declined, DemandDeclined, OtherRobot
 from mesh.chain import Account
-from mesh.errors import RemoteError
+from mesh.errors import InputError, RemoteError
 from mesh.network import Channel, Endpoints, Network, ServiceFailed, Services
 from schemas import Demand, Offer
 from schemas.rpc import Accepted, SendOffer
@@ -127,6 +127,15 @@ async def test_a_robot_that_asks_for_other_terms_is_quoted(place: Place) -> None
             await person.order(job(place), cost=5, robot=robot.address)
         assert robot.orders() == []
         assert heard == []
+
+
+async def test_a_robot_is_named_by_its_name(place: Place) -> None:
+    robot = working(place.agent("robot", name="Lifter"))
+    async with place.provider(), robot, place.agent("person") as person, asyncio.timeout(60):
+        assert (await person.demand(job(place), cost=2, robot="lifter")).robot == robot.address
+        with pytest.raises(InputError, match="Loader") as caught:
+            await person.order(job(place), cost=2, robot="Loader")
+        assert caught.value.code == "robot-unknown"
 
 
 async def test_who_is_not_there_is_an_error_at_once(place: Place) -> None:
