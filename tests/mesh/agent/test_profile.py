@@ -96,7 +96,14 @@ async def test_a_job_changes_the_state_and_the_queue(place: Place) -> None:
         if job.liability.cost == 2:
             raise JobFailed("it is broken")
 
+    put: list[str] = []
+
+    def hear(sample: zenoh.Sample) -> None:
+        put.append(Profile.decode(sample.payload.to_bytes()).state)
+
     async with place.at_work(offering(robot)) as person:
+        subscriber = person.network.session.declare_subscriber(str(ProfileKey(robot.address)), hear)
+        await until_heard(robot.network.session, str(ProfileKey(robot.address)))
         counted = await person.chain.liabilities.outcomes(blocks=50_000, most=500)
         before = counted.get(robot.address, (0, 0))
         contracts = [
@@ -121,6 +128,8 @@ async def test_a_job_changes_the_state_and_the_queue(place: Place) -> None:
             return (one.state, one.queue, one.wait) == ("idle", 0, 0)
 
         await until_found(is_idle, what="an idle robot")
+        await until(lambda: "working" in put and put[-1] == "idle", what="what the robot puts")
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
         paid, refunded = (await person.chain.liabilities.outcomes(blocks=50_000, most=500))[robot.address]
         assert (paid, refunded) == (before[0] + 1, before[1] + 1)
         (seen,) = await directory.count(person.chain, await directory.present())

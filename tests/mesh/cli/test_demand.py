@@ -129,6 +129,29 @@ async def test_a_robot_that_declines_is_shown_with_its_reason(site: Site, output
     assert "the demand stays valid until block" in output.err
 
 
+async def test_a_robot_with_a_name_is_shown_by_it_and_its_short_address(site: Site, output: Output) -> None:
+    robot = site.agent("robot", name="Lift 1")
+
+    @robot.on_demand
+    async def weigh(demand: Verified[Demand]) -> None:
+        raise Declined("too-cheap")
+
+    async with site.provider(), robot:
+        waiting = asyncio.create_task(
+            demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=False, **TERMS)
+        )
+        who = f"Lift 1 ({robot.address[:6]}…{robot.address[-4:]})"
+        await until(lambda: f"declined by {who}: (too-cheap)\n" in output.out, seconds=60)
+        waiting.cancel()
+        await asyncio.wait([waiting])
+
+
+def test_the_name_stands_beside_the_address_in_json(output: Output) -> None:
+    printer = JobPrinter(XRT, as_json=True, name_of={AGENT: "Lift 1"}.__getitem__)
+    printer(Progress(kind="offer", agent=AGENT))
+    assert json.loads(output.out) == {"kind": "offer", "agent": AGENT, "name": "Lift 1", "code": "", "detail": ""}
+
+
 async def _is_complete(robot: Agent) -> bool:
     return {"agent", "provider"} <= {peer.role for peer in await present(robot.channel)}
 
