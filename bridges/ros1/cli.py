@@ -15,7 +15,7 @@ import click
 from mesh.base.log_context import LogSource, log_event
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
-from mesh.errors import InputError
+from mesh.errors import InputError, PortUnavailable
 from mesh.role.running import fail, open_when_ready, run_until_stopped
 from mesh.settings import (
     AccountSettings,
@@ -137,6 +137,7 @@ def _write_messages(folder: Path, generation: str) -> None:
     click.echo(f"{folder}/src has the packages {', '.join(packages)}: build it with catkin_make")
     if (folder / "python").exists():
         click.echo(f"{folder}/python has them as Python: export PYTHONPATH={folder}/python:$PYTHONPATH")
+    click.echo(f"for rosmsg and rossrv: export ROS_PACKAGE_PATH={folder}/src:$ROS_PACKAGE_PATH")
 
 
 async def _serve(settings: Settings, options: Ros1Options) -> None:
@@ -148,7 +149,7 @@ async def _serve(settings: Settings, options: Ros1Options) -> None:
 
     if options.agent is not None:
         options = replace(options, agent=parse_address(options.agent))
-    if not ipaddress.ip_address(options.ros_ip).is_loopback:
+    if not _is_loopback(options.ros_ip):
         facts = log_event("ros1-open", address=options.ros_ip)
         log.warning(
             "ROS 1 has no access control: who reaches %s can do what the agent allows", options.ros_ip, extra=facts
@@ -179,19 +180,43 @@ async def _serve(settings: Settings, options: Ros1Options) -> None:
         await bridge.run()
 
 
+def _is_loopback(address: str) -> bool:
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        raise InputError(f"--ros-ip: {address!r} is no IP address", hint="as in 192.168.0.7") from None
+
+
 async def _graph(options: Ros1Options, stack: AsyncExitStack) -> Ros1Graph:
-    """The ROS graph, on our master or on another one."""
-    from bridges.ros1._wire import place_of
+    """The ROS graph, on our master or on another one, for which it waits, as nodes of ROS do."""
+    from bridges.ros1._wire import Ros1Error, place_of
     from bridges.ros1.master import RosMaster
-    from bridges.ros1.node import Ros1Graph
+    from bridges.ros1.node import RECONNECT, Ros1Graph
     from mesh.base.flood import Drops
+    from mesh.base.retry import Backoff
 
     drops, uri = Drops(), options.ros_master_uri
-    port = place_of(uri)[1]
+    try:
+        port = place_of(uri)[1]
+    except Ros1Error as error:
+        raise InputError(f"--ros-master-uri: {error}", hint="as in http://127.0.0.1:11311") from None
     if options.serves_master:
-        master = await stack.enter_async_context(RosMaster(options.ros_ip, port, drops))
-        uri = master.uri
-    return Ros1Graph(uri, options.ros_ip, drops)
+        try:
+            master = await stack.enter_async_context(RosMaster(options.ros_ip, port, drops))
+        except PortUnavailable as error:
+            error.hint = "if a ROS master runs there, leave out --master; or choose another port by --ros-master-uri"
+            raise
+        return Ros1Graph(master.uri, options.ros_ip, drops)
+    graph, backoff = Ros1Graph(uri, options.ros_ip, drops), Backoff(RECONNECT)
+    while True:
+        try:
+            await graph.call("getUri")
+        except Ros1Error as error:
+            graph.outage.failed(error, "waiting for a ROS master: start roscore, or the bridge with --master")
+            await backoff.wait()
+        else:
+            graph.outage.recovered("the ROS master answers")
+            return graph
 
 
 async def _parts(

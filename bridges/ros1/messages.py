@@ -151,10 +151,7 @@ class Ros1Type:
         that has no form in its field.
         """
         out = bytearray()
-        try:
-            self._write(values, out)
-        except (struct.error, TypeError, ValueError, UnicodeError, OverflowError) as error:
-            raise InvalidPayload(self.name, str(error)) from None
+        self._write(values, out)
         return bytes(out)
 
     def _write(self, values: Any, out: bytearray) -> None:
@@ -162,21 +159,27 @@ class Ros1Type:
             values = {} if values is None else {self.fields[0].name: values}
         for field in self.fields:
             value = values.get(field.name)
-            if field.length is None:
-                self._write_one(field.type, value, out)
-                continue
-            value = (b"" if field.type in _BYTES else ()) if value is None else value
-            if field.length < 0:
-                out += _COUNT.pack(len(value))
-            elif not value:
-                value = bytes(field.length) if field.type in _BYTES else (None,) * field.length
-            elif len(value) != field.length:
-                raise ValueError(f"{field.name} has {len(value)} elements, not {field.length}")
-            if isinstance(value, bytes):
-                out += value
-                continue
-            for one in value:
-                self._write_one(field.type, one, out)
+            try:
+                if field.length is None:
+                    self._write_one(field.type, value, out)
+                else:
+                    self._write_array(field.type, field.length, value, out)
+            except (struct.error, TypeError, ValueError, OverflowError):
+                raise InvalidPayload(self.name, f"{field.name}: {str(value)[:80]} is no {field.type}") from None
+
+    def _write_array(self, kind: str, length: int, value: Any, out: bytearray) -> None:
+        value = (b"" if kind in _BYTES else ()) if value is None else value
+        if length < 0:
+            out += _COUNT.pack(len(value))
+        elif not value:
+            value = bytes(length) if kind in _BYTES else (None,) * length
+        elif len(value) != length:
+            raise ValueError(f"{len(value)} elements, not {length}")
+        if isinstance(value, bytes):
+            out += value
+            return
+        for one in value:
+            self._write_one(kind, one, out)
 
     def _write_one(self, kind: str, value: Any, out: bytearray) -> None:
         if kind == "string":

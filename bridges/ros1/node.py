@@ -84,13 +84,20 @@ async def call_api(uri: str, method: str, *arguments: Any) -> Any:
             writer.write(encode_call(uri, method, arguments))
             head = await reader.readuntil(b"\r\n\r\n")
             return decode_reply(await reader.readexactly(http_length(head)))
+    except WireError:
+        raise Ros1Error(f"{uri} is no program of ROS 1", code="ros1-unreachable") from None
     except (OSError, EOFError, asyncio.LimitOverrunError) as error:
-        raise Ros1Error(
-            f"{uri} does not answer: {str(error) or type(error).__name__}", code="ros1-unreachable"
-        ) from None
+        raise Ros1Error(f"{uri} does not answer: {_reason(error)}", code="ros1-unreachable") from None
     finally:
         if writer is not None:
             writer.close()
+
+
+def _reason(error: Exception) -> str:
+    """Why a connection failed, in a few words; asyncio's own text repeats the address."""
+    if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
+        return os.strerror(error.errno).lower()
+    return str(error) or type(error).__name__
 
 
 async def serve_calls(
@@ -115,7 +122,7 @@ async def serve_calls(
 class Ros1Server(Lifecycle):
     """A port: XML-RPC calls on it go to `dispatch`, other connections to `connected`.
 
-    What is malformed is counted in `drops`, and its connection ends; so are connections that are too many or too slow.
+    What is malformed is counted in `drops`, and its connection ends; so are connections that are too many.
     """
 
     title = "ROS 1 port"
@@ -151,8 +158,7 @@ class Ros1Server(Lifecycle):
         try:
             server = await asyncio.start_server(self._accept, self._host, self.port, limit=LONGEST_HEAD)
         except (OSError, OverflowError) as error:
-            why = getattr(error, "strerror", None) or str(error)
-            raise PortUnavailable(self._host, self.port, why, option="--ros-master-uri") from None
+            raise PortUnavailable(self._host, self.port, _reason(error), option="--ros-master-uri") from None
         stack.callback(server.close)
         self.port = server.sockets[0].getsockname()[1]
         self._tasks.start(self._end_late(), "late connections")
@@ -164,14 +170,11 @@ class Ros1Server(Lifecycle):
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         sender = str((writer.get_extra_info("peername") or ("",))[0])
-
-        def refuse() -> None:
+        if len(self._door) >= LIMITS.connections:  # it is turned away, or another one for it
             self._drops.count("ros1-connection", sender)
-            writer.transport.abort()
-
-        guest = self._door.enter(sender, refuse)
+        guest = self._door.enter(sender, writer.transport.abort)
         if guest is None:
-            refuse()
+            writer.transport.abort()
         else:
             self._tasks.start(self._serve(reader, writer, sender, guest), "ROS 1 connection")
 
@@ -265,7 +268,8 @@ class Ros1Publisher:
             return kind.encode(message)
         except InvalidPayload as error:  # such as a cost over 32 bits, to a node of generation 3
             self._node.drops.count("ros1-version", self.topic)
-            log.info("%s: %s", self.topic, error, extra=log_event("ros1-not-sent", topic=self.topic))
+            why = "this message has no form in the version of its type that some nodes have"
+            log.info("%s: %s: %s", self.topic, why, error, extra=log_event("ros1-not-sent", topic=self.topic))
             return None
 
     async def serve(
@@ -545,7 +549,7 @@ class Ros1Node(Lifecycle):
             finally:
                 writer.close()
         except (OSError, EOFError) as error:
-            raise Ros1Error(f"{name} does not answer: {str(error) or type(error).__name__}") from None
+            raise Ros1Error(f"{name} does not answer: {_reason(error)}") from None
         if succeeded != b"\x01":
             raise Ros1Error(f"{name}: {reply[:300].decode(errors='replace')}")
         return kind.reply.decode(reply)

@@ -44,10 +44,12 @@ class Scene:
 
 
 @asynccontextmanager
-async def bridged(place: Place, robot: Agent, graph: Ros1Graph, **options: Any) -> AsyncIterator[Ros1Bridge]:
-    """The bridge beside a running robot."""
+async def bridged(
+    place: Place, robot: Agent, graph: Ros1Graph, *, endpoints: Endpoints | None = None, **options: Any
+) -> AsyncIterator[Ros1Bridge]:
+    """The bridge beside a running robot, on the market's router or by other `endpoints`."""
     async with (
-        Network(Endpoints(connect=(place.endpoint,))) as network,
+        Network(endpoints or Endpoints(connect=(place.endpoint,))) as network,
         Channel(network.session, place.market.deployment.lighthouse_name) as channel,
     ):
         store = Store(place.folder / "ros1")

@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bridges.ros1.cli import OURS, PARAMETERS, PRIVATE, settings_with_parameters
+from bridges.ros1.master import RosMaster
 from bridges.ros1.node import Ros1Graph, call_api
+from mesh.base.flood import Drops
 from mesh.settings import Settings
 from tests.support.commands import AIRA, Serving, aira, invoke
 from tests.support.objectives import objective
 from tests.support.ports import free_port
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -102,10 +105,41 @@ def test_messages_are_written_for_catkin_and_python(tmp_path: Path) -> None:
     assert "<depend>ipfs_common</depend>" in manifest
 
 
-@pytest.mark.parametrize("words", [(), ("--agent", "0x1")], ids=["nothing", "no address"])
-def test_a_bridge_without_an_agent_says_what_is_missing(words: tuple[str, ...]) -> None:
-    """Neither a keyfile nor an address."""
+WRONG = {
+    "no agent": ((), "input-error"),
+    "no address": (("--agent", "0x1"), "invalid-address"),
+    "no address to listen on": (("--ros-ip", "robot"), "input-error"),
+    "no address of a master": (("--ros-master-uri", "127.0.0.1:11311"), "input-error"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_command_that_can_not_work_says_why(name: str) -> None:
+    """In one line, and one with what to do."""
+    words, code = WRONG[name]
     master = f"http://127.0.0.1:{free_port()}/"
-    done = aira("bridge", "ros1", *words, "--master", "--ros-master-uri", master, AIRA_CONNECT="tcp/127.0.0.1:1")
-    assert done.returncode in (1, 2)
-    assert done.stderr.count("\n") <= 3, done.stderr
+    done = invoke("bridge", "ros1", "--master", "--ros-master-uri", master, *words)
+    assert done.returncode == 2
+    assert f"[{code}]" in done.stderr
+    assert done.stderr.count("\n") <= 2, done.stderr
+
+
+async def test_a_second_master_on_a_port_is_refused_with_what_to_do(
+    graph: Callable[[], AbstractAsyncContextManager[Ros1Graph]],
+) -> None:
+    """A ROS master that runs already is the one to join."""
+    async with graph() as here:
+        done = await asyncio.to_thread(aira, "bridge", "ros1", "--master", "--ros-master-uri", here.master)
+        assert done.returncode == 2
+        assert "leave out --master" in done.stderr, done.stderr
+
+
+async def test_the_bridge_waits_for_a_master_as_nodes_do(tmp_path: Path) -> None:
+    """And then reads its parameters."""
+    port = free_port()
+    words = ("bridge", "ros1", "--agent", f"0x{'1' * 40}", "--ros-master-uri", f"http://127.0.0.1:{port}")
+    variables = {"AIRA_DATA_DIR": str(tmp_path), "AIRA_CONNECT": f"tcp/127.0.0.1:{free_port()}"}
+    with Serving(*AIRA, *words, says="waiting for a ROS master", variables=variables) as bridge:
+        async with RosMaster("127.0.0.1", port, Drops()) as master:
+            await until(lambda: "the ROS master answers" in bridge.log(), what="its parameters")
+            await until(lambda: "liability" in master.parameters, what="the settings as parameters")
