@@ -86,7 +86,8 @@ class Ros1Bridge(Role):
         """Serve until one of our nodes is shut down. Raises `NodeShutDown`."""
         await self._graph.ended.wait()
         raise NodeShutDown(
-            self._graph.ended_by, hint="is another bridge, or the legacy stack, on this ROS master? Stop one of them"
+            self._graph.ended_by,
+            hint="was it `rosnode kill`? Or is another bridge, or the legacy stack, on this master? Stop one of them",
         )
 
     def families(self) -> tuple[MetricFamily, ...]:
