@@ -77,8 +77,8 @@ def scene(
     """Opens a market with a robot behind the bridge, whose options are given, for a minute and a half at most."""
 
     @asynccontextmanager
-    async def opened(*, open_services: bool = True, **options: Any) -> AsyncIterator[Scene]:
-        robot = place.agent("robot", open_services=open_services)
+    async def opened(*, open_services: bool = True, bag_results: bool = False, **options: Any) -> AsyncIterator[Scene]:
+        robot = place.agent("robot", open_services=open_services, bag_results=bag_results)
         async with (
             asyncio.timeout(90),
             graph() as here,

@@ -78,26 +78,15 @@ async def test_the_node_of_the_first_tutorial_greets_and_is_paid(scene: Opened) 
         assert await here.place.balance("robot") == before + 42
 
 
-async def test_a_tutorial_node_answers_a_bag_with_a_bag(
-    place: Place, graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
-) -> None:
-    """With `bag_results`: what it played and said, with the names that it has in the ROS graph."""
-    robot = place.agent("robot", open_services=True, bag_results=True)
-    async with (
-        asyncio.timeout(60),
-        graph() as here,
-        place.at_work(robot) as person,
-        bridged(place, robot, here),
-        ros(here.master).node("blink", "String", messages=messages["5"]) as node,
-    ):
-        assert await node.hear() == "ready"
+async def test_a_tutorial_node_answers_a_bag_with_a_bag(scene: Opened) -> None:
+    """With `bag_results`: what was played and what it says, with the names of the ROS graph."""
+    async with scene(bag_results=True) as here, here.node("blink", "String", generation="5"):
         task = Bag([BagMessage("/blink", String("red").encode(), 1)]).encode()
-        contract = await person.demand(place.save(task, "objective.bag"))
+        contract = await here.person.demand(here.place.save(task, "objective.bag"))
         assert (await contract.outcome()).success
-        result = await contract.recording()
-        info = await ros(here.master).run("rosbag", "info", "-y", str(result))
+        info = await here.tools.run("rosbag", "info", "-y", str(await contract.recording()))
     below = f"/liability/eth_{contract.address}"
-    assert [found.removeprefix("topic: ") for found in findall("topic: .*", info)] == [f"{below}/blink", f"{below}/led"]
+    assert findall("topic: (.*)", info) == [f"{below}/blink", f"{below}/led"]
     assert info.count("type: std_msgs/String") == 3  # once in the list of types
 
 
