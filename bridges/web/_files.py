@@ -226,10 +226,6 @@ class Files:
             limit, timeout = settings.objective_expanded_limit, min(settings.fetch_timeout, 4.0)
             return await self._parts.exchange.fetch(cid, size_limit=limit, timeout=timeout)
 
-    @property
-    def uploading(self) -> int:
-        return len(self._uploads)
-
     async def in_thread(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """Call what reads a file, in a thread, few at a time."""
         async with self._reading:

@@ -308,27 +308,8 @@ def encode_calls(calls: Sequence[Call], *, gas: int, most: int) -> bytes:
     return load_artifact("Multicall").bytecode + words + packed + bytes(-len(packed) % 32)
 
 
-def decode_calls(code: bytes) -> list[Call] | None:
-    """The calls that `encode_calls` encoded; None for other code. For nodes that imitate it."""
-    known = load_artifact("Multicall").bytecode
-    if not code.startswith(known):
-        return None
-    packed, calls, at = decode(["uint256", "uint256", "bytes"], code[len(known) :])[2], [], 0
-    while at < len(packed):
-        data = at + 22
-        end = data + int.from_bytes(packed[at + 20 : data])
-        calls.append(("0x" + packed[at : at + 20].hex(), packed[data:end]))
-        at = end
-    return calls
-
-
-def encode_answers(answers: Sequence[bytes | None]) -> bytes:
-    """What the code returns: of each call what it returned, or None if it failed."""
-    return b"".join([bytes([one is not None]) + len(one or b"").to_bytes(2) + (one or b"") for one in answers])
-
-
 def decode_answers(returned: bytes, *, number: int) -> list[bytes | None]:
-    """The reverse of `encode_answers`, for that many answers. Raises `SpoiledAnswer`."""
+    """What a number of calls returned, or None for those that failed. Raises `SpoiledAnswer`."""
     answers: list[bytes | None] = []
     at = 0
     while at < len(returned):

@@ -28,7 +28,7 @@ from mesh.errors import AiraError
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
     from typing import Self
 
     from mesh.chain.rpc import Transport
@@ -431,8 +431,8 @@ class JsonRpcServer:
     Requests are sent by POST or over a WebSocket, at the same address; a WebSocket also has `eth_subscribe` (`newHeads`
     and `logs`) and `eth_unsubscribe`.
 
-    It listens on loopback by default. A web page may call it only from one of `allowed_origins` (`"*"` for any); a
-    loopback server also refuses requests that name another host, as after DNS rebinding.
+    It listens on loopback by default. Web pages may not call it; a loopback server also refuses requests that name
+    another host, as after DNS rebinding.
 
     Used with `async with`; leaving it finishes the requests in progress. Entering raises `PortUnavailable` when the
     port is taken.
@@ -444,7 +444,6 @@ class JsonRpcServer:
         *,
         host: str = "127.0.0.1",
         port: int = 0,
-        allowed_origins: Iterable[str] = (),
         max_response_bytes: int = MAX_RESPONSE_BYTES,
     ) -> None:
         self._dispatcher = Dispatcher(provider, max_response_bytes=max_response_bytes)
@@ -452,7 +451,6 @@ class JsonRpcServer:
         self._connections: set[WebSocketConnection] = set()
         self._host = host
         self._port = port
-        self._origins = frozenset(allowed_origins)
         self._server: HttpServer | None = None
 
     @property
@@ -474,7 +472,6 @@ class JsonRpcServer:
         app = web.Application(client_max_size=MAX_BODY_BYTES)
         app.router.add_post("/", self._post)
         app.router.add_get("/", self._open_socket)
-        app.router.add_options("/", self._preflight)
         app.cleanup_ctx.append(self._run_subscriptions)
         app.on_shutdown.append(self._close_sockets)
         self._server = HttpServer(app, self._host, self._port, limits=LIMITS)
@@ -496,21 +493,19 @@ class JsonRpcServer:
             await connection.close()
 
     async def _post(self, request: web.Request) -> web.Response:
-        headers = self._admit(request)
+        self._check_sender(request)
         answer = await self._dispatcher.respond(await request.read())
         if answer is None:
-            return web.Response(status=204, headers=headers)
-        return web.Response(text=answer, content_type="application/json", headers=headers)
+            return web.Response(status=204)
+        return web.Response(text=answer, content_type="application/json")
 
     async def _open_socket(self, request: web.Request) -> web.StreamResponse:
-        headers = self._admit(request)
+        self._check_sender(request)
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT, max_msg_size=MAX_BODY_BYTES)
         if not socket.can_prepare(request):
-            raise web.HTTPUpgradeRequired(
-                text="this is a node: POST JSON-RPC here, or open a WebSocket", headers=headers
-            )
+            raise web.HTTPUpgradeRequired(text="this is a node: POST JSON-RPC here, or open a WebSocket")
         if len(self._connections) >= MAX_CONNECTIONS:
-            raise web.HTTPServiceUnavailable(text="too many WebSockets are open", headers=headers)
+            raise web.HTTPServiceUnavailable(text="too many WebSockets are open")
         assert self._subscriptions is not None
         connection = WebSocketConnection(request, socket, self._dispatcher, self._subscriptions)
         self._connections.add(connection)
@@ -521,24 +516,13 @@ class JsonRpcServer:
             self._connections.discard(connection)
         return socket
 
-    async def _preflight(self, request: web.Request) -> web.Response:
-        headers = self._admit(request)
-        return web.Response(
-            status=204,
-            headers=headers | {"Access-Control-Allow-Methods": "POST", "Access-Control-Allow-Headers": "content-type"},
-        )
-
-    def _admit(self, request: web.Request) -> dict[str, str]:
-        """The headers that let a page read the answer. Raises HTTP 403 for a page that is not allowed to ask."""
+    def _check_sender(self, request: web.Request) -> None:
+        """Raise HTTP 403 for a request of a web page, or for another host."""
         name = (request.host or "").rpartition(":")[0] or request.host
         if self._host in LOOPBACK_NAMES and name not in LOOPBACK_NAMES:
             raise web.HTTPForbidden(text="this node serves its own machine only")
-        origin = request.headers.get("Origin")
-        if origin is None:
-            return {}
-        if origin not in self._origins and "*" not in self._origins:
-            raise web.HTTPForbidden(text="pages of this origin may not ask this node")
-        return {"Access-Control-Allow-Origin": origin, "Vary": "Origin"}
+        if "Origin" in request.headers:
+            raise web.HTTPForbidden(text="web pages may not ask this node")
 
 
 class WebSocketConnection:

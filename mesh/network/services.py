@@ -118,11 +118,6 @@ class Services:
         if self._requests:
             await asyncio.wait(self._requests)
 
-    @property
-    def in_progress(self) -> int:
-        """The requests that are being handled."""
-        return len(self._requests)
-
     def offer(self, service: str, handler: Callable[[Any], Awaitable[Record]]) -> None:
         """Reply to requests for `service` (one of `schemas.rpc.SERVICES`) with the result of `handler`.
 

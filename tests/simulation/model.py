@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
 
-from mesh.chain._node import decode_calls, encode_answers
 from mesh.chain.answers import NO_TRANSACTIONS, REVERTED
 from mesh.dev._evm import FUNDS_WEI, MinedBlocks
 from mesh.dev._rpc import SERVER_ERROR, RpcError, parse_data
@@ -22,6 +21,7 @@ from tests.simulation.model_contracts import ModelBlockingToken, ModelJury, Mode
 from tests.simulation.model_factory import ModelFactory
 from tests.simulation.model_state import ModelRun, ModelState
 from tests.simulation.model_transactions import ModelTransaction, read_transaction
+from tests.support.multicall import decode_calls, encode_answers
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -159,9 +159,9 @@ async def test_an_upload_that_breaks_off_leaves_nothing(
         for framing in (by_length, in_chunks):
             _, writer = await asyncio.open_connection(host, int(port))
             writer.write(f"{head}Content-Type: application/octet-stream\r\n{framing}".encode())
-            await until(lambda: browser.server.api.files.uploading, what="an upload")
+            await until(lambda: browser.server.api.files._uploads, what="an upload")
             writer.close()
-            await until(lambda: not browser.server.api.files.uploading, what="the end of the upload")
+            await until(lambda: not browser.server.api.files._uploads, what="the end of the upload")
         await until(lambda: not list(tmp_path.glob("aira-upload-*")), what="an empty folder")
         await browser.get("market")
     assert "Traceback" not in caplog.text

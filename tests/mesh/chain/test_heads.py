@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import Node
-from mesh.chain._node import Heads, Pace, decode_calls, encode_calls
+from mesh.chain._node import Heads, Pace, encode_calls
 from mesh.chain.answers import NO_TRANSACTIONS, BlockHeader
 from mesh.chain.following import topics_of
 from mesh.chain.rpc import HttpTransport
@@ -20,6 +20,7 @@ from schemas import keccak256
 from schemas.address import address_bytes
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.senders import NO_MINING
+from tests.support.multicall import decode_calls
 from tests.support.nodes import Anvil
 from tests.support.waiting import until_found
 
