@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.base.extras import PackageMissing
 from mesh.recording import open_objective
 from mesh.validator.verification import Claim, JobFiles, verify
 from schemas import Empty, String, cid_of_file
@@ -105,3 +107,30 @@ async def test_the_reason_of_a_failed_job_is_read_from_its_bag(place: Place) -> 
         assert open_objective(await contract.recording()).format == "bag"
     assert (outcome.success, outcome.code) == (False, "handler-failed")
     assert "the lamp is broken" in outcome.reason
+
+
+async def test_what_a_killed_run_left_of_a_bag_is_replaced(place: Place) -> None:
+    robot = offering(place.agent("robot", bag_results=True))
+
+    @robot.on("/blink")
+    async def blink(job: Job, _message: Any) -> None:
+        left = robot.parts.recordings / f"{job.liability.address}.bag"
+        left.mkdir(exist_ok=True)
+        (left / "result.bag").write_bytes(BAG[:1000])
+
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(BAG, "objective.bag"))
+        assert (await contract.outcome()).success
+        assert len(said(await contract.recording())) == 2
+        assert not list(robot.parts.recordings.iterdir())
+
+
+async def test_an_agent_does_not_start_without_the_package_that_makes_bags(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would find out at the end of its first job."""
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
+    with pytest.raises(PackageMissing) as caught:
+        async with place.agent("robot", bag_results=True):
+            pass
+    assert caught.value.extra == "ros"
