@@ -7,21 +7,24 @@ time says how old it is.
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.ledger import Phase
 from mesh.base.flood import Rate
 from mesh.errors import ChainError, ConfigurationError
 from mesh.network.services import answering
+from mesh.role.database import LedgerUnusable
 from schemas import ProfileKey
 from schemas.cid import is_cid
 from schemas.profiles import MOST_WAITING, Profile, ProfileState, text_fault
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from contextlib import AbstractAsyncContextManager
 
     import zenoh
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
     from mesh.settings import ProfileSettings
     from schemas.model import ModelDescription
 
+log = logging.getLogger(__name__)
+
 LARGEST_PICTURE: Final = 512 * 1024
 """Bytes of a robot's picture."""
 ASKED: Final = Rate(per_second=20.0, burst=100)
@@ -38,11 +43,15 @@ ASKED: Final = Rate(per_second=20.0, burst=100)
 INTERVAL: Final = 1.0
 """Seconds between two profiles that are put, at least."""
 
-Mark: TypeAlias = Literal["stopped", "closed"]
+LOOK: Final = 2.0
+"""Seconds after which `run` looks by itself whether the profile has changed."""
 
 
 class OwnProfile:
-    """The profile of one robot. Call `prepare` once, then `serve` and `run`; `changed` and `mark` at any time."""
+    """The profile of one robot. Call `prepare` once, then `serve` and `run`, and `changed` at any time.
+
+    `is_stopped` and `is_closed` say whether somebody has stopped the robot, and whether it takes no jobs now.
+    """
 
     def __init__(
         self, parts: AgentComponents, executor: Executor, description: ModelDescription | None, *, model: str
@@ -53,8 +62,9 @@ class OwnProfile:
         self._picture = ""
         self._price = "" if description is None else description.price
         self._seconds = float((None if description is None else description.seconds) or 0)
-        self._marks: set[Mark] = set()
         self._changed = asyncio.Event()
+        self.is_stopped: Callable[[], bool] = lambda: False
+        self.is_closed: Callable[[], bool] = lambda: False
 
     async def prepare(self) -> None:
         """Check the settings, put the picture into the store, and find the model's CID.
@@ -88,11 +98,6 @@ class OwnProfile:
             raise _unusable(f"{settings.picture} is no picture that others can show")
         self._parts.store.release("picture")  # that of an earlier run
         return self._parts.store.put_bytes(data, pin="picture")
-
-    def mark(self, state: Mark, *, on: bool) -> None:
-        """Say from now on that the robot is stopped or closed, or (`on` false) that it is so no more."""
-        (self._marks.add if on else self._marks.discard)(state)
-        self.changed()
 
     def changed(self) -> None:
         """Something that the profile says may have changed."""
@@ -128,9 +133,10 @@ class OwnProfile:
         return profile.signed_by(signer)
 
     async def _state(self) -> ProfileState:
-        for mark in ("stopped", "closed"):
-            if mark in self._marks:
-                return mark
+        if self.is_stopped():
+            return "stopped"
+        if self.is_closed():
+            return "closed"
         return "working" if (await self._parts.ledger.jobs_by_phase()).get("running") else "idle"
 
     def serve(self) -> AbstractAsyncContextManager[None]:
@@ -147,13 +153,18 @@ class OwnProfile:
         key, said = str(ProfileKey(self._parts.signer.address)), dict[str, Any]()
         while True:
             self._changed.clear()
-            profile = await self.present()
-            facts = {"state": profile.state, "queue": profile.queue, "wait": profile.wait}
-            if facts != said:
-                said = facts
-                self._parts.channel.put(key, profile.encode())
+            try:
+                profile = await self.present()
+            except LedgerUnusable as error:
+                log.debug("the profile is not known now: %s", error)
+            else:
+                facts = {"state": profile.state, "queue": profile.queue, "wait": profile.wait}
+                if facts != said:
+                    said = facts
+                    self._parts.channel.put(key, profile.encode())
             await asyncio.sleep(INTERVAL)
-            await self._changed.wait()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._changed.wait(), LOOK)
 
 
 def _unusable(why: str) -> ConfigurationError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -138,14 +139,14 @@ async def test_a_job_changes_the_state_and_the_queue(place: Place) -> None:
         assert last == {robot.address: (0, 1)}
 
 
-async def test_a_robot_can_be_marked_as_stopped(place: Place) -> None:
+async def test_a_robot_that_is_stopped_or_closed_says_so(place: Place) -> None:
     async with offering(place.agent("robot")) as robot, place.agent("person") as person:
-        robot.runtime.profile.mark("closed", on=True)
-        robot.runtime.profile.mark("stopped", on=True)
+        own = robot.runtime.profile
+        own.is_stopped = own.is_closed = lambda: True
         assert (await profile_of(robot, person)).state == "stopped"
-        robot.runtime.profile.mark("stopped", on=False)
+        own.is_stopped = lambda: False
         assert (await profile_of(robot, person)).state == "closed"
-        robot.runtime.profile.mark("closed", on=False)
+        own.is_closed = lambda: False
         assert (await profile_of(robot, person)).state == "idle"
 
 
@@ -161,10 +162,11 @@ async def test_a_change_is_put_once_a_second_at_most(place: Place) -> None:
         subscriber = network.session.declare_subscriber(key, hear)
         async with robot:
             await until_heard(robot.network.session, key)
+            own = robot.runtime.profile
             for number in range(50):
-                robot.runtime.profile.mark("stopped", on=number % 2 == 0)
+                own.is_stopped = partial(bool, number % 2)
+                own.changed()
                 await asyncio.sleep(0.02)
-            robot.runtime.profile.mark("stopped", on=True)
             await until(lambda: bool(heard) and heard[-1][1].state == "stopped", what="the last state")
         subscriber.undeclare()  # type: ignore[no-untyped-call]
     assert all(profile.is_signed for _, profile in heard)
