@@ -3,9 +3,11 @@ from mesh.agent._answers import Answer as Answer, Unanswered as Unanswered
 from mesh.agent.contracts import Contract as Contract, Outcome as Outcome, Progress as Progress
 from mesh.agent.errors import (
     Declined as Declined,
+    DemandDeclined as DemandDeclined,
     LiabilityReverted as LiabilityReverted,
     OrderClosed as OrderClosed,
     OrderExpired as OrderExpired,
+    OtherRobot as OtherRobot,
 )
 from mesh.agent.handlers import Job as Job, JobFailed as JobFailed
 from mesh.agent.ledger import Phase as Phase, WrongPhase as WrongPhase

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self
 
 import msgspec
 
+from schemas.address import keccak256
 from schemas.errors import InvalidMessage
 from schemas.messages import Demand, Offer, Result
 from schemas.records import (
@@ -155,6 +156,49 @@ class OrderPair(SignedRecord, frozen=True, kw_only=True):
 class PairTaken(Record, frozen=True, omit_defaults=True):
     """The provider creates the contract when its turn comes; or, with a `code` and a `detail`, why it does not."""
 
+    code: str = ""
+    detail: str = ""
+
+
+class QuoteRequest(SignedRecord, frozen=True, kw_only=True):
+    """Ask a robot what it wants for an objective (CID) by a model (CID), signed by the `asker` (EIP-55)."""
+
+    domain: ClassVar = b"aira quote request\0"
+    author: ClassVar = "asker"
+
+    model: str
+    objective: str
+    lighthouse: str
+    asker: str
+    nonce: str
+    time: int
+    """Unix seconds, by the asker's clock."""
+
+    @property
+    def identity(self) -> str:
+        """Its hash, which a quote names: 64 hexadecimal digits."""
+        return keccak256(self.encode()).hex()
+
+
+class Quote(SignedRecord, frozen=True, kw_only=True, omit_defaults=True):
+    """What a robot wants for a job, or, with a `code` and a `detail`, why it does not want it. It binds nobody.
+
+    `cost` is in the smallest unit of `token`. `start` is in how many seconds it would begin, `seconds` how long it
+    takes (0: not known), both estimated; `until` the block until which it means this.
+    """
+
+    domain: ClassVar = b"aira quote\0"
+    author: ClassVar = "agent"
+
+    agent: str
+    request: str
+    cost: UInt256 = 0
+    token: str = ""
+    validator: str = ""
+    """The validator that it insists on; empty for any or none."""
+    start: float = 0.0
+    seconds: float = 0.0
+    until: int = 0
     code: str = ""
     detail: str = ""
 
@@ -302,6 +346,7 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "logs": Service(ReadLogs, LogsRead),
         "accept": Service(AcceptDemand, Accepted),
         "pair": Service(OrderPair, PairTaken),
+        "quote": Service(QuoteRequest, Quote),
         "sign/demand": Service(SignDemand, Published),
         "sign/offer": Service(SignOffer, Published),
         "sign/result": Service(SignResult, Published),

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from mesh.agent._outbox import result_identity
 from mesh.agent._profile import OwnProfile
+from mesh.agent._quotes import Quoting
 from mesh.agent._services import offer_services
 from mesh.agent._status import AgentStatus
 from mesh.agent.contracts import ContractReports, Outcome
@@ -240,6 +241,7 @@ class AgentRuntime(Lifecycle):
         self.status = AgentStatus(parts, self.executor, model=model)
         self.profile = OwnProfile(parts, self.executor, description, model=model)
         self._handlers = handlers
+        self._description = description
         # Else it may run beside the account's robot, as the commands of a person do.
         self._is_robot = bool(handlers.topics) or Demand in handlers.market
         self._new: Created | None = None
@@ -257,6 +259,8 @@ class AgentRuntime(Lifecycle):
         services = self.parts.services
         offer_services(self.parts, self.executor, has_handlers=bool(self._handlers.topics))
         if decide := self._handlers.market.get(Demand):
+            quoting = Quoting(self.parts, self.profile, self._handlers.quotes, self._description, model=self._model)
+            services.offer("quote", quoting.quote)
             services.offer("accept", Acceptance(self.parts, self.trader, decide, model=self._model).accept)
         services.offer("logs", LogService("agent", self.parts.signer.address).logs)
         services.offer("status", self.status.status)

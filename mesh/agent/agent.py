@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
 from mesh.agent._answers import Answer, Question, Unanswered, metadata_of_answer
+from mesh.agent._quotes import QUOTE_TIMEOUT, asked_quotes
 from mesh.agent.components import working
 from mesh.agent.contracts import nothing
 from mesh.agent.demands import HANDLED
-from mesh.agent.errors import OrderClosed
+from mesh.agent.errors import DemandDeclined, OrderClosed
 from mesh.agent.handlers import (
     ANY_TOPIC,
     DemandHandler,
@@ -25,6 +26,7 @@ from mesh.agent.handlers import (
     LiabilityHandler,
     OfferHandler,
     PeriodicHandler,
+    QuoteHandler,
     ReadingHandler,
     RegistrationError,
     ReportHandler,
@@ -42,8 +44,8 @@ from mesh.agent.statement import period, read_statement
 from mesh.agent.validators import ValidatorSilent, check_named
 from mesh.amounts import XRT
 from mesh.base.log_context import log_event
-from mesh.errors import ChainError, ClosedError, ConfigurationError, InputError
-from mesh.network import ReadingSubscription, sending
+from mesh.errors import ChainError, ClosedError, ConfigurationError, InputError, RemoteError
+from mesh.network import ReadingSubscription, ServiceFailed, sending
 from mesh.network.readings import LARGEST_READING
 from mesh.recording import encode_described, pack_values
 from mesh.role.composition import watching
@@ -90,6 +92,8 @@ if TYPE_CHECKING:
     from mesh.watching import Robot
     from schemas.model import ModelLimits
     from schemas.payloads import PayloadType
+    from schemas.rpc import Quote
+    from schemas.signing import Decline
 
 
 class ModelUnfit(ConfigurationError, code="model-unfit"):
@@ -183,6 +187,7 @@ R = TypeVar("R", bound=ResultHandler)
 L = TypeVar("L", bound=LiabilityHandler)
 G = TypeVar("G", bound=ReadingHandler)
 J = TypeVar("J", bound=ReportHandler)
+Q = TypeVar("Q", bound=QuoteHandler)
 P = TypeVar("P", bound=PeriodicHandler)
 K = TypeVar("K")
 V = TypeVar("V")
@@ -203,8 +208,11 @@ class DemandTerms(TypedDict, total=False):
     validator_fee: int | str | None
     lifetime: int | None
     robot: str
+    max_cost: int | str | None
 
 
+CHOICES: Final = ("cheapest", "first")
+"""The words for a robot that is chosen by its quote."""
 ASK_SECONDS: Final = 60.0
 """How long `Agent.ask` waits for an answer by default."""
 
@@ -304,6 +312,16 @@ class Agent(Program):
         """Handle each phase of each of the agent's jobs: `async def handler(phase, liability)`."""
         check_handler(handler, "phase: Phase, liability: Liability", arguments=2)
         self._handlers.liabilities.append(handler)
+        return handler
+
+    def on_quote(self, handler: Q) -> Q:
+        """Answer what a job would cost: `async def handler(request) -> "5 XRT"`, or raise `Declined("code", "why")`.
+
+        `request.objective` is the CID, which `agent.examine` reads. Without a handler the price is that of the model's
+        description. A robot that has no handler of demands is not asked.
+        """
+        check_handler(handler, "request: QuoteRequest", arguments=1)
+        self._handlers.quotes = [handler]
         return handler
 
     def on_report(self, handler: J) -> J:
@@ -459,6 +477,7 @@ class Agent(Program):
         validator_fee: int | str | None = None,
         lifetime: int | None = None,
         robot: str = "",
+        max_cost: int | str | None = None,
     ) -> Order:
         """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
 
@@ -471,12 +490,19 @@ class Agent(Program):
         not published. Raises `DemandDeclined` with its reason if it makes none, `ServiceFailed` if it does not answer,
         and as `robot_address` for a name.
 
+        `robot="cheapest"` and `"first"` (the one that would be done first) ask all for `quotes`, and order from one at
+        its price, if that is `max_cost` (else `cost`) at most; if it declines, from the next one. With a `max_cost`,
+        `cost` is raised up to that if robots want more. Raises `RemoteError` (`no-robot-fits`).
+
         Raises `InputError`, `InsufficientTokens`, `ObjectiveUnfit` if a file is not playable, or
         if the model's description is available and excludes the objective, `UnsafeValidator` and its like for a
         validator that can't be named, and `ValidatorSilent` if its fee is not known because nobody answers.
         """
         writer = self.runtime.trader.writer
         cid = await self._cid_of(objective)
+        if robot in CHOICES or max_cost is not None:
+            others = {"token": token, "validator": validator, "validator_fee": validator_fee, "lifetime": lifetime}
+            return await self._order_by_quote(cid, cost=cost, max_cost=max_cost, robot=robot, model=model, **others)
         terms = await writer.terms(
             model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
         )
@@ -538,6 +564,59 @@ class Agent(Program):
         except ChainError as error:  # then the records are not known
             log.debug("the records of robots can't be counted now: %s", error)
             return robots
+
+    async def quotes(
+        self, model: str, objective: str | Path | Messages, *, timeout: float = QUOTE_TIMEOUT
+    ) -> list[Quote]:
+        """What the robots of a model (CID or name) that are present want for an objective, as in `order`.
+
+        The cheapest is first; those with a `code` don't want the job. Not listed is who does not answer within
+        `timeout` seconds, and robots of the legacy network. A quote binds nobody.
+        """
+        cid, named = await self._cid_of(objective), await self.parts.chain.names.model(model or self.model)
+        robots = await self.parts.robots.present(named, timeout=timeout)
+        return await asked_quotes(self.parts, named, cid, [one.address for one in robots], timeout=timeout)
+
+    async def _order_by_quote(
+        self, objective: str, *, cost: int | str, max_cost: int | str | None, robot: str, model: str, **terms: Any
+    ) -> Order:
+        """Order at the price that robots want, up to `max_cost`: from any of them, or from the one that is chosen."""
+        named = terms["token"] or self.settings.erc20_token
+        unit, token = await self.parts.chain.tokens.unit(named), await self.parts.chain.names.address(named)
+        least, most = unit.amount(cost), unit.amount(cost if max_cost is None else max_cost)
+        if robot in CHOICES:
+            least = 0
+        elif robot:
+            robot = await robot_address(self.network.session, self.channel, robot)
+        found = [quote for quote in await self.quotes(model, objective) if robot in ("", *CHOICES, quote.agent)]
+        fitting = [quote for quote in found if not quote.code and quote.token == token and quote.cost <= most]
+        if robot == "first":
+            fitting.sort(key=lambda quote: (quote.start + quote.seconds, quote.cost))
+        if not robot:
+            paid = max(least, min((int(quote.cost) for quote in fitting), default=least))
+            return await self.order(objective, cost=paid, model=model, **terms)
+        declined: list[Decline] = []
+        for quote in fitting:
+            try:
+                paid = max(least, int(quote.cost))
+                return await self.order(objective, cost=paid, model=model, robot=quote.agent, **terms)
+            except DemandDeclined as error:
+                declined += error.declines
+            except ServiceFailed as error:
+                log.info(
+                    "%s does not answer: %s", quote.agent, error, extra=log_event("robot-silent", robot=quote.agent)
+                )
+        said = [f"{one.agent} declines ({one.code})" for one in declined]
+        said += [
+            f"{one.agent} {f'declines ({one.code})' if one.code else f'wants {unit.show(one.cost)}'}"
+            for one in found
+            if one not in fitting
+        ]
+        raise RemoteError(
+            f"no robot does it for {unit.show(most)}: {'; '.join(said[:5]) or 'none of this model answers'}",
+            hint="give a higher max_cost, or see `aira quotes`",
+            code="no-robot-fits",
+        )
 
     def orders(self, *states: OrderState) -> list[Order]:
         """The account's orders in these states, oldest first; by default the open ones, those of earlier runs included.

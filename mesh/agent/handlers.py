@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from mesh.agent.ledger import Phase
     from mesh.network import Reading, ReadingSubscription, Subscription
     from mesh.recording import Played
+    from schemas.rpc import QuoteRequest
     from schemas.verdicts import ValidatorReport
 
     TopicHandler = Callable[["Job", Any], object]
@@ -99,8 +100,8 @@ def user_frame() -> FrameType:
     return frame
 
 
-async def call_handler(handler: Callable[..., object], *arguments: Any) -> None:
-    """Call a handler, a sync one in a thread. Raises what it raises.
+async def call_handler(handler: Callable[..., object], *arguments: Any) -> Any:
+    """Call a handler, a sync one in a thread; returns what it returns. Raises what it raises.
 
     Cancelling stops an async handler; a sync one continues in its thread, and nothing waits for it.
     """
@@ -110,8 +111,7 @@ async def call_handler(handler: Callable[..., object], *arguments: Any) -> None:
         outcome = await asyncio.wrap_future(
             in_daemon_thread(partial(handler, *arguments), f"handler {name_of(handler)}")
         )
-    if inspect.isawaitable(outcome):
-        await outcome
+    return await outcome if inspect.isawaitable(outcome) else outcome
 
 
 WAITING: Final = 1024
@@ -448,6 +448,7 @@ LiabilityHandler = Callable[["Phase", Liability], object]
 ReadingHandler = Callable[["Reading"], object]
 ReportHandler = Callable[["ValidatorReport"], object]
 PeriodicHandler = Callable[[], object]
+QuoteHandler = Callable[["QuoteRequest"], object]
 
 
 def check_period(seconds: object) -> None:
@@ -475,6 +476,7 @@ class Handlers:
     market: dict[type[Demand | Offer | Result], list[Handler]] = field(default_factory=dict)
     liabilities: list[LiabilityHandler] = field(default_factory=list)
     reports: list[ReportHandler] = field(default_factory=list)
+    quotes: list[QuoteHandler] = field(default_factory=list)
     readings: list[tuple[str, str, ReadingHandler]] = field(default_factory=list)
     """The topic, the agent (`*` for any), and the handler."""
     periodic: list[tuple[float, PeriodicHandler]] = field(default_factory=list)

@@ -27,6 +27,7 @@ COMMANDS: Final = {
     "order": ("mesh.cli.order:command", "list and withdraw open orders"),
     "peers": ("mesh.cli.status:peers", "list the peers on a lighthouse's channel"),
     "provider": ("mesh.cli.provider:command", "match the orders of a lighthouse and settle them"),
+    "quotes": ("mesh.cli.quotes:command", "ask the robots of a model what they want for a job"),
     "replay": ("mesh.cli.replay:command", "publish the messages of a recording again"),
     "robots": ("mesh.cli.robots:command", "list the robots on a lighthouse's channel"),
     "router": ("mesh.cli.router:command", "run a Zenoh router for the mesh"),

@@ -438,7 +438,12 @@ async def agreed_fee(
     help="what you pay: whole tokens (1.5), or the smallest unit (1500000000wn for XRT, 15units for other tokens)",
 )
 @click.option(
-    "--robot", default="", help="name or address of the only robot that gets the job; nobody else sees the demand [any]"
+    "--robot",
+    default="",
+    help="the only robot that gets the job: name, address, cheapest or first (done first) [any]",
+)
+@click.option(
+    "--max-cost", type=AmountText(), help="raise --cost up to this if robots want more; the most for a chosen robot"
 )
 @click.option("--validator", type=ADDRESS, default="", help="address or ENS name of the validator of the result [none]")
 @click.option(
@@ -476,6 +481,7 @@ async def demand(
     as_json: bool,
     confirmed: bool = False,
     robot: str = "",
+    max_cost: str | None = None,
     existing: str | None = None,
     withdraw_on_exit: bool = False,
     **terms: Any,
@@ -525,13 +531,14 @@ async def demand(
                 await agent.add(model.file)
             cid = source if isinstance(source, str) else await agent.add(source)
             terms["cost"] = unit.parse(terms["cost"])
+            most = None if max_cost is None else unit.parse(max_cost)
             fee = await agreed_fee(agent, cid, fee, confirmed=confirmed, as_json=as_json, **terms)
             terms["validator_fee"] = fee
             printer.awaited = "the validator" if terms["validator"] else printer.awaited
             order = await take_existing(agent, cid, existing, quiet=as_json, **terms)
             if order is None:
                 await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
-                order = await _post(agent, cid, checked, printer, robot=robot, **terms)
+                order = await _post(agent, cid, checked, printer, robot=robot, max_cost=most, **terms)
             contract = await _contract(agent, order, printer, withdraw_on_exit=withdraw_on_exit)
             await _wait_for_end(agent, contract, printer, out)
 

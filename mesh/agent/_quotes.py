@@ -1,0 +1,136 @@
+"""Quotes: what robots ask for a job, and when they would do it. They bind nobody, and cost nothing.
+
+A robot answers with what its handler says, or by default with the price in its model's description.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import time
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from mesh.agent.demands import grounds_of
+from mesh.agent.errors import Declined
+from mesh.agent.handlers import call_handler
+from mesh.agent.objectives import Buyer
+from mesh.agent.orders import FEWEST_BLOCKS, HANDLED_FOR
+from mesh.base.flood import Rate, RateLimiter
+from mesh.base.log_context import log_event
+from mesh.errors import AiraError, InvalidMessage, public_text
+from mesh.watching.market import query_all
+from schemas import InvalidRecord, RpcKey
+from schemas.cid import is_cid
+from schemas.rpc import Quote, QuoteRequest
+from schemas.signing import LONGEST_DETAIL
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from mesh.agent._profile import OwnProfile
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.handlers import QuoteHandler
+    from schemas.model import ModelDescription
+
+log = logging.getLogger(__name__)
+
+QUOTE_TIMEOUT: Final = 2.0
+"""Seconds that robots have to answer by default."""
+ASKED: Final = 64
+"""Robots that are asked at once, at most."""
+PER_ASKER: Final = Rate(per_second=1.0, burst=32)
+"""Quotes for one asker …"""
+TOTAL: Final = Rate(per_second=10.0, burst=200)
+"""… and for all."""
+
+
+async def asked_quotes(
+    parts: AgentComponents, model: str, objective: str, robots: Collection[str], *, timeout: float
+) -> list[Quote]:
+    """The quotes of these robots (addresses) that arrive in `timeout` seconds: the cheapest first, refusals last."""
+    request = QuoteRequest(
+        model=model,
+        objective=objective,
+        lighthouse=parts.channel.lighthouse,
+        asker=parts.signer.address,
+        nonce=secrets.token_hex(16),
+        time=int(time.time()),
+    ).signed_by(parts.signer)
+    keys = {str(RpcKey(robot, "quote")): robot for robot in [*robots][:ASKED]}
+    found: dict[str, Quote] = {}
+    for reply in await query_all(parts.network.session, keys, payload=request.encode(), timeout=timeout):
+        if reply.ok is None:
+            continue
+        with suppress(InvalidRecord):
+            quote = Quote.decode(reply.ok.payload.to_bytes())
+            is_asked = keys.get(str(reply.ok.key_expr)) == quote.agent and quote.request == request.identity
+            if is_asked and quote.agent not in found and quote.is_signed:
+                found[quote.agent] = quote
+    return sorted(found.values(), key=lambda quote: (bool(quote.code), quote.cost, quote.start, quote.agent))
+
+
+class Quoting:
+    """The service `quote` of a robot: what its handler asks for a job, or the price of its `description`."""
+
+    def __init__(
+        self,
+        parts: AgentComponents,
+        profile: OwnProfile,
+        handlers: Sequence[QuoteHandler],
+        description: ModelDescription | None,
+        *,
+        model: str,
+    ) -> None:
+        self._parts = parts
+        self._profile = profile
+        self._handlers = handlers
+        self._price = "" if description is None else description.price
+        self._seconds = float((None if description is None else description.seconds) or 0)
+        self._model = model
+        self._limiter = RateLimiter(per_sender=PER_ASKER, total=TOTAL)
+
+    async def quote(self, request: QuoteRequest) -> Quote:
+        """The signed reply. Raises `InvalidMessage` for a request that is not signed, or for another market."""
+        if not request.is_signed:
+            raise InvalidMessage("signature", "the request is not signed by its asker")
+        if request.lighthouse != self._parts.channel.lighthouse:
+            raise InvalidMessage("lighthouse", f"made for {request.lighthouse}, not for this market")
+        agent, identity = self._parts.signer.address, request.identity
+        try:
+            quote = await self._quote(request)
+        except AiraError as error:
+            grounds = grounds_of(error)
+            code, detail = ("failed", "its handler failed") if grounds is None else grounds
+            if grounds is None:
+                log.warning("no quote: %s", error, extra=log_event("quote-failed", code=error.code))
+            detail = public_text(detail, longest=LONGEST_DETAIL)
+            quote = Quote(agent=agent, request=identity, code=code, detail=detail)
+        return quote.signed_by(self._parts.signer)
+
+    async def _quote(self, request: QuoteRequest) -> Quote:
+        parts = self._parts
+        if not self._limiter.allow(request.asker):
+            raise Declined("busy", "too many ask")
+        if is_cid(self._model) and request.model != self._model:
+            raise Declined("other-model", f"it works for the model {self._model}")
+        price: int | str | None = self._price or None
+        HANDLED_FOR.set(Buyer(request.asker, pays=False))
+        for handler in self._handlers:
+            price = await call_handler(handler, request)
+        if price is None:
+            raise Declined("no-price", "it names no price; its answer to a demand says whether that is enough")
+        token = parts.settings.erc20_token
+        unit = await parts.chain.retrying(partial(parts.chain.tokens.unit, token), outages=parts.outages)
+        named = partial(parts.chain.names.address, token)
+        _, wait = await self._profile.queue()
+        return Quote(
+            agent=parts.signer.address,
+            request=request.identity,
+            cost=unit.amount(price),
+            token=await parts.chain.retrying(named, outages=parts.outages),
+            start=float(wait),
+            seconds=self._seconds,
+            until=parts.chain_head.head + FEWEST_BLOCKS,
+        )
