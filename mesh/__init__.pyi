@@ -73,6 +73,7 @@ from schemas.model import (
     ModelTopic as ModelTopic,
     ValueSchema as ValueSchema,
 )
+from schemas.rpc import Quote as Quote, QuoteRequest as QuoteRequest
 from schemas.verdicts import (
     PolicyNote as PolicyNote,
     ReportFinding as ReportFinding,

@@ -24,6 +24,7 @@ from mesh.agent.handlers import (
     Handler,
     Handlers,
     LiabilityHandler,
+    ObjectiveMessages,
     OfferHandler,
     PeriodicHandler,
     QuoteHandler,
@@ -39,6 +40,7 @@ from mesh.agent.handlers import (
     invalid_topic,
     repeat,
 )
+from mesh.agent.objectives import ObjectiveUnfit
 from mesh.agent.orders import HANDLED_FOR, OrderState
 from mesh.agent.statement import period, read_statement
 from mesh.agent.validators import ValidatorSilent, check_named
@@ -92,7 +94,7 @@ if TYPE_CHECKING:
     from mesh.watching import Robot
     from schemas.model import ModelLimits
     from schemas.payloads import PayloadType
-    from schemas.rpc import Quote
+    from schemas.rpc import Quote, QuoteRequest
     from schemas.signing import Decline
 
 
@@ -213,6 +215,8 @@ class DemandTerms(TypedDict, total=False):
 
 CHOICES: Final = ("cheapest", "first")
 """The words for a robot that is chosen by its quote."""
+MOST_EXAMINED: Final = 10_000
+"""Messages that `Agent.examine` gives of a demand."""
 ASK_SECONDS: Final = 60.0
 """How long `Agent.ask` waits for an answer by default."""
 
@@ -457,14 +461,30 @@ class Agent(Program):
             return offered.identity
         return (await trader.post(Offer, trader.writer.terms_of(wanted), answers=answered, lighthouse_fee=fee)).hash
 
-    async def examine(self, cid: str) -> Objective:
+    @overload
+    async def examine(self, wanted: str) -> Objective: ...
+
+    @overload
+    async def examine(self, wanted: Verified[Demand] | Demand | QuoteRequest) -> ObjectiveMessages: ...
+
+    async def examine(self, wanted: str | Verified[Demand] | Demand | QuoteRequest) -> Objective | ObjectiveMessages:
         """The objective with that CID, fetched if needed, after it was checked as before a job.
+
+        Of a demand, or of a request for a quote, its messages, each as the type that its handler takes:
+        `sum(move.meters for move in (await agent.examine(demand)).of(Move))`. They are `MOST_EXAMINED` at most.
 
         Raises `ObjectiveUnfit`, whose `reason` is a word for programs, and branches of `ContentError`; while a demand
         is handled also `ObjectiveNotFetched`, as what strangers make an agent fetch is limited.
         """
         # seconds without a new block
-        return await self.runtime.objectives.examine(cid, patience=10.0, buyer=HANDLED_FOR.get())
+        examine = partial(self.runtime.objectives.examine, patience=10.0, buyer=HANDLED_FOR.get())
+        if isinstance(wanted, str):
+            return await examine(wanted)
+        cid = (wanted.message if isinstance(wanted, Verified) else wanted).objective
+        objective = await examine(cid)
+        if objective.count > MOST_EXAMINED:
+            raise ObjectiveUnfit(cid, "too-many-messages", f"it has more than {MOST_EXAMINED:,}, which have no price")
+        return await asyncio.to_thread(lambda: self._handlers.topics.typed(objective.messages()))
 
     async def order(
         self,

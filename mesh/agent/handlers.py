@@ -21,7 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -38,7 +38,7 @@ from schemas.keys import LiabilityTopicKey, topic_chunks
 from schemas.payloads import Empty, PayloadType, SentDefinitions, String, decode_value, payload_type, plain_value
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from types import FrameType
 
     import zenoh
@@ -251,6 +251,8 @@ class Job:
 
 ANY_TOPIC: Final = "*"
 """The topic of the handler for topics without a handler of their own."""
+K = TypeVar("K")
+
 _NATIVE: Final = (Empty, String, bytes)
 """What payloads decode to, and no JSON is converted to."""
 _ANYTHING: Final = (Any, object, inspect.Parameter.empty)
@@ -281,6 +283,16 @@ class TypedHandler:
             with suppress(msgspec.ValidationError):
                 return msgspec.convert(_whole(plain), self._converted)
             raise InvalidPayload(_text(self.declared), str(error)) from None
+
+
+class ObjectiveMessages(tuple[tuple[str, Any], ...]):
+    """The messages of an objective by time: each with its topic, and as the type that its handler takes."""
+
+    __slots__ = ()
+
+    def of(self, kind: type[K]) -> list[K]:
+        """Those of one type: `sum(move.meters for move in messages.of(Move))`."""
+        return [value for _, value in self if isinstance(value, kind)]
 
 
 class TopicHandlers:
@@ -324,6 +336,15 @@ class TopicHandlers:
             except InvalidPayload as error:
                 return str(error)
         return ""
+
+    def typed(self, messages: Iterable[Played]) -> ObjectiveMessages:
+        """What these handlers would get of messages that were examined: each as its handler's type."""
+        typed = []
+        for message in messages:
+            value = decode_value(message.payload, message.type)
+            found = self._find(message.topic)
+            typed.append((message.topic, value if found is None else found.convert(value)))
+        return ObjectiveMessages(typed)
 
     async def handle(self, job: Job, message: Played) -> None:
         """Decode a played message and await its handler. Raises what the handler raises, and `JobFailed`."""

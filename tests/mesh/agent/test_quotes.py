@@ -6,6 +6,7 @@ import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
 from mesh.agent.errors import Declined, DemandDeclined
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from mesh import Agent
     from mesh.agent.handlers import Job
+    from schemas import Demand, Verified
 
 
 def priced(robot: Agent, price: int | str, *, only: str = "") -> Agent:
@@ -83,6 +85,42 @@ async def test_a_price_above_the_most_is_not_paid(place: Place) -> None:
         as_given = await person.order(job(place), cost=1, max_cost=2)
         assert as_given.message.cost == 1
         assert cheap.address != dear.address
+
+
+class Move(msgspec.Struct):
+    meters: int
+
+
+async def test_a_price_may_depend_on_what_the_objective_plays(place: Place) -> None:
+    robot = place.agent("robot")
+
+    @robot.on("/move")
+    async def move(job: Job, message: Move) -> None:
+        pass
+
+    @robot.on("*")
+    async def others(job: Job, message: Any) -> None:
+        pass
+
+    @robot.on_quote
+    async def price(request: QuoteRequest) -> int:
+        return sum(move.meters for move in (await robot.examine(request)).of(Move))
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        messages = await robot.examine(demand)
+        assert [topic for topic, _ in messages] == ["/move", "/lamp", "/move"]
+        if demand.message.cost < sum(move.meters for move in messages.of(Move)):
+            raise Declined("too-cheap")
+        await robot.offer(demand)
+
+    wanted = [("/move", Move(3)), ("/lamp", True), ("/move", Move(4))]
+    async with robot, place.agent("person") as person:
+        (quote,) = await person.quotes(MODEL, wanted)
+        assert quote.cost == 7
+        with pytest.raises(DemandDeclined, match="too-cheap"):
+            await person.order(wanted, cost=6, robot=robot.address)
+        assert (await person.order(wanted, cost=7, robot=robot.address)).message.cost == 7
 
 
 async def test_a_robot_declines_with_its_reason(place: Place) -> None:
