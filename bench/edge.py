@@ -93,9 +93,9 @@ def start_and_memory(elf: Path) -> dict[str, float]:
 
 
 @contextmanager
-def edge(port: Path, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+def edge(port: Path, endpoint: str, agent: str = AGENT) -> Iterator[subprocess.Popen[bytes]]:
     """`aira edge` as a process."""
-    command = [sys.executable, "-m", "mesh", "edge", str(port), "--agent", AGENT, "--connect", endpoint]
+    command = [sys.executable, "-m", "mesh", "edge", str(port), "--agent", agent, "--connect", endpoint]
     inherited = {name: value for name, value in os.environ.items() if not name.startswith("AIRA_")}
     with subprocess.Popen(command, env=inherited, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:

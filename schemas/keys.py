@@ -42,6 +42,8 @@ PRESENT: Final = "/present"
 """The topic of a device's liveliness token, which exists as long as the device answers."""
 IDLE: Final = "/aira/idle"
 """The topic on which the process of a device answers once the device has done all that it was told before."""
+STOP: Final = "/aira/stop"
+"""The topic on which the process of a device answers once the device has heard that it must stop (`DeviceStop`)."""
 
 _CHUNK: Final = r"[A-Za-z0-9_~-][A-Za-z0-9_.~-]*"
 _ONE_CHUNK: Final = re.compile(_CHUNK)

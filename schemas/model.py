@@ -366,6 +366,8 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
     `objective` are the topics that an objective plays, and no others, unless `other_topics`. `result` are those of the
     recording that comes back; a success has at least one message on each required one, and is what `success` says.
     `price` is typical (`5 XRT`; `units` is the smallest unit of another token), as are the `seconds` that a job takes.
+    `on_stop` says what becomes of the cost when a job that has begun is stopped: the customer gets it back (`refund`),
+    or the robot keeps it (`paid`).
     """
 
     title: Annotated[str, Meta(min_length=1, max_length=80)]
@@ -376,6 +378,7 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
     success: Prose = ""
     price: Annotated[str, Meta(max_length=60, extra_json_schema={"pattern": f"^{PRICE}$"})] = ""
     seconds: Seconds | None = None
+    on_stop: Literal["refund", "paid"] = "refund"
     limits: ModelLimits | None = None
 
     def __post_init__(self) -> None:

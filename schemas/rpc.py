@@ -24,7 +24,7 @@ from schemas.records import (
     Record,
     UInt256,
 )
-from schemas.signing import Decline, SignedRecord  # msgspec reads the annotations
+from schemas.signing import Decline, SignedRecord, StopRequest  # msgspec reads the annotations
 from schemas.status import LogsRead, ReadLogs, Status
 
 if TYPE_CHECKING:
@@ -247,6 +247,20 @@ class LiabilityRead(Record, frozen=True):
     liability: Liability | None = None
 
 
+class DeviceStop(Record, frozen=True, kw_only=True):
+    """What became of a stop at one device. It was `heard` if the device confirmed it; else `detail` says why not."""
+
+    device: str
+    heard: bool
+    detail: str = ""
+
+
+class Stopped(Record, frozen=True):
+    """The job is stopped for good; `devices` are those that were present. None are told of a job that had not begun."""
+
+    devices: tuple[DeviceStop, ...] = ()
+
+
 class AccountBalance(Record, frozen=True):
     """Request the balance of an account."""
 
@@ -342,6 +356,7 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "restart": Service(LiabilityRequest, Done),
         "resume": Service(LiabilityRequest, Done),
         "read": Service(LiabilityRequest, LiabilityRead),
+        "stop": Service(StopRequest, Stopped),
         "status": Service(Nothing, Status),
         "logs": Service(ReadLogs, LogsRead),
         "accept": Service(AcceptDemand, Accepted),

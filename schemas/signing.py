@@ -347,6 +347,34 @@ class Decline(_Statement, frozen=True, kw_only=True):
             raise InvalidRecord("Decline", f"detail: expected at most {LONGEST_DETAIL} characters")
 
 
+LONGEST_WHY: Final = 200
+"""Characters of the reason for a stop."""
+
+
+class StopRequest(SignedRecord, frozen=True, kw_only=True):
+    """A request to stop the job of `liability`, by its promisee or its promisor; `why` is for people.
+
+    To repeat one, or to send an old one again, changes nothing: a job is stopped once, and never continues.
+    """
+
+    domain: ClassVar = b"aira stop\0"
+    author: ClassVar = "by"
+
+    liability: str
+    """The liability's address (EIP-55)."""
+    by: str
+    """The account that asks (EIP-55)."""
+    why: str
+    """At most `LONGEST_WHY` characters."""
+    time: int
+    """When it was signed (Unix time, seconds)."""
+
+    def __post_init__(self) -> None:
+        Record.__post_init__(self)
+        if len(self.why) > LONGEST_WHY:
+            raise InvalidRecord("StopRequest", f"why: expected at most {LONGEST_WHY} characters")
+
+
 def is_word(text: str) -> bool:
     """Whether a text is a word for programs: lower-case letters, digits and single hyphens, 64 characters at most."""
     return len(text) <= _LONGEST_WORD and _WORD.fullmatch(text) is not None

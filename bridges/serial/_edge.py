@@ -3,7 +3,8 @@
 Outside a job a topic is `aira/agent/{address}/device/{device}/{topic}`; messages of a job use the liability's topics
 and are recorded. A put is a command without a reply; a query is a call, whose reply reports how it ended. While the
 board answers, its liveliness token is on the topic `/present`. A query for `/aira/idle` is answered when the board
-has ended all commands and calls that came before it.
+has ended all commands and calls that came before it. A query for `/aira/stop` drops the commands that wait for the
+board, and calls its topic `/stop` before anything else.
 
 If several devices of an agent share a topic's name, a call reaches the one that its parameter `device` names, a command
 in a job all of them. Edge agents mark what they put, so that others don't take it for a command.
@@ -14,9 +15,11 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+import threading
 import time
 from collections import Counter
-from contextlib import contextmanager
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -54,6 +57,7 @@ from mesh.cli.output import announce
 from mesh.errors import InvalidKey, public_text
 from mesh.network import sending
 from mesh.network.connecting import SessionOpening
+from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, listening, stop_folder
 from mesh.role.running import INTERRUPTED, file_delays
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.metrics import STARTING, Health, MetricFamily, by_label, counter, gauge, health_metrics
@@ -62,6 +66,7 @@ from schemas.errors import InvalidPayload
 from schemas.keys import (
     IDLE,
     PRESENT,
+    STOP,
     DeviceTopicKey,
     LiabilityTopicKey,
     event_selector,
@@ -70,6 +75,7 @@ from schemas.keys import (
     topic_selector,
 )
 from schemas.payloads import EMPTY, STRING, Empty, PayloadType, String, decode_value, encode_as, payload_type
+from schemas.rpc import DeviceStop
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:
@@ -81,6 +87,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+STOP_TOPIC: Final = "/stop"
+"""The topic, by its name on the board, on which a board hears that it must stop: std_msgs/Empty, or std_msgs/String for
+the reason."""
+ASKED_IN_SILENCE: Final = 4
+"""How often the agent is asked within the time that it may be silent."""
+LONGEST_STOP: Final = 60
+"""Characters of the reason for a stop that a board gets: it may have room for no more."""
 ANSWER: Final = "/answer"
 """The topic below a called one on which a job's recording has what the board answered."""
 
@@ -90,8 +103,9 @@ class EdgeOptions:
     """A board: its agent's address and its name in the mesh, how it is reached, and the protocol that it speaks.
 
     `baud` is in bits per second, 0 if it has to be found, as is the `protocol` "auto"; a command waits at most
-    `patience` seconds for a board that is absent or busy; `parameters` are values that firmware may request; `rename`
-    returns the name in the mesh of a topic of the board.
+    `patience` seconds for a board that is absent or busy; after `agent_silence` seconds (0: never) without an answer
+    of the agent in a job the edge agent stops the board by itself; `parameters` are values that firmware may request;
+    `rename` returns the name in the mesh of a topic of the board.
     """
 
     agent: str
@@ -100,6 +114,7 @@ class EdgeOptions:
     protocol: str = AUTO
     baud: int = 0
     patience: float = PATIENCE
+    agent_silence: float = 0.0
     parameters: Mapping[str, object] = field(default_factory=dict)
     rename: Callable[[str], str] = str
 
@@ -142,10 +157,13 @@ class Edge:
         self._jobs = JobTracker()
         self._pending: dict[Command, zenoh.Query | None] = {}
         """The commands that have not ended, each with the call that waits for its outcome, if it is one."""
+        self._stops: dict[Command, Callable[[str], None]] = {}
+        """The calls of `/stop` that have not ended, and what is called with the reason if the board did not hear it."""
         self._until_idle: list[zenoh.Query] = []
         """The queries that wait until there are none."""
         self._outcomes: Counter[str] = Counter()
         self._board_losses = 0
+        self._ended = threading.Event()
         self._declared: dict[str, list[Any]] = {}
         self._token: Any = None
         self._said_by = said_by(options.name)
@@ -161,13 +179,23 @@ class Edge:
         session.get(event_selector(agent), self._on_present_job, timeout=PATIENCE)
         about: Any = session.declare_queryable(self._key(ABOUT), partial(self._soon, self._reply_about))
         idle: Any = session.declare_queryable(self._key(IDLE), partial(self._soon, self._reply_when_idle))
+        stop: Any = session.declare_queryable(self._key(STOP), partial(self._soon, self._reply_when_stopped))
+        if self.options.agent_silence:
+            threading.Thread(target=self._watch_agent, args=(session,), name="agent's silence", daemon=True).start()
         try:
             self._line.run()
         finally:
+            self._ended.set()
             for query in (*filter(None, self._pending.values()), *self._until_idle):
                 query.drop()  # type: ignore[no-untyped-call]
             if not session.is_closed():
-                for declared in (subscriber, about, idle, *(one for some in self._declared.values() for one in some)):
+                for declared in (
+                    subscriber,
+                    about,
+                    idle,
+                    stop,
+                    *(one for some in self._declared.values() for one in some),
+                ):
                     declared.undeclare()
                 self._withdraw_token()
 
@@ -322,6 +350,8 @@ class Edge:
     def _command_finished(self, finished: events.CommandFinished) -> None:
         """Count the outcome of a command; if it was a call, record the answer in its job, and reply."""
         query = self._pending.pop(finished.command, None)
+        if (end := self._stops.pop(finished.command, None)) is not None:
+            end(finished.detail if finished.status is CallStatus.FAILED else "")
         self._outcomes[finished.reason or finished.status.value] += 1
         if finished.status is CallStatus.FAILED:
             failed = log_event("command-failed", topic=finished.command.topic, reason=finished.reason)
@@ -330,6 +360,76 @@ class Edge:
             self._record_answer(str(query.key_expr), finished)
             _reply(query, finished)
         self._reply_if_idle()
+
+    def stop_board(self, why: str, on_end: Callable[[DeviceStop], None]) -> None:
+        """Drop the commands that wait for the board and call its topic `/stop`. On the line's thread.
+
+        `on_end` is called when the board has heard it, or can't hear it.
+        """
+
+        def end(why_not: str = "") -> None:
+            if why_not:
+                log.error("the board has not heard the stop: %s", why_not, extra=log_event("stop-unheard"))
+            on_end(DeviceStop(device=self.options.name, heard=not why_not, detail=why_not))
+
+        dialect, now = self._line.dialect, time.monotonic()
+        log.warning("told to stop: %s", why, extra=log_event("device-stopped"))
+        dialect.drop_queued(now)
+        if dialect.info is None:
+            end("the board is absent")
+            return
+        flows = (Flow.SUBSCRIBES, Flow.SERVES)
+        topic = next((one for one in dialect.info.topics if one.name == STOP_TOPIC and one.flow in flows), None)
+        if topic is None:
+            end(f"its firmware has no topic {STOP_TOPIC}")
+            return
+        said = String(why[:LONGEST_STOP]).encode()
+        payload = b"" if topic.type == EMPTY else convert(said, STRING, topic.type)
+        command = Command(topic.name, payload, now + self.options.patience)
+        try:
+            dialect.submit(command, now)
+        except CommandRefused as error:
+            end(str(error))
+            return
+        self._stops[command] = end
+        if (job := self._jobs.current) and (name := self._name_of.get(topic, "")):
+            self._put(self._job_key(job, name), payload, topic.type)
+
+    def stop_from_thread(self, why: str) -> LocalAnswer:
+        """The same from any thread; returns when the board has heard it, can't hear it, or takes too long."""
+        outcome: Future[DeviceStop] = Future()
+        self._line.call_soon(partial(self.stop_board, why, outcome.set_result))
+        try:
+            ended = outcome.result(ANSWER_SECONDS - 1)
+        except TimeoutError:
+            detail = "the board is busy and has not confirmed the stop yet"
+            ended = DeviceStop(device=self.options.name, heard=False, detail=detail)
+        who = f"device {ended.device} of {self.options.agent}"
+        return LocalAnswer(who=who, heard=ended.heard, detail=ended.detail)
+
+    def _watch_agent(self, session: zenoh.Session) -> None:
+        """Stop the board once the agent has been silent for too long in a job, each time. On a thread of its own."""
+        silence, is_told = self.options.agent_silence, False
+        heard = time.monotonic()
+        while not self._ended.wait(silence / ASKED_IN_SILENCE):
+            job = self._jobs.current
+            with suppress(zenoh.ZError):  # a closed session has no answers
+                asked = event_selector(self.options.agent, job) if job else ""
+                if not job or any(one.ok for one in session.get(asked, timeout=silence / ASKED_IN_SILENCE)):
+                    heard, is_told = time.monotonic(), False
+            if not is_told and time.monotonic() - heard >= silence:
+                is_told, why = True, f"the agent has been silent for {silence:g} s in a job"
+                self._line.call_soon(partial(self.stop_board, why, lambda _outcome: None))
+
+    def _reply_when_stopped(self, query: zenoh.Query) -> None:
+        def reply(outcome: DeviceStop) -> None:
+            with query:
+                query.reply(str(query.key_expr), outcome.encode(), encoding="application/json", express=True)
+
+        why = ""
+        with suppress(InvalidPayload):
+            why = String.decode(b"" if query.payload is None else query.payload.to_bytes()).data
+        self.stop_board(public_text(why), reply)
 
     def _reply_when_idle(self, query: zenoh.Query) -> None:
         self._until_idle.append(query)
@@ -492,5 +592,9 @@ def run_edge(edge: Edge, settings: Settings, endpoints: Endpoints) -> None:
         words = f"edge of {board.agent}: {board.name} on {board.port}, {protocol} at {speed}, Zenoh id {session.zid()}"
         set_process_source(LogSource("edge", parse_address(board.agent)))
         announce(log, "edge-started", words, device=board.name)
-        with answer_log_queries(session, str(DeviceTopicKey(board.agent, board.name, LOG)), "edge"):
+        socket = f"device-{board.name}-of-{board.agent}"
+        with (
+            answer_log_queries(session, str(DeviceTopicKey(board.agent, board.name, LOG)), "edge"),
+            listening(stop_folder(settings), socket, edge.stop_from_thread),
+        ):
             edge.run(session)

@@ -10,7 +10,7 @@ from bridges.serial.dialect import AUTO, dialect_names
 from mesh.cli.options import with_settings
 from mesh.errors import AiraError, InputError
 from mesh.role.running import fail
-from mesh.settings import NetworkSettings, TelemetrySettings
+from mesh.settings import EdgeSettings, NetworkSettings, TelemetrySettings
 from mesh.telemetry.logs import configure_logging_from
 from schemas.keys import topic_chunks
 
@@ -125,7 +125,7 @@ def _number(text: str) -> int | float | str:
     callback=_renaming,
     help="rename a topic of the board and all topics below it, as in /led=/left/led or /=/left (may be repeated)",
 )
-@with_settings(NetworkSettings, TelemetrySettings)
+@with_settings(NetworkSettings, TelemetrySettings, EdgeSettings, "data_dir")
 def command(settings: Settings, renamed: tuple[tuple[str, str], ...], **options: Any) -> None:
     """Connect the device at PORT to its agent. Ctrl-C stops it.
 
@@ -144,7 +144,7 @@ def command(settings: Settings, renamed: tuple[tuple[str, str], ...], **options:
     configure_logging_from(settings, "edge")
     endpoints = Endpoints.from_settings(settings)
     try:
-        edge = Edge(EdgeOptions(**options, rename=topic_names(renamed)))
+        edge = Edge(EdgeOptions(**options, rename=topic_names(renamed), agent_silence=settings.agent_silence))
         with serve_metrics(edge, settings.metrics_listen):
             run_edge(edge, settings, endpoints)
     except AiraError as error:

@@ -49,7 +49,7 @@ class CallFailed(AiraError, code="call-failed"):
 
     `call-refused`: the device or its edge agent would refuse it again (`refused`, `unfit`). `no-such-topic`: the device
     has no topic of that name to call. `call-not-done`: it certainly was not done, so it is safe to try again (`absent`,
-    `expired`, `full`). `call-in-doubt`: the device was restarted or unplugged before it answered (`doubt`).
+    `expired`, `full`, `stopped`). `call-in-doubt`: the device was restarted or unplugged before it answered (`doubt`).
     """
 
     def __init__(self, topic: str, reason: str, detail: str, *, code: str = "") -> None:
@@ -58,7 +58,7 @@ class CallFailed(AiraError, code="call-failed"):
         self.reason = reason
 
 
-REASONS: Final = frozenset({"refused", "unfit", "absent", "expired", "full", "doubt"})
+REASONS: Final = frozenset({"refused", "unfit", "absent", "expired", "full", "stopped", "doubt"})
 """The reasons for which a call fails, as they travel."""
 
 
@@ -66,7 +66,7 @@ def call_failed(topic: str, reason: str, detail: str) -> CallFailed:
     """The error for one of these reasons."""
     if reason in ("refused", "unfit"):
         return CallFailed(topic, reason, detail, code="call-refused")
-    if reason in ("absent", "expired", "full"):
+    if reason in ("absent", "expired", "full", "stopped"):
         return CallFailed(topic, reason, detail, code="call-not-done")
     return CallFailed(topic, reason, detail, code="call-in-doubt")
 
@@ -254,6 +254,12 @@ class Dialect(ABC):
     @abstractmethod
     def submit(self, command: Command, now: float) -> None:
         """Queue a command; `CommandFinished` reports its end. Raises `CommandRefused`."""
+
+    def drop_queued(self, now: float) -> None:
+        """Fail the commands that wait for the board, because it has to stop."""
+        dropped, self._queue = self._queue, []
+        for command in dropped:
+            self._fail(command, "stopped", "the device was told to stop before it was sent")
 
     def respond(self, topic: BoardTopic, payload: bytes, now: float) -> None:
         """Answer a request of the board (`Flow.REQUESTS`), if the boards of this dialect send any."""
@@ -447,6 +453,12 @@ class DetectingDialect(Dialect):
         self._found.submit(command, now)
         self._unfinished += 1
         self._pass_on(now)
+
+    def drop_queued(self, now: float) -> None:
+        super().drop_queued(now)
+        if self._found is not None:
+            self._found.drop_queued(now)
+            self._pass_on(now)
 
     def respond(self, topic: BoardTopic, payload: bytes, now: float) -> None:
         if self._found is not None:

@@ -24,7 +24,7 @@ from mesh.agent._status import AgentStatus
 from mesh.agent.contracts import ContractReports, Outcome
 from mesh.agent.demands import Acceptance, DemandDispatcher
 from mesh.agent.handlers import call
-from mesh.agent.jobs import Executor
+from mesh.agent.jobs import Executor, stop_devices
 from mesh.agent.ledger import TO_BE_DONE, UNFINISHED, Phase, advance
 from mesh.agent.objectives import Objectives
 from mesh.agent.trade import Trader
@@ -48,6 +48,7 @@ from mesh.chain import (
 from mesh.errors import ChainError
 from mesh.network.services import answering, declared
 from mesh.role.following import follow_chain
+from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, listening, stop_folder
 from mesh.telemetry.logs import LogService
 from schemas import ZERO_ADDRESS, Demand, Result, Withdrawal, decode, event_selector, parse_address
 from schemas.cid import is_cid
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
     from mesh.role.models import Models
     from schemas import Liability, Record
     from schemas.model import ModelDescription
+    from schemas.rpc import DeviceStop
     from schemas.verdicts import ValidatorReport
 
 
@@ -236,10 +238,18 @@ class AgentRuntime(Lifecycle):
         self.reports = ContractReports(parts, self._on_report if handlers.reports else None)
         self.trader = Trader(parts, self.reports)
         self.objectives = Objectives(parts.store, parts.exchange, parts.settings, topics, description)
-        self.executor = Executor(parts, objectives=self.objectives, handlers=topics, on_phase=self._on_phase)
+        self.executor = Executor(
+            parts,
+            objectives=self.objectives,
+            handlers=topics,
+            on_phase=self._on_phase,
+            on_stop=handlers.stops,
+            is_paid_when_stopped=description is not None and description.on_stop == "paid",
+        )
         self.token_events = TokenEvents(parts.channel.put, parts.signer.address)
         self.status = AgentStatus(parts, self.executor, model=model)
         self.profile = OwnProfile(parts, self.executor, description, model=model)
+        self.profile.is_stopped = lambda: self.executor.hold.is_held
         self._handlers = handlers
         self._description = description
         # Else it may run beside the account's robot, as the commands of a person do.
@@ -257,11 +267,15 @@ class AgentRuntime(Lifecycle):
             await stack.enter_async_context(self.profile.serve())
         await stack.enter_async_context(answering_phases(self.parts, self.executor))
         services = self.parts.services
-        offer_services(self.parts, self.executor, has_handlers=bool(self._handlers.topics))
+        offer_services(self.parts, self.executor, self.stop, has_handlers=bool(self._handlers.topics))
         if decide := self._handlers.market.get(Demand):
             quoting = Quoting(self.parts, self.profile, self._handlers.quotes, self._description, model=self._model)
             services.offer("quote", quoting.quote)
             services.offer("accept", Acceptance(self.parts, self.trader, decide, model=self._model).accept)
+        if self.parts.settings.enable_executor:
+            stop = partial(self._stop_from_thread, asyncio.get_running_loop())
+            folder = stop_folder(self.parts.settings)
+            stack.enter_context(listening(folder, f"agent-{self._account}", stop))
         services.offer("logs", LogService("agent", self.parts.signer.address).logs)
         services.offer("status", self.status.status)
 
@@ -471,6 +485,40 @@ class AgentRuntime(Lifecycle):
         model = self._model if is_cid(self._model) else "*"
         selector = market_selector(self.parts.channel.lighthouse, "created", model)
         return declared(session, session.declare_subscriber(selector, lambda _sample: call_in_loop(loop, look)))
+
+    async def stop(self, address: str, *, why: str, by: str) -> tuple[DeviceStop, ...]:
+        """Stop a job; if the agent is held then, it withdraws its offers. As `Executor.stop`."""
+        devices = await self.executor.stop(address, why=why, by=by)
+        if self.executor.hold.is_held:
+            await self.trader.take_back_offers("the robot was stopped")
+            self.profile.changed()
+        return devices
+
+    async def stop_all(self, why: str) -> LocalAnswer:
+        """Stop the jobs that have begun, for the robot's owner, who holds the agent; without one, tell the devices."""
+        jobs, stops = tuple(self.executor.runs), []
+        if not jobs:
+            stops = [asyncio.to_thread(stop_devices, self.parts.network.session, self._account, why)]
+        stops += [self.stop(address, why=why, by=self._account) for address in jobs]
+        devices: dict[str, DeviceStop] = {}
+        for outcome in await asyncio.gather(*stops, return_exceptions=True):
+            if isinstance(outcome, BaseException):
+                log.warning("a job could not be stopped: %s", outcome, extra=log_event("job-not-stopped"))
+            else:
+                devices |= {one.device: one for one in outcome}
+        await self.trader.take_back_offers("the robot was stopped")
+        self.profile.changed()
+        told = [
+            f"{one.device} has {'heard it' if one.heard else f'not heard it: {one.detail}'}" for one in devices.values()
+        ]
+        detail = "; ".join((f"stopped {len(jobs)} job{'' if len(jobs) == 1 else 's'}", *told))
+        return LocalAnswer(who=f"agent {self._account}", heard=True, detail=detail)
+
+    def _stop_from_thread(self, loop: asyncio.AbstractEventLoop, why: str) -> LocalAnswer:
+        try:
+            return asyncio.run_coroutine_threadsafe(self.stop_all(why), loop).result(ANSWER_SECONDS)
+        except TimeoutError:
+            return LocalAnswer(who=f"agent {self._account}", heard=False, detail="it is busy and has not stopped yet")
 
     async def require_fit(self, objective: str, model: str) -> None:
         """Raise `ObjectiveUnfit` if an objective does not fit the model's description, as far as both are available."""

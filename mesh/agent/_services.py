@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import secrets
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from msgspec.structs import replace
 
@@ -38,6 +38,7 @@ from schemas.rpc import (
     LiabilityRead,
     Nothing,
     Published,
+    Stopped,
     Transaction,
 )
 
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
         AccountBalance,
         AccountToAddressAllowance,
         Approve,
+        DeviceStop,
         FinishLiability,
         LiabilityRequest,
         SendDemand,
@@ -62,8 +64,15 @@ if TYPE_CHECKING:
         TransferFromRequest,
         TransferRequest,
     )
+    from schemas.signing import StopRequest
 
     Service = Callable[[Any], Awaitable[Record]]
+
+    class Stopping(Protocol):
+        """`AgentRuntime.stop`."""
+
+        def __call__(self, address: str, *, why: str, by: str) -> Awaitable[tuple[DeviceStop, ...]]: ...
+
 
 log = logging.getLogger(__name__)
 
@@ -73,10 +82,11 @@ DRIVING = frozenset({"start", "restart", "resume", "finish"})
 """The services that drive jobs."""
 
 
-def offer_services(parts: AgentComponents, executor: Executor, *, has_handlers: bool) -> None:
-    """Offer all services of an agent; `has_handlers` if its own code does the jobs."""
+def offer_services(parts: AgentComponents, executor: Executor, stop: Stopping, *, has_handlers: bool) -> None:
+    """Offer all services of an agent; `has_handlers` if its own code does the jobs, `stop` stops one of them."""
     services = {
         **job_services(executor),
+        "stop": stop_service(parts, executor, stop),
         **account_services(parts),
         **MessageServices(parts).services(),
     }
@@ -86,7 +96,7 @@ def offer_services(parts: AgentComponents, executor: Executor, *, has_handlers: 
         facts = log_event("services-opened", address=parts.signer.address)
         log.warning("open_services: anyone on the router may sign and spend with %s", parts.signer.address, extra=facts)
     for name, service in services.items():
-        if name in DRIVING and not parts.settings.enable_executor:
+        if name in {*DRIVING, "stop"} and not parts.settings.enable_executor:
             continue
         parts.services.offer(name, _refusal(name) if name in refused else service)
 
@@ -127,6 +137,25 @@ def job_services(executor: Executor) -> dict[str, Service]:
 
     driving = {"start": done(executor.start), "restart": done(executor.restart), "resume": done(executor.resume)}
     return {"read": read, "finish": finish, **driving}
+
+
+def stop_service(parts: AgentComponents, executor: Executor, stop: Stopping) -> Service:
+    """`stop`, for the customer of a job and for the agent's own account, by their signatures."""
+
+    async def stop_job(request: StopRequest) -> Stopped:
+        address = parse_address(request.liability)
+        liability = await executor.read(address)
+        if request.by not in (liability.promisee, parts.signer.address) or not request.is_signed:
+            facts = log_event("stop-refused", liability=address, by=request.by)
+            log.warning("refused to stop %s for %s", address, request.by, extra=facts)
+            raise AiraError(
+                f"{request.by} may not stop {address}",
+                hint="only its customer and the robot's own account may, by their signature",
+                code="stop-refused",
+            )
+        return Stopped(await stop(address, why=request.why, by=request.by))
+
+    return stop_job
 
 
 def account_services(parts: AgentComponents) -> dict[str, Service]:

@@ -10,14 +10,14 @@ from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypedDict, TypeVar, Unpack, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
 from mesh.agent._answers import Answer, Question, Unanswered, metadata_of_answer
 from mesh.agent._quotes import QUOTE_TIMEOUT, asked_quotes
 from mesh.agent.components import working
 from mesh.agent.contracts import nothing
 from mesh.agent.demands import HANDLED
-from mesh.agent.errors import DemandDeclined, OrderClosed
+from mesh.agent.errors import Declined, DemandDeclined, OrderClosed
 from mesh.agent.handlers import (
     ANY_TOPIC,
     DemandHandler,
@@ -32,6 +32,7 @@ from mesh.agent.handlers import (
     RegistrationError,
     ReportHandler,
     ResultHandler,
+    StopHandler,
     check_handler,
     check_model,
     check_period,
@@ -41,7 +42,7 @@ from mesh.agent.handlers import (
     repeat,
 )
 from mesh.agent.objectives import ObjectiveUnfit
-from mesh.agent.orders import HANDLED_FOR, OrderState
+from mesh.agent.orders import HANDLED_FOR, ROBOT_STOPPED, OrderState
 from mesh.agent.statement import period, read_statement
 from mesh.agent.validators import ValidatorSilent, check_named
 from mesh.amounts import XRT
@@ -191,6 +192,7 @@ G = TypeVar("G", bound=ReadingHandler)
 J = TypeVar("J", bound=ReportHandler)
 Q = TypeVar("Q", bound=QuoteHandler)
 P = TypeVar("P", bound=PeriodicHandler)
+S = TypeVar("S", bound=StopHandler)
 K = TypeVar("K")
 V = TypeVar("V")
 T = TypeVar("T", bound=Callable[["Job", Any], object])
@@ -228,6 +230,7 @@ class DescriptionFields(TypedDict, total=False):
     success: str
     price: str
     seconds: float
+    on_stop: Literal["refund", "paid"]
     limits: ModelLimits
 
 
@@ -326,6 +329,17 @@ class Agent(Program):
         """
         check_handler(handler, "request: QuoteRequest", arguments=1)
         self._handlers.quotes = [handler]
+        return handler
+
+    def on_stop(self, handler: S) -> S:
+        """Bring the robot to a safe state when a job was stopped: `async def handler(job, why)`.
+
+        The devices that hear a stop have heard it, and the job's handlers are cancelled; a sync one goes on in its
+        thread, but can't publish any more. What this handler publishes on the job becomes the end of its recording. It
+        has `SAFE_SECONDS`. The next job waits for it. It is not called for a job that had not begun.
+        """
+        check_handler(handler, "job: Job, why: str", arguments=2)
+        self._handlers.stops.append(handler)
         return handler
 
     def on_report(self, handler: J) -> J:
@@ -443,9 +457,12 @@ class Agent(Program):
 
         Raises `InsufficientTokens`, `InvalidAmount`, for an objective that can't be played `ObjectiveUnfit` or a
         `ContentError`, an `AiraError` for a demand that is a contract, and `Declined` for one whose validator wants a
-        higher fee or is not one of the setting `accepted_validators`, or while an equal one is open that was declined.
+        higher fee or is not one of the setting `accepted_validators`, while an equal one is open that was declined, or
+        while a stopped robot is held.
         """
         trader, fee = self.runtime.trader, XRT.amount(lighthouse_fee)
+        if self.runtime.executor.hold.is_held:
+            raise Declined(ROBOT_STOPPED, "the robot was stopped, and takes no job before its owner releases it")
         if demand is None:
             terms = await trader.writer.terms(
                 model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime

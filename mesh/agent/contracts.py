@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
@@ -28,8 +29,8 @@ from mesh.base.flood import BoundedDict, FairQueue, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import liability_context, log_event
 from mesh.content import ContentUnavailable
-from mesh.errors import AiraError
-from mesh.network import Pump
+from mesh.errors import AiraError, InputError
+from mesh.network import Pump, ServiceFailed, call
 from mesh.network.services import declared
 from mesh.watching.market import JobEvent, query_all, read_event
 from schemas import (
@@ -43,7 +44,7 @@ from schemas import (
     market_selector,
 )
 from schemas.keys import report_selector
-from schemas.signing import Decline, Rejection, SignedRecord
+from schemas.signing import LONGEST_WHY, Decline, Rejection, SignedRecord, StopRequest
 from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
@@ -56,7 +57,8 @@ if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
     from mesh.chain import Chain
     from mesh.network import Subscription
-    from schemas import Demand
+    from schemas import Demand, Signer
+    from schemas.rpc import Stopped
 
 
 log = logging.getLogger(__name__)
@@ -570,6 +572,10 @@ async def asked_reports(
     return [found[juror] for juror in await accepted_of(chain, liability.validator, found)]
 
 
+STOP_SECONDS: Final = 10.0
+"""For which a request to stop is repeated until the robot answers …"""
+STOP_AGAIN: Final = 0.25
+"""… every so many seconds, if nobody answers, or the robot has too many requests."""
 REASON_TIMEOUT: Final = 10.0
 """Seconds without a new block after which the recording of a failed job is given up, and with it the reason."""
 
@@ -589,6 +595,24 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True, repr_omit_defaults=True
     reports: tuple[ValidatorReport, ...] = ()
     robot: str = ""
     """The robot that did the job, or should have: its address."""
+
+
+async def request_stop(session: zenoh.Session, signer: Signer, liability: Liability, why: str) -> Stopped:
+    """Ask the promisor of a liability to stop its job, signed by `signer`. Raises as `Contract.stop`."""
+    if len(why) > LONGEST_WHY:
+        raise InputError(f"the reason has {len(why)} characters, the most are {LONGEST_WHY}", code="why-too-long")
+    request = StopRequest(liability=liability.address, by=signer.address, why=why, time=int(time.time()))
+    signed, until = request.signed_by(signer), time.monotonic() + STOP_SECONDS
+    while True:
+        left = max(until - time.monotonic(), 0.1)
+        try:
+            stopped: Stopped = await call(session, liability.promisor, "stop", signed, timeout=left)
+        except ServiceFailed as error:
+            if error.reason == "agent-error" or left <= STOP_AGAIN:
+                raise
+            await asyncio.sleep(STOP_AGAIN)
+        else:
+            return stopped
 
 
 class Contract:
@@ -646,6 +670,19 @@ class Contract:
         kind: Literal["paid", "refunded"] = "paid" if ended.success else "refunded"
         report(on_progress, Progress(kind=kind, agent=self.liability.promisor, code=ended.code, detail=ended.reason))
         return ended
+
+    async def stop(self, why: str = "") -> Stopped:
+        """Stop the job for good, as its customer or its robot; returns what the robot's devices say.
+
+        `why`, at most 200 characters, is for people and becomes public with the recording. The robot's handlers are
+        cancelled; `outcome` then waits for the end, whose code is `stopped`. What it costs is in the model's
+        description (`on_stop`); a job that had not begun costs nothing. To stop it again changes nothing.
+
+        Raises `ServiceFailed`: `no-answer` if the robot does not answer within `STOP_SECONDS`, or is one of the legacy
+        network, which can't be stopped; `service-failed` if it refuses, or the job has ended. Raises `InputError` for
+        a `why` that is too long.
+        """
+        return await request_stop(self._parts.network.session, self._parts.signer, self.liability, why)
 
     async def reports(self) -> tuple[ValidatorReport, ...]:
         """What the jurors of its validator have reported until now, each report signed and by a juror, one of each.

@@ -18,6 +18,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -177,6 +178,10 @@ class JobMessages:
         self._changed.set()
 
 
+STOPPING: Final = ContextVar("stopping", default="")
+"""The job that the running code, a handler of `Agent.on_stop`, brings to a safe state."""
+
+
 class JobFailed(AiraError, code="job-failed"):
     """Raise it in a handler to end the job without success, which refunds the promisee. The text says why."""
 
@@ -199,6 +204,8 @@ class Job:
         """How many of the objective's messages have been handled."""
         self.playing: Played | None = None
         """The message that is being handled: its topic, times and type."""
+        self.stopped = False
+        """Whether it was stopped. A sync handler, which nothing can cancel, looks at it and returns."""
 
     def __repr__(self) -> str:
         return f"Job({self.liability.address}, position={self.position}, topics={sorted(self.topics)})"
@@ -208,7 +215,8 @@ class Job:
 
         `message` is a number, a bool, a str, bytes, None, a list, a dict, a msgspec Struct, a dataclass, `Empty`,
         `String`, a number or array of numpy, or a `Payload`. Raises `InvalidPayload` for anything else (also for NaN in
-        a dict or Struct, which become JSON), and `ClosedError` before the job runs and after it has ended.
+        a dict or Struct, which become JSON), and `ClosedError` before the job runs, and after it has ended or was
+        stopped.
         """
         self._check_running()
         payload, kind = encode_described(message)
@@ -244,6 +252,8 @@ class Job:
     def _check_running(self) -> None:
         if self._subscriber is None:
             raise ClosedError(f"the job {self.liability.address} is not running")
+        if self.stopped and STOPPING.get() != self.liability.address:
+            raise ClosedError(f"the job {self.liability.address} was stopped")
 
     def _put(self, key: str, payload: bytes, kind: PayloadType, attachment: bytes | None = None) -> None:
         sending.put(self._session, key, payload, encoding=kind.zenoh_encoding, attachment=attachment)
@@ -470,6 +480,7 @@ ReadingHandler = Callable[["Reading"], object]
 ReportHandler = Callable[["ValidatorReport"], object]
 PeriodicHandler = Callable[[], object]
 QuoteHandler = Callable[["QuoteRequest"], object]
+StopHandler = Callable[[Job, str], object]
 
 
 def check_period(seconds: object) -> None:
@@ -498,6 +509,7 @@ class Handlers:
     liabilities: list[LiabilityHandler] = field(default_factory=list)
     reports: list[ReportHandler] = field(default_factory=list)
     quotes: list[QuoteHandler] = field(default_factory=list)
+    stops: list[StopHandler] = field(default_factory=list)
     readings: list[tuple[str, str, ReadingHandler]] = field(default_factory=list)
     """The topic, the agent (`*` for any), and the handler."""
     periodic: list[tuple[float, PeriodicHandler]] = field(default_factory=list)

@@ -24,6 +24,7 @@ import threading
 import time
 from contextlib import asynccontextmanager
 from contextvars import ContextVar, copy_context
+from functools import partial
 from traceback import format_exception_only
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -32,9 +33,9 @@ from msgspec.structs import replace
 
 import mesh
 from mesh.agent._outbox import outgoing
-from mesh.agent.handlers import Job
-from mesh.agent.ledger import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
-from mesh.base.background import Background
+from mesh.agent.handlers import STOPPING, Job, call
+from mesh.agent.ledger import STARTABLE, TO_BE_DONE, Phase, Stop, WrongPhase, advance
+from mesh.base.background import Background, in_daemon_thread
 from mesh.base.extras import needs_extra
 from mesh.base.log_context import liability_context, log_event, with_liability_context
 from mesh.base.private_files import make_private_folder, sync_directory
@@ -55,11 +56,14 @@ from mesh.recording import (
 )
 from mesh.recording.ros import legacy_topic
 from mesh.role.database import LedgerUnusable
+from mesh.role.local_stop import Hold, stop_folder
 from schemas import Result
-from schemas.errors import InvalidPayload
+from schemas.errors import InvalidPayload, InvalidRecord
 from schemas.keys import (
     IDLE,
     PRESENT,
+    STOP,
+    DeviceTopicKey,
     LiabilityTopicKey,
     ObjectiveTopicKey,
     ProgressKey,
@@ -69,13 +73,14 @@ from schemas.keys import (
 )
 from schemas.payloads import JSON, STRING, PayloadType, String, defined_by, payload_type
 from schemas.records import PlaybackPosition
+from schemas.rpc import DeviceStop
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
     from pathlib import Path
 
     from mesh.agent.components import AgentComponents
-    from mesh.agent.handlers import TopicHandlers
+    from mesh.agent.handlers import StopHandler, TopicHandlers
     from mesh.agent.ledger import JobRecord, Ledger
     from mesh.agent.objectives import Objectives
     from mesh.recording import Objective, Pace, Played, Recorder, RecordingSummary
@@ -87,6 +92,8 @@ if TYPE_CHECKING:
 
 HANDLER_FAILED: Final = "handler-failed"
 """The code of an exception that has none: one of a handler's own."""
+STOPPED: Final = "stopped"
+"""The code of a job that was stopped."""
 _CODE: Final = re.compile(r"(.*) \[([a-z0-9-]{1,64})\]", re.DOTALL)
 
 
@@ -102,6 +109,12 @@ def note_of(error: Exception) -> str:
     if isinstance(error, AiraError):
         return f"{public_text(error)} [{error.code}]"
     return f"{public_text(''.join(format_exception_only(error)).strip())} [{HANDLER_FAILED}]"
+
+
+def note_of_stop(stop: Stop, liability: Liability) -> str:
+    """The note at the end of a stopped job's recording. It becomes public with the recording."""
+    who = "the customer" if stop.by == liability.promisee else "the robot's side"
+    return f"stopped by {who}{': ' if stop.why else ''}{public_text(stop.why)} [{STOPPED}]"
 
 
 def read_reason(recording: Path) -> Reason:
@@ -135,6 +148,41 @@ PUBLISH_INTERVAL: Final = 0.5
 """Seconds after which a run's position is published, if it has changed."""
 SAVE_INTERVAL: Final = 0.5
 """Seconds after which a run's recording is synced and its position saved, again and again: what a crash repeats."""
+
+
+HEARING_SECONDS: Final = 2.0
+"""For which a stop waits until the agent's devices have confirmed that they heard it."""
+LEAVING_SECONDS: Final = 2.0
+"""For which the cancelled handlers of a stopped job may clean up; then `on_stop` is called beside them."""
+HELD_INTERVAL: Final = 0.5
+"""Seconds between two looks whether an agent that is held was released."""
+SAFE_SECONDS: Final = 60.0
+"""For which a handler of `Agent.on_stop` may bring the robot to a safe state."""
+
+
+def stop_devices(session: zenoh.Session, agent: str, why: str) -> tuple[DeviceStop, ...]:
+    """Tell the devices of an agent that are present to stop; returns once each has answered. Blocks.
+
+    A device that does not answer within `HEARING_SECONDS` has not heard it.
+    """
+    answers: dict[str, DeviceStop] = {}
+    with contextlib.suppress(zenoh.ZError):
+        stop, payload = device_selector(agent, topic=STOP), String(why).encode()
+        target, consolidation = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
+        for reply in session.get(
+            stop, payload=payload, target=target, consolidation=consolidation, timeout=HEARING_SECONDS, express=True
+        ):
+            if reply.ok is not None:
+                with contextlib.suppress(InvalidRecord):
+                    answer = DeviceStop.decode(reply.ok.payload.to_bytes())
+                    answers[answer.device] = answer
+        for reply in session.liveliness().get(device_selector(agent, topic=PRESENT), timeout=ASK_SECONDS):
+            if reply.ok is not None:
+                key = parse_agent_key(str(reply.ok.key_expr))
+                if isinstance(key, DeviceTopicKey) and key.device not in answers:
+                    detail = f"it did not confirm the stop within {HEARING_SECONDS:g} s"
+                    answers[key.device] = DeviceStop(device=key.device, heard=False, detail=detail)
+    return tuple(answers[device] for device in sorted(answers))
 
 
 def incomplete(liability: str, missing: int) -> AiraError:
@@ -500,12 +548,19 @@ class Executor:
         objectives: Objectives,
         handlers: TopicHandlers | None,
         on_phase: OnPhase,
+        on_stop: Sequence[StopHandler] = (),
+        is_paid_when_stopped: bool = False,
     ) -> None:
         self._ledger, self._outbox, self._store, self._signer = parts.ledger, parts.outbox, parts.store, parts.signer
         self._session = parts.network.session
         self._objectives = objectives
         self._handlers = handlers
         self._on_phase = on_phase
+        self._on_stop = on_stop
+        self._is_paid_when_stopped = is_paid_when_stopped
+        self._holds_when_stopped = parts.settings.hold_when_stopped
+        self.hold = Hold(stop_folder(parts.settings), parts.signer.address)
+        """While it is held, no job begins."""
         self._pace: Pace = AtOnce() if parts.settings.playback == "at-once" else RecordedTimes()
         names = (name.strip() for name in parts.settings.recording_topics.split(","))
         self._recorded = frozenset(name for name in names if name) or None
@@ -520,6 +575,8 @@ class Executor:
         """The open runs, by the address of the job."""
         self._playing: dict[str, asyncio.Task[None]] = {}
         """The tasks that play them."""
+        self._stopping: dict[str, asyncio.Event] = {}
+        """The jobs that were stopped and have not ended; no other job begins meanwhile."""
         self._fetched: dict[str, Objective] = {}
         self._ready: asyncio.Queue[str] = asyncio.Queue()
         self._tasks: asyncio.TaskGroup | None = None
@@ -533,6 +590,8 @@ class Executor:
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 for job in unfinished:
+                    if await self._ledger.stopped(job.liability.address) is not None:
+                        self._stopping[job.liability.address] = asyncio.Event()
                     self.prepare(job.liability)
                 self._opened.set()
                 await self._serve()
@@ -612,6 +671,80 @@ class Executor:
                 raise WrongPhase(address, asked="resume", phase=job.phase)
             await self._begin(job)
 
+    @with_liability_context
+    async def stop(self, address: str, *, why: str, by: str) -> tuple[DeviceStop, ...]:
+        """Stop a job for good, also after a restart, and return what its devices say: each has heard it, or why not.
+
+        `by` is the account that asks, which the caller has checked. The devices hear it first, then the handlers are
+        cancelled. After that the handlers of `on_stop` bring the robot to a safe state, and the job ends with the code
+        `stopped`: this does not wait for it. To stop a job again tells the devices again. Raises `WrongPhase` for a job
+        that has ended otherwise.
+        """
+        telling = self._halt(address, why)  # before anything that takes its time
+        async with self._changing:
+            job, stopped = await self._job(address, asked="stop"), await self._ledger.stopped(address)
+            if stopped is None:
+                if job.phase not in TO_BE_DONE:
+                    raise WrongPhase(address, asked="stop", phase=job.phase)
+                await self._ledger.stop(address, Stop(why, by))
+                if self._holds_when_stopped:
+                    await asyncio.to_thread(self.hold.hold, why)
+                self._fetched.pop(address, None)
+                telling = telling or self._halt(address, why)  # it has just begun
+                self._task_group().create_task(self._end_stopped(address), name=f"stop {address}")
+        devices = () if telling is None else await telling
+        unheard = ", ".join(f"{one.device}: {one.detail}" for one in devices if not one.heard)
+        facts = log_event("job-stopped", by=by, unheard=unheard)
+        log.warning("stopped by %s: %s%s", by, why, f"; not heard by {unheard}" if unheard else "", extra=facts)
+        return devices
+
+    def _halt(self, address: str, why: str) -> asyncio.Future[tuple[DeviceStop, ...]] | None:
+        """Begin to tell the devices of a job that has begun to stop, and cancel its playback; None if it has not."""
+        if (run := self.runs.get(address)) is None:
+            return None
+        run.stopped = True
+        self._stopping.setdefault(address, asyncio.Event())
+        if (playing := self._playing.get(address)) is not None:
+            playing.cancel()
+        telling = partial(stop_devices, self._session, self._signer.address, why)
+        return asyncio.wrap_future(in_daemon_thread(telling, f"stop {address}"))
+
+    @with_liability_context
+    async def _end_stopped(self, address: str) -> None:
+        """Bring the robot of a stopped job that had begun to a safe state, and end the job."""
+        ended = self._stopping.setdefault(address, asyncio.Event())
+        try:
+            if (playing := self._playing.get(address)) is not None:
+                await asyncio.wait([playing], timeout=LEAVING_SECONDS)
+            job, stop = await self._ledger.job(address), await self._ledger.stopped(address)
+            assert stop is not None, "only stopped jobs end like this"
+            if job is not None and job.phase is Phase.RUNNING:
+                await self._make_safe(job, stop.why)
+            await self._unless_ended(self.finish(address, success=False))
+        finally:
+            self._stopping.pop(address, None)
+            ended.set()
+
+    async def _make_safe(self, job: JobRecord, why: str) -> None:
+        """Call the handlers of `on_stop` while what the devices say is still recorded."""
+        address = job.liability.address
+        async with self._changing:
+            if (run := self.runs.get(address)) is None:  # the agent was restarted since
+                run = self.runs[address] = await self.create_run(job)
+                run.open()
+                telling = self._halt(address, why)
+                assert telling is not None
+                await telling
+        STOPPING.set(address)
+        for handler in self._on_stop:
+            try:
+                async with asyncio.timeout(SAFE_SECONDS):
+                    await call(handler, run, why)
+            except TimeoutError:
+                facts = log_event("stop-handler-late", seconds=SAFE_SECONDS)
+                log.error("a handler of on_stop took more than %g s", SAFE_SECONDS, extra=facts)
+        STOPPING.set("")
+
     async def read(self, address: str) -> Liability:
         """The record of a job's liability as the ledger has it. Raises `WrongPhase` for a liability without a job."""
         job = await self._job(address, asked="read")
@@ -624,13 +757,17 @@ class Executor:
 
         With success it first waits until devices have answered their commands (`JobRun.settle`). `note` says why the
         job failed, in the recording and the ledger. A job whose recording lacks what was played ends without
-        success. Raises `WrongPhase` if the job has ended already.
+        success. That of a stopped job is what the model's description says of stops. Raises `WrongPhase` if the job
+        has ended already.
         """
         if success and (run := self.runs.get(address)) is not None:
             await run.settle()
         async with self._changing:
             job = await self._job(address, asked="finish")
             advance(address, job.phase, Phase.COMPLETE)
+            if (stop := await self._ledger.stopped(address)) is not None:
+                success = self._is_paid_when_stopped and job.phase is Phase.RUNNING
+                note = note_of_stop(stop, job.liability)
             ended = await self._stop(address) or await self.create_run(job)
             summary = await ended.close(note, sync=False)  # its copy in the store is synced
             if success and (missing := ended.missing + summary.lost_played):
@@ -667,6 +804,9 @@ class Executor:
     async def _fetch(self, liability: Liability) -> None:
         """Fetch and check the objective of a job: then it is ready, or complete without success."""
         address = liability.address
+        if await self._ledger.stopped(address) is not None:  # before a restart
+            await self._end_stopped(address)
+            return
         try:
             await asyncio.to_thread(self._store.pin, liability.objective, address, sync=False)
             objective = await self._objectives.examine(liability.objective)
@@ -676,7 +816,7 @@ class Executor:
             return
         async with self._changing:
             job = await self._ledger.job(address)
-            if job is None or job.phase not in TO_BE_DONE:
+            if job is None or job.phase not in TO_BE_DONE or await self._ledger.stopped(address) is not None:
                 return
             if job.phase is Phase.INCOMING:
                 await self._ledger.set_phase(address, Phase.READY)
@@ -690,6 +830,7 @@ class Executor:
         """Do ready jobs, one at a time. Without handlers, others start them."""
         while True:
             address = await self._ready.get()
+            await self._until_allowed()
             if self._handlers is not None:
                 with liability_context(address):
                     await self._unless_ended(self._resume_to_end(address))
@@ -703,6 +844,14 @@ class Executor:
             if playback is None:
                 return
             await asyncio.wait([playback])
+
+    async def _until_allowed(self) -> None:
+        """Return when no stopped job is being ended, and nothing holds the agent."""
+        while self._stopping or self.hold.is_held:
+            for ended in tuple(self._stopping.values()):
+                await ended.wait()
+            if self.hold.is_held:
+                await asyncio.sleep(HELD_INTERVAL)
 
     async def create_run(self, job: JobRecord, objective: Objective | None = None) -> JobRun:
         """A run of `objective` from the job's position; without an objective, one that only records.
@@ -728,6 +877,8 @@ class Executor:
         run = self.runs[address] = await self.create_run(job, objective)
         await self._ledger.set_phase(address, Phase.RUNNING, position=position)
         run.open()
+        if run.stopped:  # meanwhile
+            return
         context = copy_context()
         context.run(_playing.set, address)
         task = tasks.create_task(self._run_job(run), name=f"play {address}", context=context)
@@ -737,7 +888,8 @@ class Executor:
         """Cancel the playback of a job and wait for its end, unless it is the caller. Returns its run, still open."""
         if _playing.get() != address and (task := self._playing.pop(address, None)) is not None:
             task.cancel()
-            await asyncio.wait([task])
+            if (run := self.runs.get(address)) is None or not run.stopped:  # a stopped one's handlers had their time
+                await asyncio.wait([task])
         return self.runs.pop(address, None)
 
     async def _suspend(self, address: str) -> None:

@@ -87,6 +87,11 @@ CREATE TABLE IF NOT EXISTS jobs (
     aside INTEGER NOT NULL DEFAULT 0,
     changed REAL NOT NULL
 );
+CREATE TABLE IF NOT EXISTS stops (
+    liability TEXT PRIMARY KEY,
+    why TEXT NOT NULL,
+    by TEXT NOT NULL
+);
 CREATE INDEX IF NOT EXISTS jobs_by_phase ON jobs (phase, changed) WHERE NOT aside;
 CREATE TABLE IF NOT EXISTS outbox (
     identity TEXT PRIMARY KEY,
@@ -136,6 +141,13 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
     position: int
     recorded: int
     note: str
+
+
+class Stop(msgspec.Struct, frozen=True):
+    """A job was stopped: `why`, for people, and by which account."""
+
+    why: str
+    by: str
 
 
 class Outgoing(msgspec.Struct, frozen=True):
@@ -218,6 +230,15 @@ class Ledger(RoleLedger):
         await self._database.run_together(
             (ended, (Phase.COMPLETE, success, result, note, time.time(), liability)), (POST, _posted(outgoing))
         )
+
+    async def stop(self, liability: str, stop: Stop) -> None:
+        """Keep that the job at `liability` (address) was stopped. The first stop counts."""
+        await self._database.run("INSERT OR IGNORE INTO stops VALUES (?, ?, ?)", (liability, stop.why, stop.by))
+
+    async def stopped(self, liability: str) -> Stop | None:
+        """How the job at `liability` (address) was stopped; None if it was not."""
+        rows = await self._database.rows("SELECT why, by FROM stops WHERE liability = ?", (liability,))
+        return Stop(*rows[0]) if rows else None
 
     async def job(self, liability: str) -> JobRecord | None:
         """The job at `liability` (EIP-55 address), if there is one."""

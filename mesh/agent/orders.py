@@ -296,6 +296,8 @@ PER_MAKER: Final = 256
 """Open offers that answer demands of one maker."""
 TOTAL: Final = 2048
 """Open offers that answer demands."""
+ROBOT_STOPPED: Final = "stopped"
+"""The reason of a decline while a stopped robot is held."""
 EQUAL_DECLINED: Final = "equal-declined"
 """Why a demand is declined whose terms are those of an open demand that the agent has declined."""
 

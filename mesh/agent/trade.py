@@ -396,6 +396,10 @@ class Trader(Lifecycle):
         if answered is not None and answered is not but:
             self.ask_again(answered.demand)
 
+    async def take_back_offers(self, why: str) -> None:
+        """Withdraw all open offers of the account."""
+        await self._take_back(self._offers(), why)
+
     async def _take_back(self, offers: Iterable[TradedOrder], why: str) -> None:
         """Withdraw the open ones of these offers."""
         left = [offer for offer in offers if offer.is_open]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import signal
 import sys
 import threading
 from collections import Counter
@@ -24,6 +25,7 @@ from mesh.amounts import XRT
 from mesh.base.background import Background
 from mesh.cli.chain_client import check_balance
 from mesh.cli.files import file_or_cid, model_named, require_writable
+from mesh.cli.liability import device_lines
 from mesh.cli.options import ADDRESS, PATH, AmountText, with_json, with_settings
 from mesh.cli.order import withdraw_orders, withdrawal_lines
 from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress, wait_for_broken_pipe
@@ -54,6 +56,8 @@ STEP: Final = 10
 """Percent of a playback after which another line is printed where there is no bar."""
 HELD_TIMEOUT: Final = 3.0
 """Seconds in which somebody on the mesh may say that it has the objective."""
+STOP_PROMPT: Final = 5.0
+"""Seconds in which another Ctrl-C stops the robot."""
 STOP_TIMEOUT: Final = 1.0
 """Seconds that an interrupted command waits for the node, to say for how long the demand stays valid."""
 BEHIND: Final = 32
@@ -494,7 +498,8 @@ async def demand(
     With --robot only that robot gets the job. It is asked first, and if it declines the command ends with its reason.
 
     Ctrl-C stops waiting, but does not withdraw the demand (--withdraw-on-exit or `aira order withdraw` does) or cancel
-    the contract. A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks
+    the contract. In a terminal a second Ctrl-C, within five seconds, stops the robot, as `aira liability stop` does.
+    A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks
     what to do; without a terminal it needs --existing.
 
     With --validator, the command first says who judges the work and by which policies, what that costs, and what
@@ -571,6 +576,7 @@ async def _post(agent: Agent, cid: str, checked: Objective | None, printer: JobP
         size = f"{plural(objective.count, 'message')}, {format_duration(objective.duration_ns)}"
         facts = {"objective": cid, "messages": objective.count, "seconds": objective.duration_ns / 1e9}
         printer.line(f"objective {cid}: {size}", kind="objective", **facts)
+    await _say_what_a_stop_costs(agent, printer)
     order = await agent.order(cid, **terms)
     until = f"valid until block {order.deadline:,}"
     printer.line(f"posted {order.hash}, {until}", kind="posted", order=order.hash, deadline=order.deadline)
@@ -663,7 +669,10 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
         printer.close()
         goes_on = f"the contract goes on; `aira liability watch {contract.address}` waits for its end"
         click.echo(f"{goes_on}, `aira liability show` says from when the cost can be refunded", err=True)
-        raise
+        if not await _is_to_stop():
+            raise
+        await _stop(contract, printer)
+        outcome = await contract.outcome(on_progress=printer)
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
     if contract.liability.validator != ZERO_ADDRESS:
         facts["reports"] = [decode_json(one.encode()) for one in outcome.reports]
@@ -699,6 +708,42 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
         print_line(f"recording {facts['recording']}")
     if failure is not None:
         raise failure
+
+
+async def _is_to_stop() -> bool:
+    """Whether Ctrl-C is pressed again, which stops the robot, while the terminal says so."""
+    if not sys.stderr.isatty():
+        return False
+    again = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGINT, again.set)
+    try:
+        click.echo(f"press Ctrl-C again within {STOP_PROMPT:g} seconds to stop the robot; else it goes on", err=True)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(STOP_PROMPT):
+                await again.wait()
+    finally:
+        loop.remove_signal_handler(signal.SIGINT)
+    return again.is_set()
+
+
+async def _stop(contract: Contract, printer: JobPrinter) -> None:
+    """Stop the job of a contract, and say what the robot's devices say."""
+    click.echo("\nstopping the robot; Ctrl-C leaves without waiting for the end", err=True)
+    stopped = await contract.stop("the customer pressed Ctrl-C")
+    devices = [decode_json(one.encode()) for one in stopped.devices]
+    printer.line("the robot has stopped", kind="stopped", devices=devices)
+    for line in device_lines(stopped):
+        click.echo(line, err=True)
+
+
+async def _say_what_a_stop_costs(agent: Agent, printer: JobPrinter) -> None:
+    """Say what becomes of the cost if the job is stopped, as the model's description says."""
+    model = await agent.parts.chain.names.model(agent.model)
+    described = await agent.runtime.models.find(model)
+    if described is not None:
+        refund = "the cost comes back" if described.on_stop == "refund" else "the robot is paid all the same"
+        printer.line(f"if you stop the job after it has begun, {refund}", kind="on-stop", cost=described.on_stop)
 
 
 async def _keep_recording(contract: Contract, out: Path | None) -> Path:

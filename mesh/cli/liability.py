@@ -1,4 +1,4 @@
-"""`aira liability`: lists, shows, follows, cancels and claims what liabilities hold."""
+"""`aira liability`: lists, shows, follows, stops, cancels and claims what liabilities hold."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ from mesh.cli.output import (
     short_address,
 )
 from mesh.cli.verify import CONNECT_TIMEOUT, print_verdicts, reports_json, reports_on, verdict_facts
-from mesh.errors import AiraError, ChainError, InputError, InvalidMessage
-from mesh.settings import ChainSettings, NetworkSettings
+from mesh.errors import AiraError, ChainError, InputError, InvalidMessage, RemoteError
+from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
 from schemas.address import ZERO_ADDRESS
 from schemas.decoding import decode_json
 
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from mesh.chain.transactions import Receipt
     from mesh.settings import Settings
     from schemas.records import Liability
+    from schemas.rpc import Stopped
     from schemas.verdicts import ValidatorReport
 
 
@@ -284,6 +285,46 @@ async def cancel(settings: Settings, address: str, signatures: tuple[str, ...], 
             await _print_end(chain, await _refunded(chain, liability), liability, as_json)
         elif (settled := await _cancelled(chain, liability, signatures, as_json)) is not None:
             await _print_end(chain, settled, liability, as_json)
+
+
+@command.command("stop", short_help="stop the job of one, as its customer or its robot")
+@click.argument("address", type=ADDRESS)
+@click.argument("why", default="")
+@with_json
+@with_settings(NetworkSettings, AccountSettings, ChainSettings)
+async def stop(settings: Settings, address: str, why: str, as_json: bool) -> None:
+    """Stop the job of the liability at ADDRESS, with the key of its promisee or its promisor. WHY becomes public with
+    the recording.
+
+    The robot's devices hear it, its handlers are cancelled, and the job ends with the code `stopped`. Whether the cost
+    comes back says the description of the model (`aira model show`).
+
+    The exit code is 1 if the robot does not answer, or a device could not stop.
+    """
+    from mesh.agent.contracts import request_stop
+    from mesh.network import Network
+    from mesh.role.composition import endpoints_of, load_account
+
+    account = await asyncio.to_thread(load_account, settings)
+    async with open_chain(settings) as chain, Network(endpoints_of(settings)) as network:
+        liability = await chain.liabilities.get(address)
+        stopped = await request_stop(network.session, account.signer, liability, why)
+    if as_json:
+        print_json(stopped)
+    else:
+        print_line(f"stopped {liability.address}")
+        for line in device_lines(stopped):
+            print_line(line)
+    if missed := [one.device for one in stopped.devices if not one.heard]:
+        raise RemoteError(f"not stopped: {', '.join(map(printable, missed))}", code="not-stopped")
+
+
+def device_lines(stopped: Stopped) -> list[str]:
+    """What the robot's devices say of a stop, for people."""
+    return [
+        f"  {printable(one.device)} has {'heard it' if one.heard else f'not heard it: {printable(one.detail)}'}"
+        for one in stopped.devices
+    ]
 
 
 async def _refunded(chain: Chain, liability: Liability) -> Settled:

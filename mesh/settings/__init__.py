@@ -9,6 +9,7 @@ from mesh.settings.groups import (
     AccountSettings,
     ChainSettings,
     ContentSettings,
+    EdgeSettings,
     ExecutionSettings,
     IpfsSettings,
     MarketSettings,

@@ -232,6 +232,9 @@ class ExecutionSettings(ContentSettings):
         "hand in a ROS 1 bag as the result of a job whose objective is one, as the people of the legacy network expect;"
         " validators accept no bags unless they are set to",
     )
+    hold_when_stopped: bool = option(
+        False, "after a job was stopped, take and begin no other one until `aira stop --release` on this machine"
+    )
     open_services: bool = option(
         False,
         "let anyone on the router make this agent sign, send messages and spend (rpc/sign, rpc/send,"
@@ -277,6 +280,15 @@ class Ros2Settings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class EdgeSettings:
+    """How an edge agent treats its device."""
+
+    agent_silence: Seconds = option(
+        0.0, "seconds without an answer of the agent in a job, after which `aira edge` stops its device (0: never)"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class TelemetrySettings:
     """How an operator sees what a server does."""
 
@@ -303,6 +315,7 @@ CONTRACT_NAMES: Final = {
 @dataclass(frozen=True, kw_only=True)
 class Settings(
     TelemetrySettings,
+    EdgeSettings,
     Ros2Settings,
     IpfsSettings,
     ValidatorSettings,

@@ -105,6 +105,8 @@ _READ_CONTENT: Final = _grant("get", "aira/agent/*/cid/*")
 """Who holds content serves it in its own space."""
 _READINGS: Final = _grant("subscribe", "aira/agent/*/reading/**")
 _PROFILES: Final = _grant("get subscribe", "aira/agent/*/profile")
+_STOPS: Final = _grant("get", "aira/agent/*/rpc/stop")
+"""Requests to stop a job; their signatures say who asks."""
 
 ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
     {
@@ -116,6 +118,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _READ_CONTENT,
             _READINGS,
             _PROFILES,
+            _STOPS,
         ),
         # A person who orders work also runs an agent.
         "person": (
@@ -126,6 +129,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _READ_CONTENT,
             _READINGS,
             _PROFILES,
+            _STOPS,
         ),
         "provider": (
             _OWN_SPACE,
@@ -154,6 +158,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
         "edge": (
             _grant("put serve token get subscribe presence", "aira/agent/{agent}/device/{device}/**"),
             _grant("put serve subscribe", "aira/agent/{agent}/liability/*/topic/**"),
+            _grant("get", "aira/agent/{agent}/liability/*/*"),
             _grant("subscribe", "aira/agent/{agent}/liability/*/*", "aira/agent/{agent}/liability/*/objective/**"),
         ),
         # A bridge relays messages that are signed elsewhere. Its turn is a separate liveliness token.

@@ -173,7 +173,7 @@ GET = NOBODY | {
     "miner": OWN | MARKETS,
     "judge": OWN | MARKETS | {"other cid"},
     "boss": OWN | OTHER | MARKETS,
-    "board": {"robot device"},
+    "board": {"robot device", "robot event"},
     "bridge": OWN | MARKETS | {"other cid"},
     "screen": MARKETS | {"own cid", "other cid", "own profile", "other profile"},
 }
