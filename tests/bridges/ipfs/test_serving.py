@@ -55,12 +55,13 @@ async def served(place: Place, *, size_limit: int = 1 << 20) -> AsyncIterator[Ip
         store.close()
 
 
-async def run(client: str, *arguments: str) -> dict[str, Any]:
+async def run(place: Place, client: str, *arguments: str) -> dict[str, Any]:
     """What a page with that client reports, by name."""
     folders, script = f"{require(client)}:{require('ipfs-api')}", f"order_{client[-1]}.cjs"
     process = await asyncio.create_subprocess_exec(
         "node", SCRIPTS / script, *arguments,
-        env=os.environ | {"NODE_PATH": folders}, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        env=os.environ | {"NODE_PATH": folders, "TMPDIR": str(place.folder)},
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
     try:
         async with asyncio.timeout(100):
@@ -92,7 +93,7 @@ async def test_a_legacy_page_orders_a_job_without_ipfs(place: Place, client: str
         Background() as tasks,
     ):
         tasks.start(provider.run(), "provider of the test")
-        found = await run(client, node.url, place.market.deployment.ens, api.url, MODEL, content)
+        found = await run(place, client, node.url, place.market.deployment.ens, api.url, MODEL, content)
     assert found["offer"] == place.address("robot")
     assert found["result"] == found["result message"]
 
@@ -128,7 +129,7 @@ async def test_a_legacy_page_orders_a_job_on_js_ipfs(
         await until(lambda: bridge.channels[0].status().state in ("alone", "connected"))
         ens = place.market.deployment.ens
         ipfs = js_ipfs.swarm_address if has_node else js_ipfs.api
-        found = await run(client, node.url, ens, ipfs, MODEL, content, str(packages))
+        found = await run(place, client, node.url, ens, ipfs, MODEL, content, str(packages))
         assert cid_of_bytes(await daemon.cat(found["result"])) == found["result"]
     assert found["offer"] == place.address("robot")
     assert found["result"] == found["result message"]
@@ -161,7 +162,7 @@ async def test_a_legacy_page_orders_with_a_bag_and_gets_a_bag(
     ):
         tasks.start(provider.run(), "provider of the test")
         content = b64encode(task.read_bytes()).decode()
-        found = await run("robonomics-3", node.url, place.market.deployment.ens, api.url, MODEL, content)
+        found = await run(place, "robonomics-3", node.url, place.market.deployment.ens, api.url, MODEL, content)
         async with LegacyClient(api.url) as client:
             result.write_bytes(await client.cat(found["result"]))
     assert found["result"] == found["result message"] == cid_of_file(result)
