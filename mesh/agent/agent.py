@@ -551,17 +551,23 @@ class Agent(Program):
         return await self.runtime.trader.post(Demand, terms, robot=named, validator_fee=fee)
 
     async def demand(
-        self, objective: str | Path | Messages, *, on_progress: OnProgress = nothing, **terms: Unpack[DemandTerms]
+        self,
+        objective: str | Path | Messages,
+        *,
+        on_progress: OnProgress = nothing,
+        wait: bool = False,
+        **terms: Unpack[DemandTerms],
     ) -> Contract:
         """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
 
-        The terms are those of `order`, `on_progress` that of `Order.contract`. Cancelling withdraws the demand. Raises
-        `OrderExpired`, `OrderClosed` (withdrawn elsewhere), `InsufficientTokens`, and `OtherRobot` if another one than
-        the `robot` that was named has the contract.
+        The terms are those of `order`, `on_progress` that of `Order.contract`. If all robots of the model that are
+        present decline, the demand is withdrawn, and `DemandDeclined` says why; with `wait` it stays open. Cancelling
+        withdraws the demand. Raises `OrderExpired`, `OrderClosed` (withdrawn elsewhere), `InsufficientTokens`, and
+        `OtherRobot` if another one than the `robot` that was named has the contract.
         """
         order = await self.order(objective, **terms)
         try:
-            return await order.contract(on_progress=on_progress)
+            return await order.contract(on_progress=on_progress, wait=wait)
         except asyncio.CancelledError:
             if self._runtime is not None:
                 with suppress(OrderClosed):  # it has just become a contract

@@ -40,7 +40,7 @@ from schemas.messages import equal_terms, lasting_hash
 from schemas.signing import Refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.contracts import OnProgress
@@ -159,6 +159,24 @@ class TradedOrder:
         self._report(stated(decline))
         return True
 
+    async def all_declined(self, robots: Callable[[], Awaitable[Collection[str]]]) -> list[Decline]:
+        """Wait until all robots (addresses) that are there have declined it for good; returns what they said.
+
+        `robots` is called after each decline.
+        """
+        heard = asyncio.Event()
+        listener: OnProgress = lambda _progress: heard.set()  # noqa: E731
+        self.on_progress.append(listener)
+        try:
+            while True:
+                said = {agent: one for agent, one in self.declines.items() if one.code not in TRIED_AGAIN}
+                if said and said.keys() >= set(present := await robots()) and present:
+                    return [said[robot] for robot in present]
+                await heard.wait()
+                heard.clear()
+        finally:
+            self.on_progress.remove(listener)
+
     async def contract(self, on_progress: OnProgress) -> Contract:
         """Wait until it is a contract, and report rejections and declines meanwhile, those of before first."""
         if self.created is None:
@@ -176,6 +194,8 @@ class TradedOrder:
             report(on_progress, progress)
 
 
+TRIED_AGAIN: Final = frozenset({"busy", "objective-unavailable", "equal-declined"})
+"""The codes of declines after which the robot looks at the demand's next copy again."""
 NEAR: Final = 16
 """Nonces before and after an order's that another version of it may have."""
 

@@ -27,7 +27,7 @@ from mesh.agent.contracts import (
     report,
     seen_offers,
 )
-from mesh.agent.errors import Declined, OtherRobot
+from mesh.agent.errors import Declined, DemandDeclined, OtherRobot
 from mesh.agent.orders import (
     ALONE,
     EQUAL_DECLINED,
@@ -178,14 +178,19 @@ class Order:
         """
         return await self._trader.withdraw_on_chain(self._traded)
 
-    async def contract(self, *, on_progress: OnProgress = nothing) -> Contract:
+    async def contract(self, *, on_progress: OnProgress = nothing, wait: bool = True) -> Contract:
         """Wait until the order is a contract. Cancelling the wait changes nothing.
+
+        Without `wait`, a demand is withdrawn once all robots of its model that are present have declined, and
+        `DemandDeclined` has their reasons.
 
         `on_progress` is called with offers for a demand, agents' declines, providers' rejections (both also earlier
         ones), and the contract. After a decline or a rejection the order stays valid. Raises `OrderClosed` if the order
         was withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
         """
-        return await self._trader.contract_of(self._traded, on_progress)
+        if wait or self.kind == "offer":
+            return await self._trader.contract_of(self._traded, on_progress)
+        return await self._trader.contract_unless_declined(self._traded, on_progress)
 
 
 ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: demands stay open until their deadline")
@@ -450,6 +455,33 @@ class Trader(Lifecycle):
         if isinstance(order.signed, Demand) and order.robot not in ("", promisor):
             raise OtherRobot(order.identity, robot=order.robot, promisor=promisor, liability=address)
         return contract
+
+    async def contract_unless_declined(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
+        """As `contract_of`, until all robots of the model that are present have declined: then it is withdrawn.
+
+        Robots of the legacy network can't be counted, so nothing ends while a bridge is present. Raises
+        `DemandDeclined`.
+        """
+
+        async def robots() -> list[str]:
+            if order.robot:
+                return [order.robot]
+            if await self._parts.channel.present("bridge"):
+                return []
+            return [robot.address for robot in await self._parts.robots.present(order.signed.model)]
+
+        async with Background() as tasks:
+            contract: asyncio.Task[Contract] = tasks.start(
+                self.contract_of(order, on_progress), f"contract of {order.identity}"
+            )
+            declined = tasks.start(order.all_declined(robots), f"declines of {order.identity}")
+            await asyncio.wait((contract, declined), return_when=asyncio.FIRST_COMPLETED)
+            if not contract.done():
+                said, identity = declined.result(), order.identity
+                contract.cancel()
+                await self._withdraw([order])
+                raise DemandDeclined(identity, said)
+            return contract.result()
 
     async def withdraw(self, order: TradedOrder) -> Order:
         """See `Order.withdraw`."""

@@ -463,6 +463,9 @@ async def agreed_fee(
     type=click.Choice(list(CHOICES)),
     help="what to do if an equal demand is open: wait for it, withdraw it first, or post another [ask]",
 )
+@click.option(
+    "--wait", is_flag=True, help="wait for other robots if all that are present have declined [withdraw the demand]"
+)
 @click.option("--yes", "confirmed", is_flag=True, help="post the demand even if perhaps nobody judges the work")
 @click.option("--out", type=PATH, help="file to copy the recording to")
 @click.option(
@@ -486,6 +489,7 @@ async def demand(
     confirmed: bool = False,
     robot: str = "",
     max_cost: str | None = None,
+    wait: bool = False,
     existing: str | None = None,
     withdraw_on_exit: bool = False,
     **terms: Any,
@@ -495,7 +499,9 @@ async def demand(
     playback, the result. The recording is kept in the account's store, so that `aira verify` and `aira objective show`
     need no robot.
 
-    With --robot only that robot gets the job. It is asked first, and if it declines the command ends with its reason.
+    If all robots of the model that are present decline, the demand is withdrawn and the command ends with their
+    reasons; --wait keeps it open. With --robot only that robot gets the job. It is asked first, and if it declines
+    the command ends with its reason.
 
     Ctrl-C stops waiting, but does not withdraw the demand (--withdraw-on-exit or `aira order withdraw` does) or cancel
     the contract. In a terminal a second Ctrl-C, within five seconds, stops the robot, as `aira liability stop` does.
@@ -544,7 +550,7 @@ async def demand(
             if order is None:
                 await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
                 order = await _post(agent, cid, checked, printer, robot=robot, max_cost=most, **terms)
-            contract = await _contract(agent, order, printer, withdraw_on_exit=withdraw_on_exit)
+            contract = await _contract(agent, order, printer, withdraw_on_exit=withdraw_on_exit, wait=wait)
             await _wait_for_end(agent, contract, printer, out)
 
 
@@ -583,7 +589,9 @@ async def _post(agent: Agent, cid: str, checked: Objective | None, printer: JobP
     return order
 
 
-async def _contract(agent: Agent, order: Order | Contract, printer: JobPrinter, *, withdraw_on_exit: bool) -> Contract:
+async def _contract(
+    agent: Agent, order: Order | Contract, printer: JobPrinter, *, withdraw_on_exit: bool, wait: bool
+) -> Contract:
     """Wait until an order is a contract. When that is interrupted, say what becomes of the order, or withdraw it."""
     from mesh.agent.contracts import Contract, Progress
     from mesh.agent.trade import Order
@@ -595,7 +603,7 @@ async def _contract(agent: Agent, order: Order | Contract, printer: JobPrinter, 
     try:
         async with Background() as tasks:
             tasks.start(_say_who_is_present(agent, printer), "silence")
-            return await order.contract(on_progress=printer)
+            return await order.contract(on_progress=printer, wait=wait)
     except asyncio.CancelledError:
         if withdraw_on_exit and isinstance(order, Order):
             for line in withdrawal_lines(await withdraw_orders(agent.parts, [order], on_chain=False)):

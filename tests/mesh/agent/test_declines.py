@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec.structs import replace
 
-from mesh import Declined, InputError, Progress
+from mesh import Declined, DemandDeclined, InputError, Progress
 from mesh.agent.demands import PER_MAKER, DeclinePublisher, Grounds
 from mesh.base.flood import Drops
 from mesh.network import Endpoints, Network
 from schemas import DeclineKey, Demand, Empty, RejectKey, Signer, Verified, cid_of_bytes
 from schemas.signing import Decline
+from tests.mesh.agent.test_hiring import another
 from tests.mesh.agent.trades import OBJECTIVE, posted
 from tests.support import orders
 from tests.support.log_events import logged_facts
-from tests.support.market import Place, offering
+from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_heard
 
@@ -172,3 +173,38 @@ async def test_only_those_who_demand_subscribe_to_declines(place: Place) -> None
             assert not publisher.matching_status.matching  # type: ignore[attr-defined]
         async with asyncio.timeout(60):
             await order.withdraw()
+
+
+async def test_a_demand_ends_when_all_robots_of_its_model_have_declined(place: Place) -> None:
+    async with another(place) as second, asyncio.timeout(60):
+        for robot in (first := place.agent("robot"), second):
+            _decline_all(robot)
+        async with place.at_work(first, second) as person:
+            with pytest.raises(DemandDeclined) as caught:
+                await person.demand(OBJECTIVE)
+            assert {one.agent: one.code for one in caught.value.declines} == {
+                first.address: "too-cheap",
+                second.address: "too-cheap",
+            }
+            assert person.orders() == []
+            # One that waits stays open.
+            kept = asyncio.create_task(person.demand(OBJECTIVE, cost=1, wait=True))
+            await until(lambda: any(len(order._traded.declines) == 2 for order in person.orders()))
+            assert not kept.done()
+            kept.cancel()
+            await asyncio.wait([kept])
+
+
+async def test_a_demand_goes_on_while_one_robot_has_not_declined(place: Place) -> None:
+    async with another(place) as second, asyncio.timeout(60):
+        _decline_all(second)
+
+        async with place.at_work(second, silent := taking_speeds(place.agent("robot", MODEL))) as person:
+            contract = await person.demand(place.save(objective(("/go", 1.0))))
+            assert contract.robot == silent.address
+
+
+def _decline_all(robot: Agent) -> None:
+    @robot.on_demand
+    async def decline(demand: Verified[Demand]) -> None:
+        raise Declined("too-cheap", "costs more")

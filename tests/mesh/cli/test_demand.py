@@ -120,7 +120,14 @@ async def test_a_robot_that_declines_is_shown_with_its_reason(site: Site, output
 
     async with site.provider(), robot:
         waiting = asyncio.create_task(
-            demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=False, **TERMS)
+            demand(
+                settings_of(site, "person"),
+                objective=str(site.job("word")),
+                out=None,
+                as_json=False,
+                wait=True,
+                **TERMS,
+            )
         )
         line = f"declined by {robot.address}: costs at least 5 XRT (too-cheap)\n"
         await until(lambda: line in output.out, seconds=60)
