@@ -145,7 +145,14 @@ async def test_a_robot_with_a_name_is_shown_by_it_and_its_short_address(site: Si
 
     async with site.provider(), robot:
         waiting = asyncio.create_task(
-            demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=False, **TERMS)
+            demand(
+                settings_of(site, "person"),
+                objective=str(site.job("word")),
+                out=None,
+                as_json=False,
+                wait=True,
+                **TERMS,
+            )
         )
         who = f"Lift 1 ({robot.address[:6]}…{robot.address[-4:]})"
         await until(lambda: f"declined by {who}: (too-cheap)\n" in output.out, seconds=60)
