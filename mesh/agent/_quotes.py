@@ -29,6 +29,7 @@ from schemas.signing import LONGEST_DETAIL
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
+    from mesh.agent._owner_rules import OwnerRules
     from mesh.agent._profile import OwnProfile
     from mesh.agent.components import AgentComponents
     from mesh.agent.handlers import QuoteHandler
@@ -72,12 +73,16 @@ async def asked_quotes(
 
 
 class Quoting:
-    """The service `quote` of a robot: what its handler asks for a job, or the price of its `description`."""
+    """The service `quote` of a robot: what its handler asks for a job, or the price of its `description`.
+
+    What its owner's `rules` exclude is declined.
+    """
 
     def __init__(
         self,
         parts: AgentComponents,
         profile: OwnProfile,
+        rules: OwnerRules,
         handlers: Sequence[QuoteHandler],
         description: ModelDescription | None,
         *,
@@ -85,6 +90,7 @@ class Quoting:
     ) -> None:
         self._parts = parts
         self._profile = profile
+        self._rules = rules
         self._handlers = handlers
         self._price = "" if description is None else description.price
         self._seconds = float((None if description is None else description.seconds) or 0)
@@ -124,12 +130,15 @@ class Quoting:
         token = parts.settings.erc20_token
         unit = await parts.chain.retrying(partial(parts.chain.tokens.unit, token), outages=parts.outages)
         named = partial(parts.chain.names.address, token)
+        cost, paid_in = unit.amount(price), await parts.chain.retrying(named, outages=parts.outages)
+        if (refused := await self._rules.refusal(request.asker, cost=cost, token=paid_in)) is not None:
+            raise refused
         _, wait = await self._profile.queue()
         return Quote(
             agent=parts.signer.address,
             request=request.identity,
-            cost=unit.amount(price),
-            token=await parts.chain.retrying(named, outages=parts.outages),
+            cost=cost,
+            token=paid_in,
             start=float(wait),
             seconds=self._seconds,
             until=parts.chain_head.head + FEWEST_BLOCKS,

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 import zenoh
 from msgspec.structs import replace
 
+from mesh.agent._notifications import Notifier, OwnerWatch
 from mesh.agent._outbox import result_identity
+from mesh.agent._owner_rules import OwnerRules
 from mesh.agent._profile import OwnProfile
 from mesh.agent._quotes import Quoting
 from mesh.agent._services import offer_services
@@ -24,7 +26,7 @@ from mesh.agent._status import AgentStatus
 from mesh.agent.contracts import ContractReports, Outcome
 from mesh.agent.demands import Acceptance, DemandDispatcher
 from mesh.agent.handlers import call
-from mesh.agent.jobs import Executor, stop_devices
+from mesh.agent.jobs import Executor, reason_in, stop_devices
 from mesh.agent.ledger import TO_BE_DONE, UNFINISHED, Phase, advance
 from mesh.agent.objectives import Objectives
 from mesh.agent.trade import Trader
@@ -50,7 +52,7 @@ from mesh.network.services import answering, declared
 from mesh.role.following import follow_chain
 from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, listening, stop_folder
 from mesh.telemetry.logs import LogService
-from schemas import ZERO_ADDRESS, Demand, Result, Withdrawal, decode, event_selector, parse_address
+from schemas import ZERO_ADDRESS, Demand, Result, Withdrawal, decode, event_selector, message_hash, parse_address
 from schemas.cid import is_cid
 from schemas.keys import EthEventKey, EventKey, LiabilityEvent, ProgressKey, market_selector
 from schemas.rpc import ApprovalEvent, TransferEvent
@@ -66,7 +68,7 @@ if TYPE_CHECKING:
     from mesh.network import Subscription
     from mesh.role.following import Created
     from mesh.role.models import Models
-    from schemas import Liability, Record
+    from schemas import Liability, Offer, Record
     from schemas.model import ModelDescription
     from schemas.rpc import DeviceStop
     from schemas.verdicts import ValidatorReport
@@ -158,6 +160,8 @@ SOON: Final = 3
 JUDGED: Final = frozenset({"NotTheValidator", "RefusedByValidator"})
 """How the contracts refuse a Result that only a validator can finalize."""
 NEVER: Final = 2**63
+HOURS_INTERVAL: Final = 5.0
+"""Seconds between two looks at whether the robot is closed."""
 
 
 class LateResults:
@@ -229,6 +233,7 @@ class AgentRuntime(Lifecycle):
         description: ModelDescription | None = None,
         *,
         model: str = "",
+        parallel: int = 1,
     ) -> None:
         topics = handlers.topics or None
         self.parts = parts
@@ -244,12 +249,18 @@ class AgentRuntime(Lifecycle):
             handlers=topics,
             on_phase=self._on_phase,
             on_stop=handlers.stops,
+            parallel=parallel,
             is_paid_when_stopped=description is not None and description.on_stop == "paid",
         )
+        self.rules = OwnerRules(parts, lambda: len(self.executor.at_hand) + len(self.trader.answers))
+        self.trader.full = self.rules.full
+        self.notifier = Notifier(parts.settings, parts.signer.address)
+        self.trader.on_offer = self._on_offer
         self.token_events = TokenEvents(parts.channel.put, parts.signer.address)
         self.status = AgentStatus(parts, self.executor, model=model)
         self.profile = OwnProfile(parts, self.executor, description, model=model)
         self.profile.is_stopped = lambda: self.executor.hold.is_held
+        self.profile.is_closed = lambda: not self.rules.is_open
         self._handlers = handlers
         self._description = description
         # Else it may run beside the account's robot, as the commands of a person do.
@@ -259,6 +270,7 @@ class AgentRuntime(Lifecycle):
         self._model = model
 
     async def _open(self, stack: AsyncExitStack) -> None:
+        await stack.enter_async_context(self.notifier)
         await stack.enter_async_context(self.reports)
         await stack.enter_async_context(self.trader)
         if self._is_robot:
@@ -269,9 +281,11 @@ class AgentRuntime(Lifecycle):
         services = self.parts.services
         offer_services(self.parts, self.executor, self.stop, has_handlers=bool(self._handlers.topics))
         if decide := self._handlers.market.get(Demand):
-            quoting = Quoting(self.parts, self.profile, self._handlers.quotes, self._description, model=self._model)
+            quoting = Quoting(
+                self.parts, self.profile, self.rules, self._handlers.quotes, self._description, model=self._model
+            )
             services.offer("quote", quoting.quote)
-            services.offer("accept", Acceptance(self.parts, self.trader, decide, model=self._model).accept)
+            services.offer("accept", Acceptance(self.parts, self.trader, self.rules, decide, model=self._model).accept)
         if self.parts.settings.enable_executor:
             stop = partial(self._stop_from_thread, asyncio.get_running_loop())
             folder = stop_folder(self.parts.settings)
@@ -289,6 +303,15 @@ class AgentRuntime(Lifecycle):
         yield "reports on earlier contracts", self._follow_earlier()
         if self._is_robot:
             yield "profile", self.profile.run()
+            yield from OwnerWatch(self.parts, self.notifier).tasks()
+            if self.parts.settings.hours:
+                yield "hours", self._follow_hours()
+
+    async def _follow_hours(self) -> None:
+        """Let the profile say when the robot closes, and when it opens again."""
+        while True:
+            self.profile.changed()
+            await asyncio.sleep(HOURS_INTERVAL)
 
     async def _do_jobs(self) -> None:
         await self.finalize_ended()
@@ -389,10 +412,13 @@ class AgentRuntime(Lifecycle):
     @with_liability_context
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract was created that names this account: as promisee, as promisor, or as both."""
+        does_jobs = self.parts.settings.enable_executor
+        if does_jobs and liability.promisor == self._account and not liability.is_finalized:
+            self.executor.at_hand.add(liability.address)  # before the offer is none any more
         await self.trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
         if liability.promisor != self._account:
             return
-        if not self.parts.settings.enable_executor:
+        if not does_jobs:
             if not liability.is_finalized:  # for the account's next run that does jobs, or one beside this
                 await self.parts.ledger.add_job(liability)
             return
@@ -405,8 +431,11 @@ class AgentRuntime(Lifecycle):
         job = await self.parts.ledger.job(address)
         # Another program of the account may have added it, and left it to this one.
         if job is None or (is_known and (job.phase is not Phase.INCOMING or address in self.executor.preparing)):
+            if job is None or job.phase not in TO_BE_DONE:
+                self.executor.at_hand.discard(address)
             return
         if job.result is not None:
+            self.executor.at_hand.discard(address)
             await self._owe_result(job)
             return
         facts = log_event("job-accepted", model=liability.model, objective=liability.objective, cost=liability.cost)
@@ -458,7 +487,8 @@ class AgentRuntime(Lifecycle):
         """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
         parts, names = self.parts, self.parts.chain.names
         token = await parts.chain.retrying(partial(names.address, parts.settings.erc20_token), outages=parts.outages)
-        dispatcher = DemandDispatcher(subscription, handlers, parts, self.trader, token=token)
+        await self.rules.open()
+        dispatcher = DemandDispatcher(subscription, handlers, parts, self.trader, self.rules, token=token)
         async with parts.channel.subscribe(Withdrawal) as withdrawals, asyncio.TaskGroup() as tasks:
             tasks.create_task(dispatcher.run(), name="demands")
             with self._hearing_of_contracts():
@@ -549,5 +579,27 @@ class AgentRuntime(Lifecycle):
         if phase in PUBLISHED:
             key = str(EventKey(self.parts.signer.address, liability.address, PUBLISHED[phase]))
             self.parts.channel.put(key, liability.encode())
+        await self._notify(phase, liability)
         for handler in self._handlers.liabilities:
             await call(handler, phase, liability)
+
+    def _on_offer(self, offer: Offer, customer: str) -> None:
+        """Notify of an offer, which may become a job."""
+        facts = {"order": message_hash(offer).hex(), "customer": customer, "model": offer.model}
+        facts |= {"objective": offer.objective, "cost": str(offer.cost), "token": offer.token}
+        self.notifier.notify("job-offered", facts, about=facts["order"])
+
+    async def _notify(self, phase: Phase, liability: Liability) -> None:
+        """Notify of what has become of a job."""
+        facts = {"liability": liability.address, "customer": liability.promisee, "model": liability.model}
+        facts |= {"objective": liability.objective, "cost": str(liability.cost), "token": liability.token}
+        tell = partial(self.notifier.notify, about=liability.address)
+        match phase:
+            case Phase.RUNNING:
+                tell("job-begun", facts)
+            case Phase.COMPLETE if not liability.is_success:
+                job = await self.parts.ledger.job(liability.address)
+                reason = reason_in("" if job is None else job.note)
+                tell("job-failed", facts | {"reason": reason.text, "code": reason.code, "result": liability.result})
+            case Phase.FINALIZED:
+                tell("job-paid" if liability.is_success else "job-refunded", facts | {"result": liability.result})

@@ -35,6 +35,7 @@ from mesh.agent.handlers import (
     StopHandler,
     check_handler,
     check_model,
+    check_parallel,
     check_period,
     check_topic,
     dispatch,
@@ -242,7 +243,7 @@ class Agent(Program):
     With an account (`account`, or a keyfile in the settings) it trades and works; without one it only watches the
     market. It opens nothing before `run` or `async with`. Any number of agents can run in one event loop. `chain`, if
     given, is an open chain to use instead of the one that the settings name; `resend` is how often messages without
-    effect are sent again.
+    effect are sent again. Jobs run one after the other, or `parallel` at a time if the handlers can do several at once.
 
     The decorators register handlers. A handler may be sync: it then runs in a thread of its own, and may block. What
     can't work raises a `RegistrationError`, a `ConfigurationError` with the line of your program.
@@ -258,14 +259,17 @@ class Agent(Program):
         settings: Settings | None = None,
         account: Account | None = None,
         chain: Chain | None = None,
+        parallel: int = 1,
         resend: RetryPolicy = RESEND,
     ) -> None:
         check_model(model)
+        check_parallel(parallel)
         super().__init__(load() if settings is None else settings, account=account, chain=chain)
         self.model = ""
         with suppress(ConfigurationError):  # without its file, which is required when it is opened
             self.model = model_of(model)
         self._given_model = model
+        self._parallel = parallel
         self._resend = resend
         self._handlers = Handlers()
         self._link: tuple[Network, Channel] | None = None
@@ -835,7 +839,9 @@ class Agent(Program):
         parts = await self._open_when_ready(stack, make)
         models = Models(parts.store, parts.exchange)
         description = await own_description(parts, models, self._given_model, self._handlers.topics)
-        runtime = AgentRuntime(parts, self._handlers, models, description, model=self.model or "")
+        runtime = AgentRuntime(
+            parts, self._handlers, models, description, model=self.model or "", parallel=self._parallel
+        )
         return await stack.enter_async_context(runtime)
 
     def _opened(self) -> tuple[Network, Channel]:

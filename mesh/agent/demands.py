@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from msgspec.structs import replace
 
+from mesh.agent._owner_rules import FOR_NOW
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call
 from mesh.agent.objectives import Buyer, ObjectiveNotFetched, ObjectiveUnfit
@@ -31,6 +32,7 @@ from schemas.signing import LONGEST_DETAIL, Decline
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from mesh.agent._owner_rules import OwnerRules
     from mesh.agent.components import AgentComponents
     from mesh.agent.handlers import Handler
     from mesh.agent.trade import Trader
@@ -124,7 +126,7 @@ LOGGED: Final = Rate(per_second=0.2, burst=20)
 
 
 class DemandDispatcher:
-    """Calls `handlers` with the demands of a subscription: `await dispatcher.run()`.
+    """Calls `handlers` with the demands of a subscription that the `rules` allow: `await dispatcher.run()`.
 
     A demand whose maker can't pay now waits for `UNFUNDED_POLLS` looks at the chain, because an approval or a payment
     may be under way, or the node a block behind the maker's; after that its next copy is looked at. Pay counts in
@@ -138,6 +140,7 @@ class DemandDispatcher:
         handlers: Sequence[Handler],
         parts: AgentComponents,
         trader: Trader,
+        rules: OwnerRules,
         *,
         token: str,
     ) -> None:
@@ -146,6 +149,7 @@ class DemandDispatcher:
         self._chain = chain = parts.chain
         self._token = token
         self._trader = trader
+        self._rules = rules
         trader.ask_again = self._ask_again
         self._pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
         self._outages = parts.outages
@@ -246,11 +250,15 @@ class DemandDispatcher:
             self._changed.set()
 
     async def _decide(self, demand: Verified[Demand], *, pays: bool) -> bool:
-        """Call the handlers with a demand; False if they decline it."""
+        """Call the handlers with a demand, unless the settings exclude it; False if it is declined."""
         HANDLED_FOR.set(Buyer(demand.signer, pays))
         answered, grounds = self._trader.answered.note(demand), []
         answered.is_declined = False
-        for handler in self._handlers:
+        message = demand.message
+        refused = await self._rules.refusal(demand.signer, cost=message.cost, token=message.token)
+        if refused is not None:
+            grounds.append(Grounds(refused.reason, refused.detail))
+        for handler in self._handlers if refused is None else ():
             error = await call(handler, demand, logged=self._is_logged)
             if isinstance(error, ObjectiveNotFetched):
                 self._drop(demand, f"objective-{error.reason}")
@@ -264,7 +272,9 @@ class DemandDispatcher:
                 grounds.append(reason)
         if grounds and not answered.is_answered:
             self._declines.decline(demand, grounds[0])
-            if not answered.is_over and grounds[0].code not in (BUSY.code, EQUAL_DECLINED, ROBOT_STOPPED):
+            if grounds[0].code in FOR_NOW:
+                self._drop(demand, grounds[0].code, after=self._pause)
+            elif not answered.is_over and grounds[0].code not in (BUSY.code, EQUAL_DECLINED, ROBOT_STOPPED):
                 await self._trader.decline(answered)
         if not answered.is_answered:
             self._trader.answered.forget(answered)
@@ -288,14 +298,17 @@ def _may_pass(error: AiraError) -> bool:
 
 
 class Acceptance:
-    """The service `accept` of a robot: its `handlers` decide on a demand that is for it alone.
+    """The service `accept` of a robot: its `handlers` decide on a demand that is for it alone and that `rules` allow.
 
     What they offer is not published, and is the reply. A demand that was answered before gets the same offer.
     """
 
-    def __init__(self, parts: AgentComponents, trader: Trader, handlers: Sequence[Handler], *, model: str) -> None:
+    def __init__(
+        self, parts: AgentComponents, trader: Trader, rules: OwnerRules, handlers: Sequence[Handler], *, model: str
+    ) -> None:
         self._parts = parts
         self._trader = trader
+        self._rules = rules
         self._handlers = handlers
         self._model = model
         self._limiter = RateLimiter(per_sender=PER_MAKER, total=TOTAL)
@@ -334,6 +347,11 @@ class Acceptance:
         if answered.offer is None or not answered.offer.is_open:
             if not self._limiter.allow(demand.signer):
                 return BUSY
+            terms = demand.message
+            refused = await self._rules.refusal(demand.signer, cost=terms.cost, token=terms.token)
+            if refused is not None:
+                self._trader.answered.forget(answered)
+                return Grounds(refused.reason, refused.detail)
             ask = partial(self._parts.chain.tokens.balance, demand.signer, token=demand.message.token)
             if await self._parts.chain.retrying(ask, outages=self._parts.outages) < demand.message.cost:
                 return Grounds("unfunded", "its maker lacks the money")

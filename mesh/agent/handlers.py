@@ -490,6 +490,13 @@ def check_period(seconds: object) -> None:
         raise RegistrationError(why, hint="write @agent.every(5.0)", code="invalid-period")
 
 
+def check_parallel(parallel: object) -> None:
+    """Raise `RegistrationError` for what is no number of jobs."""
+    if not isinstance(parallel, int) or parallel < 1:
+        why = f"{parallel!r} is not a number of jobs from 1 on"
+        raise RegistrationError(why, hint="write Agent(…, parallel=2)", code="invalid-parallel")
+
+
 def check_model(model: object) -> None:
     """Raise `RegistrationError` for what is neither a CID, an ENS name nor a path. Empty stands for any model."""
     if isinstance(model, Path) or (isinstance(model, str) and (not model or is_ens_name(model) or is_cid(model))):

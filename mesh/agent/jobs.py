@@ -3,10 +3,10 @@
     incoming ──► ready ──► running ──► complete ──► finalized        (`mesh.agent.ledger`)
     fetch, check           play, record  store, sign    paid or refunded
 
-Objectives of several jobs are fetched at once; jobs run one at a time. A missing or bad objective fails its own job
-only. The ledger has each change before anyone is notified. `Executor` takes jobs through their phases. `JobRun` is one
-run of a job: the objective played to the handlers, and everything on the job's topics recorded into a file of
-`JobRecordings`.
+Objectives of several jobs are fetched at once; jobs run one after the other, or `parallel` at a time. A missing or bad
+objective fails its own job only. The ledger has each change before anyone is notified. `Executor` takes jobs through
+their phases. `JobRun` is one run of a job: the objective played to the handlers, and everything on the job's topics
+recorded into a file of `JobRecordings`.
 
 Why a job failed stands at the end of its recording: one line of text and the error's code, as in
 `the lamp is broken [job-failed]`.
@@ -126,6 +126,11 @@ def read_reason(recording: Path) -> Reason:
                 note = String.decode(message.payload).data[:1000]
             except InvalidPayload:
                 continue  # the recording is a stranger's: what is no text says nothing
+    return reason_in(note)
+
+
+def reason_in(note: str) -> Reason:
+    """What a note says."""
     found = _CODE.fullmatch(note)
     return Reason(note) if found is None else Reason(*found.groups())
 
@@ -550,7 +555,9 @@ class Executor:
         on_phase: OnPhase,
         on_stop: Sequence[StopHandler] = (),
         is_paid_when_stopped: bool = False,
+        parallel: int = 1,
     ) -> None:
+        self._parallel = parallel
         self._ledger, self._outbox, self._store, self._signer = parts.ledger, parts.outbox, parts.store, parts.signer
         self._session = parts.network.session
         self._objectives = objectives
@@ -573,6 +580,8 @@ class Executor:
         """The tasks that fetch and check objectives, by the address of the job."""
         self.runs: Final[dict[str, JobRun]] = {}
         """The open runs, by the address of the job."""
+        self.at_hand: Final[set[str]] = set()
+        """The jobs whose work is not done, by address: those that are fetched, wait, or run."""
         self._playing: dict[str, asyncio.Task[None]] = {}
         """The tasks that play them."""
         self._stopping: dict[str, asyncio.Event] = {}
@@ -594,6 +603,8 @@ class Executor:
                         self._stopping[job.liability.address] = asyncio.Event()
                     self.prepare(job.liability)
                 self._opened.set()
+                for number in range(1, self._parallel):
+                    self._tasks.create_task(self._serve(), name=f"jobs {number}")
                 await self._serve()
         finally:
             self._tasks = None
@@ -617,6 +628,7 @@ class Executor:
     def prepare(self, liability: Liability) -> None:
         """Fetch and check a job's objective in a task. Then the job is ready, or complete without success."""
         address = liability.address
+        self.at_hand.add(address)
         task = self._task_group().create_task(self._fetch(liability), name=f"prepare {address}")
         _keep_task(self.preparing, address, task)
 
@@ -631,6 +643,7 @@ class Executor:
             if job is not None:
                 await self._suspend(address)
                 self._fetched.pop(address, None)
+            self.at_hand.discard(address)
             yield job
             if job is not None:
                 await self._release(address)
@@ -779,6 +792,7 @@ class Executor:
             await self.owe_result(address, success=success, result=cid, note=note, is_pinned=True)
             await asyncio.to_thread(self.recordings.discard, address)
             self._fetched.pop(address, None)
+            self.at_hand.discard(address)
         facts = log_event("job-finished", success=success, result=cid, recording=recording, messages=summary.messages)
         log.info("complete, success %s, result %s, %d messages", success, cid, summary.messages, extra=facts)
         await self._on_phase(Phase.COMPLETE, replace(job.liability, result=cid, is_success=success))
@@ -827,7 +841,7 @@ class Executor:
         self._ready.put_nowait(address)
 
     async def _serve(self) -> None:
-        """Do ready jobs, one at a time. Without handlers, others start them."""
+        """Do ready jobs, one after the other. Without handlers, others start them."""
         while True:
             address = await self._ready.get()
             await self._until_allowed()

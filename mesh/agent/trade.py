@@ -221,6 +221,10 @@ class Trader(Lifecycle):
         self.answered = AnsweredDemands()
         self.ask_again: Callable[[Verified[Demand]], object] = lambda _demand: None
         """Called with a demand whose offer was taken back, or used for another one: its handlers decide again."""
+        self.on_offer: Callable[[Offer, str], object] = lambda _offer, _customer: None
+        """Called with an offer that was posted, and the customer (address; empty: anybody) whose demand it answers."""
+        self.full: Callable[[], Declined | None] = lambda: None
+        """Returns the refusal of one more job, if the agent has no place for it."""
         self._heard = asyncio.Event()
         """Set when a provider has said that it honours a withdrawal."""
         self._changing = asyncio.Lock()
@@ -309,7 +313,8 @@ class Trader(Lifecycle):
         A demand for one `robot` (address) alone is posted once that has agreed; raises `DemandDeclined`, `RemoteError`.
 
         Raises `InsufficientTokens`, and for an offer that answers a demand `TooManyOffers`, the error of a demand that
-        is taken, and `Declined` while a demand with equal terms is open that the agent has declined.
+        is taken, and `Declined` while a demand with equal terms is open that the agent has declined, or the agent has
+        no place for one more job.
         """
         order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time(), robot=robot, is_ours=True)
         if isinstance(order.signed, Demand) and robot:
@@ -326,6 +331,8 @@ class Trader(Lifecycle):
                     text = f"it declined the demand {declined.demand.hash.hex()[:16]}… with equal terms, which is open"
                     raise Declined(EQUAL_DECLINED, text)
         if kind is Offer and (buyer := HANDLED_FOR.get()) is not None:
+            if (full := self.full()) is not None:  # other handlers may have offered since this one was called
+                raise full
             await self._give_up(self.answers.add(order, buyer.maker, pays=buyer.pays))
         self._orders[order.identity] = order
         if answers is not None:
@@ -340,6 +347,8 @@ class Trader(Lifecycle):
         try:
             if order.is_open:
                 await self._parts.outbox.post(order.signed, robot=order.robot)
+                if isinstance(order.signed, Offer):
+                    self.on_offer(order.signed, "" if answers is None else answers.demand.signer)
         except asyncio.CancelledError:
             await self.withdraw(order)
             raise

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from mesh.errors import ConfigurationError
 from mesh.settings._options import (
@@ -254,6 +254,38 @@ class ProfileSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AcceptanceSettings:
+    """Which jobs an agent takes."""
+
+    queue_limit: NaturalInt = option(
+        0, "most jobs that an agent has at a time: those that run, wait, or were offered (0: no limit)"
+    )
+    least_price: str = option("", "least cost of a job that an agent takes, in the token erc20_token (1.5; empty: any)")
+    accept: tuple[str, ...] = option((), "addresses of the only customers that an agent works for (empty: all)")
+    refuse: tuple[str, ...] = option((), "addresses of customers that an agent never works for (banned)")
+    hours: tuple[str, ...] = option(
+        (), "when an agent takes jobs, as in 'Mon-Fri 08:00-18:00 Europe/Berlin' (empty: always)"
+    )
+
+
+OwnerEvent = Literal[
+    "job-offered", "job-begun", "job-failed", "job-paid", "job-refunded", "robot-unreachable", "low-on-gas"
+]
+"""What the owner of a robot can be notified of."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NotificationSettings:
+    """Who is told what happens to a robot."""
+
+    notify: tuple[str, ...] = option(
+        (), "URLs (https://…) and programs (/usr/local/bin/say) that are told what happens to the robot, as CloudEvents"
+    )
+    notify_events: tuple[OwnerEvent, ...] = option(get_args(OwnerEvent), "what they are told")
+    notify_secret_file: str = option("", "file with the secret that signs what URLs are told (empty: not signed)")
+
+
+@dataclass(frozen=True, kw_only=True)
 class IpfsSettings:
     """How to reach IPFS."""
 
@@ -320,6 +352,8 @@ class Settings(
     IpfsSettings,
     ValidatorSettings,
     ProfileSettings,
+    AcceptanceSettings,
+    NotificationSettings,
     ExecutionSettings,
     MarketSettings,
     AccountSettings,

@@ -39,6 +39,23 @@ def header(served: ServedChain, number: int) -> Any:
     return served.ask("person", lambda chain: chain.node.header(number))
 
 
+def first_block_since(served: ServedChain, moment: int) -> int:
+    return served.ask("person", lambda chain: chain.node.first_block_since(moment))
+
+
+def gas_of(served: ServedChain, tx: str) -> int:
+    """What the gas of a transaction cost, wei, as its receipt says."""
+
+    async def cost() -> int:
+        async with served.chain("person") as chain:
+            receipt = await chain.node.receipt(tx)
+            assert receipt is not None
+            assert receipt.effective_gas_price is not None
+            return receipt.gas_used * receipt.effective_gas_price
+
+    return served.run(cost())
+
+
 def token_with_a_formula(served: ServedChain) -> str:
     """The address of a token, XRT in all but its symbol, of which the person has all."""
 
@@ -68,10 +85,7 @@ def test_each_contract_has_its_amounts_blocks_and_gas(fresh: ServedChain) -> Non
     earned, lost, waiting = fresh.run_json("statement", by="robot")["contracts"]
 
     made, ended = header(fresh, head - 4), header(fresh, head - 3)
-    receipts = [
-        fresh.ask("person", lambda chain, tx=tx: chain.node.receipt("0x" + tx.hex()))
-        for tx in (made.transactions[0], ended.transactions[0])
-    ]
+    steps = ["0x" + block.transactions[0].hex() for block in (made, ended)]
     assert datetime.fromisoformat(earned.pop("time")).timestamp() == ended.timestamp
     assert earned.pop("month") == datetime.now(UTC).strftime("%Y-%m")
     assert earned == {
@@ -88,9 +102,9 @@ def test_each_contract_has_its_amounts_blocks_and_gas(fresh: ServedChain) -> Non
         "earned": str(COST % XRT),
         "spent": "0",
         "fee": "7",
-        "gas": str(sum(receipt.gas_used * receipt.effective_gas_price for receipt in receipts)),
+        "gas": str(sum(gas_of(fresh, tx) for tx in steps)),
         "ownGas": "0",
-        "tx": "0x" + ended.transactions[0].hex(),
+        "tx": steps[1],
         "result": recording,
     }
     assert (lost["liability"], lost["state"], lost["earned"], lost["block"]) == (failed, "failed", "0", head - 1)
@@ -110,9 +124,8 @@ def test_gas_that_the_account_itself_paid_is_its_own(fresh: ServedChain) -> None
 
     contract = fresh.run_json("statement", by="person")["contracts"][0]
 
-    receipt = fresh.ask("person", lambda chain: chain.node.receipt(contract["tx"]))
     assert contract["state"] == "called-off"
-    assert contract["ownGas"] == str(receipt.gas_used * receipt.effective_gas_price)
+    assert contract["ownGas"] == str(gas_of(fresh, contract["tx"]))
     assert int(contract["gas"]) > int(contract["ownGas"]) > 0
     assert fresh.run_json("statement", by="robot")["contracts"][0]["ownGas"] == "0"
 
@@ -192,9 +205,8 @@ def test_the_first_block_of_a_time_is_found(served: ServedChain) -> None:
     head = served.ask("person", lambda chain: chain.block_number())
     times = [header(served, number).timestamp for number in range(head + 1)]
     for number in (0, 1, head // 2, head):
-        found = served.ask("person", lambda chain, at=times[number]: chain.node.first_block_since(at))
-        assert found == times.index(times[number])
-    assert served.ask("person", lambda chain: chain.node.first_block_since(times[-1] + 1)) == head + 1
+        assert first_block_since(served, times[number]) == times.index(times[number])
+    assert first_block_since(served, times[-1] + 1) == head + 1
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,55 @@
+"""The page for owners: its commands run as printed, its settings load, and its tables are complete."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, get_args
+
+import pytest
+
+from mesh.agent._owner_rules import Hours
+from mesh.settings import load
+from mesh.settings.groups import OwnerEvent
+
+if TYPE_CHECKING:
+    from tests.mesh.cli.served_chain import ServedChain
+
+PAGE: Final = (Path(__file__).parents[3] / "docs" / "owners.md").read_text()
+COMMANDS: Final = re.findall(r"^    ((?:aira|openssl) .+)$", PAGE, re.MULTILINE)
+
+
+def test_every_command_of_the_page_runs(served: ServedChain, tmp_path: Path) -> None:
+    served.finalize(served.create_liability(cost=5))
+    robot, stranger = served.people["robot"].address, served.people["stranger"].address
+    served.run_json("xrt", "transfer", stranger, "1wn", by="robot")  # there is state to back up
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    variables = {**os.environ, **served.variables("robot"), "PATH": path}
+    assert len(COMMANDS) >= 15
+    for command in COMMANDS:
+        line = command.replace("NEW-ADDRESS", stranger).replace("OLD-ADDRESS", robot)
+        done = subprocess.run(
+            line, shell=True, cwd=tmp_path, env=variables, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, (line, done.stderr)
+    statement = (tmp_path / "statement.csv").read_text().splitlines()
+    assert statement[0].startswith("time,month,block,liability,state,")
+    assert len(statement) == 2
+
+
+def test_the_settings_of_the_page_load(tmp_path: Path) -> None:
+    file = tmp_path / "settings.toml"
+    blocks = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    file.write_text("".join(blocks))
+    settings = load(path=file, environ={})
+    assert (settings.queue_limit, settings.least_price, len(settings.refuse)) == (3, "5", 1)
+    assert [Hours.parse(text) for text in settings.hours]
+    assert set(settings.notify_events) < set(get_args(OwnerEvent))
+
+
+@pytest.mark.parametrize("event", get_args(OwnerEvent))
+def test_the_page_explains_each_event(event: str) -> None:
+    assert f"| `{event}` |" in PAGE
