@@ -111,7 +111,9 @@ class OwnProfile:
         jobs, runs = await self._parts.ledger.jobs_by_phase(), self._executor.runs.values()
         waiting, running = sum(jobs.get(phase, 0) for phase in (Phase.INCOMING, Phase.READY)), jobs.get("running", 0)
         played = sum(one.position / one.total for run in runs if (one := run.playback) is not None and one.total)
-        return waiting, math.ceil(self._seconds * max(0.0, waiting + running - played))
+        parallel = self._executor.parallel
+        left = max(0.0, waiting + running - played) if waiting + running >= parallel else 0.0
+        return waiting, math.ceil(self._seconds * left / parallel)
 
     async def present(self) -> Profile:
         """The signed profile of this moment."""

@@ -557,7 +557,7 @@ class Executor:
         is_paid_when_stopped: bool = False,
         parallel: int = 1,
     ) -> None:
-        self._parallel = parallel
+        self.parallel = parallel
         self._ledger, self._outbox, self._store, self._signer = parts.ledger, parts.outbox, parts.store, parts.signer
         self._session = parts.network.session
         self._objectives = objectives
@@ -603,7 +603,7 @@ class Executor:
                         self._stopping[job.liability.address] = asyncio.Event()
                     self.prepare(job.liability)
                 self._opened.set()
-                for number in range(1, self._parallel):
+                for number in range(1, self.parallel):
                     self._tasks.create_task(self._serve(), name=f"jobs {number}")
                 await self._serve()
         finally:
