@@ -17,7 +17,6 @@ from schemas.errors import InvalidAddress
 ZERO_ADDRESS: Final = "0x0000000000000000000000000000000000000000"
 
 _CACHED: Final = 8192
-_MAX_NAME: Final = 255
 _LABEL: Final = frozenset("abcdefghijklmnopqrstuvwxyz0123456789-_")
 _TOP_LEVEL: Final = (".eth", ".sid", ".test")
 _LOW_BIT_OF_40: Final = int.from_bytes(b"\x01" * 40, "big")
@@ -78,7 +77,7 @@ def is_ens_name(text: str) -> bool:
 
     Labels are ASCII letters of either case, digits, `-` and `_`, so every name can be part of a key.
     """
-    if len(text) > _MAX_NAME or not text.isascii():
+    if len(text) > 255 or not text.isascii():
         return False
     name = text.lower()
     return name.endswith(_TOP_LEVEL) and all(label and _LABEL.issuperset(label) for label in name.split("."))

@@ -31,7 +31,6 @@ _MEDIA_TYPES: Final = {
 }
 _ENCODINGS: Final = {media_type: encoding for encoding, media_type in _MEDIA_TYPES.items()}
 _SCHEMA_ENCODINGS: Final = {"ros1": "ros1msg", "json": "jsonschema", "cdr": "ros2msg", "protobuf": "protobuf"}
-_NO_ENCODINGS: Final = ("", "zenoh/bytes")
 
 
 _FORMATS: Final = {
@@ -156,7 +155,7 @@ def payload_type(zenoh_encoding: str) -> PayloadType:
     known = _KNOWN.get(zenoh_encoding)
     if known is not None:
         return known
-    if zenoh_encoding in _NO_ENCODINGS:
+    if zenoh_encoding in ("", "zenoh/bytes"):
         return RAW
     media_type, _, name = zenoh_encoding.partition(";")
     encoding = _ENCODINGS.get(media_type, media_type)

@@ -98,7 +98,6 @@ _M_co = TypeVar("_M_co", bound=SignedMessage, covariant=True)
 
 _PREFIX: Final = b"\x19Ethereum Signed Message:\n32"
 _HIGHEST_S: Final = (ORDER // 2).to_bytes(32, "big")
-_V_OFFSET: Final = 27
 _RECOVERY_IDS: Final = {27: 0, 28: 1}
 _CACHED: Final = 8192
 LONGEST_DETAIL: Final = 500
@@ -153,7 +152,7 @@ class Signer:
         if len(digest) != 32:
             raise InputError(f"a message hash has 32 bytes, not {len(digest)}")
         signature = sign_recoverable(keccak256(_PREFIX + digest), self.__key)
-        return signature[:64] + bytes((signature[64] + _V_OFFSET,))
+        return signature[:64] + bytes((signature[64] + 27,))
 
 
 def recover(digest: bytes, signature: str | bytes) -> str:

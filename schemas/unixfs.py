@@ -31,7 +31,6 @@ _LINK_HASH, _LINK_NAME, _LINK_TREE_SIZE = 1, 2, 3
 _UNIXFS_TYPE, _UNIXFS_DATA, _UNIXFS_FILE_SIZE, _UNIXFS_BLOCK_SIZE = 1, 2, 3, 4
 
 _VARINT, _BYTES = 0, 2
-_MAX_NUMBER: Final = 2**64 - 1
 
 
 class UnixfsBlock(Struct, frozen=True, gc=False):
@@ -292,6 +291,6 @@ def _read_varint(data: bytes, position: int) -> tuple[int, int]:
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
             break
-    if byte >= 0x80 or value > _MAX_NUMBER:
+    if byte >= 0x80 or value >= 2**64:
         raise InputError("a protobuf number has more than 64 bits")
     return value, position

@@ -37,7 +37,6 @@ CANCELED: Final = 5
 ABORTED: Final = 6
 STATUS: Final = {SUCCEEDED: "succeeded", CANCELED: "cancelled", ABORTED: "aborted"}
 CANCEL_GOAL: Final = "action_msgs/srv/CancelGoal"
-STATUS_ARRAY: Final = "action_msgs/msg/GoalStatusArray"
 UNKNOWN_GOAL: Final = 2
 GOAL_TERMINATED: Final = 3
 """What a server says about a goal that can't be cancelled."""
@@ -168,7 +167,7 @@ class RosActionServer:
         self._handler = handler
         self._goals: dict[bytes, RosGoal] = {}
         below = f"{name}{ACTION}"
-        self._status = RosPublisher(node, f"{below}status", STATUS_ARRAY, LATCHED)
+        self._status = RosPublisher(node, f"{below}status", "action_msgs/msg/GoalStatusArray", LATCHED)
         self._feedback = RosPublisher(node, f"{below}feedback", f"{type_name}_FeedbackMessage", DEFAULT_QOS)
         self._servers = [
             RosServer(node, f"{below}cancel_goal", CANCEL_GOAL, self._cancel, limit=REQUESTS),

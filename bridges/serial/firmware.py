@@ -133,7 +133,6 @@ def _library_of(header: str, libraries: Sequence[ArduinoLibrary]) -> ArduinoLibr
 
 CORE: Final = Path("/usr/share/arduino/hardware/arduino/avr")
 CORE_INCLUDES: Final = (CORE / "cores/arduino", CORE / "variants/standard")
-AVR_HEADERS: Final = Path("/usr/lib/avr/include")
 SKETCHES: Final = (".ino", ".pde")
 """How the files of a sketch end; the second one is that of the IDE before 1.0."""
 FLAGS: Final = (
@@ -171,7 +170,7 @@ def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), d
     includes = [*CORE_INCLUDES, sketch]
     own = source_files([*sketch.iterdir(), *(sketch / "src").rglob("*")])
     available = libraries_in([*libraries, CORE / "libraries"])
-    used = used_libraries([*written, *own], available, folders=[*includes, AVR_HEADERS])
+    used = used_libraries([*written, *own], available, folders=[*includes, Path("/usr/lib/avr/include")])
     includes += [folder for library in used for folder in library.includes]
     macros = [f"-D{define}" for define in defines]
     core = compiled_core(macros)

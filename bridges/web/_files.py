@@ -50,7 +50,6 @@ _MAGIC: Final = (
     (b"GIF89a", "image/gif"),
     (b"BM", "image/bmp"),
 )
-_COMPRESSED_IMAGE: Final = "sensor_msgs/CompressedImage"
 
 
 def summary_of(path: Path, cid: str) -> dict[str, Any]:
@@ -169,7 +168,7 @@ def _how_shown(message: Played) -> str:
 def _image(message: Played) -> tuple[bytes, str] | None:
     """The image in a message: its payload, or that of a ROS 1 compressed image. Never SVG, which may hold scripts."""
     data = message.payload
-    if message.type.encoding == "ros1" and message.type.schema_name == _COMPRESSED_IMAGE:
+    if message.type.encoding == "ros1" and message.type.schema_name == "sensor_msgs/CompressedImage":
         data = _third_field(data)
     elif message.type.encoding in ("json", "ros1", "cdr", "protobuf"):
         return None

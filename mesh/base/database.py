@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 DISK_ERRORS: Final = (OSError, sqlite3.Error)
 """What the methods of a `SyncedDatabase` raise when the disk refuses, or the file is no database."""
-WAIT: Final = 2.0
 
 
 class SyncedDatabase:
@@ -31,7 +30,7 @@ class SyncedDatabase:
     has written may not be on the disk yet: `sync` before you act on it.
     """
 
-    def __init__(self, path: Path | None, schema: str, *, patience: float = WAIT) -> None:
+    def __init__(self, path: Path | None, schema: str, *, patience: float = 2.0) -> None:
         self.path = path
         self.written = self.synced = self.foreign = 0
         """The number of the last write, of the last one that no power failure takes back, and of the last of another

@@ -30,7 +30,6 @@ CHECKS: Final = 0.5
 """Seconds between two looks at who is late."""
 STALLED: Final = 30.0
 """Seconds in which a client must take something of what it is sent, or its connection ends (on Linux)."""
-BACKLOG: Final = 256
 BREATH: Final = 0.2
 """Seconds until connections are accepted again when the process has no descriptor left."""
 
@@ -111,7 +110,7 @@ class HttpServer(Lifecycle):
                 if family == socket.AF_INET6:
                     one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
                 one.bind((address[0], self.port, *address[2:]))
-                one.listen(BACKLOG)
+                one.listen(256)
                 self.port = one.getsockname()[1]
         except (OSError, OverflowError, UnicodeError) as error:
             for one in listening:

@@ -9,9 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
-from typing import Any, Final, NamedTuple
-
-_METADATA: Final = (".dist-info", ".egg-info")
+from typing import Any, NamedTuple
 
 
 class EntryPoint(NamedTuple):
@@ -32,7 +30,7 @@ def entry_points(group: str) -> dict[str, EntryPoint]:
     found: dict[str, EntryPoint] = {}
     for folder in sys.path:
         try:
-            packages = sorted(name for name in os.listdir(folder or ".") if name.endswith(_METADATA))
+            packages = sorted(name for name in os.listdir(folder or ".") if name.endswith((".dist-info", ".egg-info")))
         except OSError:  # not a folder, or not readable
             continue
         for package in packages:

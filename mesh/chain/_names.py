@@ -27,7 +27,6 @@ PUBLIC_REGISTRY: Final = "0x00000000000C2E074eC69A0dFb2997BA6C7d2e1e"
 DEVELOPMENT_REGISTRY: Final = "0x5FbDB2315678afecb367f032d93F642f64180aa3"
 """Where `deploy` puts the registry when the first account of a development chain deploys first."""
 
-ROOT_PARENT: Final = ".robonomics.eth"
 GENERATIONS: Final = (3, 5)
 MULTIHASH_ABI: Final = (
     {
@@ -57,7 +56,7 @@ def namehash(name: str) -> bytes:
 
 def root_of(name: str) -> str:
     """The name whose resolver knows `name`: `3.robonomics.eth` for all below it, elsewhere the name itself."""
-    return ".".join(name.split(".")[-3:]) if name.endswith(ROOT_PARENT) else name
+    return ".".join(name.split(".")[-3:]) if name.endswith(".robonomics.eth") else name
 
 
 class Names:

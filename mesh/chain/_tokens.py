@@ -281,8 +281,6 @@ def _sum(orders: Iterable[Mapping[str, int]], token: str) -> int:
 LONGEST_LABEL: Final = 64
 """Characters of a token's name or symbol that are shown; anybody can deploy a token with any name."""
 
-MAX_DECIMALS: Final = 255
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Token:
@@ -405,4 +403,4 @@ def _label(answer: bytes) -> str:
 
 def _decimals(answer: bytes) -> int:
     value = int.from_bytes(answer, "big") if len(answer) == 32 else 0
-    return value if value <= MAX_DECIMALS else 0
+    return value if value <= 255 else 0

@@ -38,7 +38,6 @@ MAX_LOGS: Final = 50_000
 """Logs in one answer."""
 NO_TRANSACTIONS: Final = bytes.fromhex("56e81f171bcc55a6ff8345e692c0f86e5b48e01b996cadc001622fb5e363b421")
 """The root of an empty trie: a block without transactions has it."""
-BLOOM_BITS: Final = 2_048
 LONGEST_TEXT: Final = 1_000
 """Characters of a text, such as an error message, that are kept."""
 REVERTED: Final = 3
@@ -305,7 +304,7 @@ def liability_record(address: str, held: Mapping[str, Any]) -> Liability:
 def _bloom_bits(member: bytes) -> int:
     """The bits of an address or topic in a block's Bloom filter: three, each by eleven bits of its hash."""
     digest = keccak256(member)
-    return sum(1 << place for place in {int.from_bytes(digest[at : at + 2], "big") % BLOOM_BITS for at in (0, 2, 4)})
+    return sum(1 << place for place in {int.from_bytes(digest[at : at + 2], "big") % 2_048 for at in (0, 2, 4)})
 
 
 def _failure(error: object) -> RpcFailure:

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from mesh.chain.metrics import NodeMetrics
 
 
-UNAVAILABLE: Final = 503
 PIECE: Final = 1 << 16
 """Bytes that are read of an answer at a time."""
 
@@ -81,7 +80,7 @@ class HttpTransport(_Transport):
             body = await _read(response)
             # Some nodes answer errors with HTTP 4xx or 5xx and a JSON-RPC error in the body.
             wait = _retry_after(response.headers.get("Retry-After", ""))
-            if response.status == TOO_MANY or (wait and response.status == UNAVAILABLE):
+            if response.status == TOO_MANY or (wait and response.status == 503):
                 why = f"HTTP {response.status} {response.reason or ''}".strip()
                 raise OverQuota(why, wait=max(wait, _wait_in(body)))
             if not response.ok and not body.lstrip().startswith(b"{"):
@@ -262,7 +261,6 @@ Endpoint: TypeAlias = "str | Transport | Sequence[str | Transport]"
 
 SEND: Final = "eth_sendRawTransaction"
 CHAIN_ID: Final = "eth_chainId"
-NEW_HEADS: Final = "newHeads"
 SHORTEST_KEY: Final = 8
 """Characters of a part of a node's URL that may be a key; shorter ones are words such as `v3`."""
 TRANSIENT_STATUS: Final = frozenset({500, 502, 503, 504})
@@ -385,7 +383,7 @@ class RpcClient:
         if upstream is not self._upstreams[0] or self._on_head is None:
             return
         try:
-            head = None if pushed is None else decode_answer(NEW_HEADS, {"result": pushed}, BlockHeader)
+            head = None if pushed is None else decode_answer("newHeads", {"result": pushed}, BlockHeader)
         except SpoiledAnswer as error:
             log.debug("%s: %s", upstream.endpoint, error)
         else:

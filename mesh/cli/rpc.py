@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 
-ETH_BALANCES: Final = frozenset({"eth/eth_balance", "eth/account_eth_balance"})
 BOOLEANS: Final = {"true": True, "yes": True, "false": False, "no": False}
 TYPES: Final[Mapping[Any, str]] = {
     UInt256: "a whole number, in the smallest unit",
@@ -87,7 +86,7 @@ async def command(
     if isinstance(reply, LogsRead):
         for event in reply.entries:
             print_line(human_line(event))
-    elif service in ETH_BALANCES and isinstance(reply, Balance):
+    elif service in ("eth/eth_balance", "eth/account_eth_balance") and isinstance(reply, Balance):
         print_facts({"balance": ETH.show(reply.balance)})  # only the agent knows the unit of its token
     else:
         print_facts(_describe(reply) or {service: "done"})

@@ -74,7 +74,6 @@ if TYPE_CHECKING:
     from mesh.content.files import Progress, Readable
 
 
-_BUSY_SECONDS: Final = 60.0
 _BATCH: Final = 128
 """Blocks added in one transaction: 32 MiB of a file, so that a file of any size takes constant memory."""
 _SCHEMA: Final = """
@@ -107,7 +106,7 @@ class BlockIndex:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = threading.Lock()
-        self._database = SyncedDatabase(path, _SCHEMA, patience=_BUSY_SECONDS)
+        self._database = SyncedDatabase(path, _SCHEMA, patience=60.0)
         self._database.open()
 
     def close(self) -> None:

@@ -24,7 +24,6 @@ MAX_REQUESTS: Final = 1_000
 """Requests in progress at once."""
 HISTORY: Final = 26
 """Seconds before its start at which a chain with a market begins: the blocks of its deployment, made in an instant."""
-RUN_THREADS: Final = 2
 RUN_SECONDS: Final = 5.0
 """What a call, an estimate or a transaction may compute, as in geth."""
 MAX_LOGS: Final = 10_000
@@ -76,7 +75,7 @@ class EmbeddedChain:
         return self._funded_keys
 
     async def __aenter__(self) -> Self:
-        for does, most in (("changes", 1), ("reads", 1), ("runs", RUN_THREADS)):
+        for does, most in (("changes", 1), ("reads", 1), ("runs", 2)):
             self._threads[does] = ThreadPoolExecutor(most, thread_name_prefix=f"aira-embedded-chain-{does}")
         await self._in_thread("changes", self._start)
         if self._block_time is not None:

@@ -151,8 +151,6 @@ class BoundedVM(PragueVM):
 MNEMONIC: Final = "test test test test test test test test test test test junk"
 """The phrase that development chains share (anvil, hardhat): its keys are public, and worth nothing elsewhere."""
 
-DERIVATION_PATH: Final = "m/44'/60'/0'/0"
-FUNDED_KEYS: Final = 10
 FUNDS_WEI: Final = 1_000_000 * 10**18
 MAX_MINED_BLOCKS: Final = 1_000
 """Empty blocks that one request may mine."""
@@ -206,8 +204,8 @@ class Evm(MinedBlocks):
         self._backend = PyEVMBackend.from_mnemonic(
             MNEMONIC,
             genesis_state_overrides={"balance": FUNDS_WEI},
-            num_accounts=FUNDED_KEYS,
-            hd_path=DERIVATION_PATH,
+            num_accounts=10,
+            hd_path="m/44'/60'/0'/0",
             genesis_parameters=PyEVMBackend.generate_genesis_params(
                 {"gas_limit": GAS_LIMIT, "timestamp": int(time.time()) - history}
             ),

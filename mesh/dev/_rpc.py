@@ -47,7 +47,6 @@ LIMIT_EXCEEDED: Final = -32005
 
 MAX_BATCH: Final = 1_000
 """Requests in a batch."""
-MAX_QUANTITY: Final = 2**256 - 1
 MAX_RESPONSE_BYTES: Final = 25_000_000
 """The answers to a batch; the requests that come after are refused."""
 INLINE_BYTES: Final = 50_000
@@ -87,7 +86,7 @@ def parse_quantity(value: object) -> int:
     elif isinstance(value, str) and value.startswith("0x"):
         with suppress(ValueError):
             number = int(value, 16)
-    if 0 <= number <= MAX_QUANTITY:
+    if 0 <= number < 2**256:
         return number
     raise RpcError(INVALID_PARAMS, f"{str(value)[:80]!r} is not a quantity (0x…)")
 

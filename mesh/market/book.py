@@ -166,7 +166,7 @@ class OrderRecord:
     @property
     def verified(self) -> Verified[Any]:
         """The message as it arrived."""
-        return Verified(self.message, self.identity[:HASH_SIZE], self.signer)
+        return Verified(self.message, self.identity[:32], self.signer)
 
     def move(self, state: OrderStage) -> None:
         """Enter another state."""
@@ -243,9 +243,6 @@ class Added:
 
     order: Verified[Order]
     evicted: tuple[Verified[Order], ...] = ()
-
-
-HASH_SIZE: Final = 32
 
 
 def order_id(order: Verified[Any]) -> bytes:

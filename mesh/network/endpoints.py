@@ -39,7 +39,6 @@ LOCATOR: Final = re.compile(
 """The endpoints that Zenoh connects to. It reports no error for others; it never connects to them."""
 TLS_PREFIXES: Final = ("tls/", "quic/")
 """Prefixes of locators on which both sides show certificates."""
-HIGHEST_PORT: Final = 65_535
 
 
 SEND_WAIT: Final = 0.02
@@ -179,7 +178,7 @@ def check_locators(*locators: str) -> None:
     """Raise `ConfigurationError` for a locator that Zenoh would silently ignore."""
     for locator in locators:
         parts = LOCATOR.fullmatch(locator)
-        if parts is None or int(parts["port"] or 0) > HIGHEST_PORT:
+        if parts is None or int(parts["port"] or 0) > 65_535:
             raise ConfigurationError(
                 f"{locator!r} is not a Zenoh endpoint",
                 hint="write it as tcp/HOST:PORT, for instance tcp/127.0.0.1:7447",

@@ -175,7 +175,6 @@ RecordingFormat = Literal["mcap", "bag", "rosbag2-mcap", "rosbag2-sqlite3"]
 _VERSION: Final = 9
 """Of rosbag2's metadata: that of ROS 2 Jazzy."""
 _SUFFIXES: Final = {"MCAP": "mcap", "SQLITE3": "db3"}
-_LONGEST_QOS: Final = 64 << 10
 METADATA: Final = "metadata.yaml"
 """The file that makes a folder a recording of rosbag2."""
 
@@ -394,7 +393,7 @@ def _qos(channel: RecordingChannel) -> Any:
         return LATCH
     text = channel.metadata.get("offered_qos_profiles", "")
     try:
-        return parse_qos(text) if 0 < len(text) <= _LONGEST_QOS else ()
+        return parse_qos(text) if 0 < len(text) <= 64 << 10 else ()
     except Exception:  # of a stranger's text
         return ()
 

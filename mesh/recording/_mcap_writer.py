@@ -35,7 +35,6 @@ ROS2: Final = "ros2"
 """The profile without which readers of rosbag2 refuse a file."""
 MAX_TIME: Final = (1 << 64) - 1
 
-LIBRARY: Final = "aira-mesh"
 
 _PREFIX: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
@@ -304,7 +303,7 @@ def _check_text(text: str) -> None:
 
 def _header_of(profile: str, *, room: int = 0) -> bytes:
     """The header record, with room for a profile of so many characters: readers skip what follows its fields."""
-    header = _bytes_of(records.Header(profile, LIBRARY)) + bytes(max(room - len(profile), 0))
+    header = _bytes_of(records.Header(profile, "aira-mesh")) + bytes(max(room - len(profile), 0))
     return _PREFIX.pack(Opcode.HEADER, len(header) - _PREFIX.size) + header[_PREFIX.size :]
 
 

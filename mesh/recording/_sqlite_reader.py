@@ -124,7 +124,6 @@ _SQL: Final = 16 << 10
 """Bytes of the longest definition of a table."""
 _RUN: Final = 1 << 20
 """Bytes of messages that are read as one block."""
-_RUN_ROWS: Final = 4096
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 _SCHEMA_ENCODINGS: Final = ("ros2msg", "ros2idl")
 _ALL: Final = "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED"
@@ -268,7 +267,7 @@ def _runs(rows: Iterator[Any]) -> Iterator[list[RecordedMessage]]:
             raise CorruptRecording("its rows are out of order")
         if data.startswith(ZSTD_MAGIC):
             raise NotARecording("its messages are compressed one by one; convert it first: ros2 bag convert")
-        if run and (size + len(data) > _RUN or len(run) >= _RUN_ROWS):
+        if run and (size + len(data) > _RUN or len(run) >= 4096):
             yield run
             run, size = [], 0
         run.append(RecordedMessage(topic, row, time, time, data))

@@ -43,7 +43,6 @@ MAX_TRACEBACK: Final = 12_000
 MAX_EVENT: Final = 40_000
 """Bytes of an encoded event. A larger one (with many escapes) has its texts cut to `MAX_SHORT_TEXT`."""
 MAX_SHORT_TEXT: Final = 1_000
-MAX_FACTS: Final = 16
 MARGIN: Final = "    | "
 """Before each line of a traceback. It may quote untrusted text, which must not pass for an event."""
 FIELDS: Final = frozenset(LogEvent.__struct_fields__)
@@ -61,7 +60,7 @@ def event_of(record: logging.LogRecord, *, default: LogSource = context.UNKNOWN_
         source = default
     error = record.exc_info[1] if record.exc_info else None
     found: dict[str, str] = getattr(record, "facts", {})
-    facts = {name: _cut(_encodable(value), MAX_SHORT_TEXT) for name, value in list(found.items())[:MAX_FACTS]}
+    facts = {name: _cut(_encodable(value), MAX_SHORT_TEXT) for name, value in list(found.items())[:16]}
     raised = "" if error is None else f"{type(error).__name__}: {error}".removesuffix(": ")
     event = LogEvent(
         time=timestamp(record.created),

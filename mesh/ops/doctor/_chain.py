@@ -198,7 +198,6 @@ def is_stalled(client: str, *, number: int, age: float) -> bool:
     return age > RECENT and number > 0 and not client.lower().startswith(DEVELOPMENT)
 
 
-READ_BY_OTHERS: Final = stat.S_IRGRP | stat.S_IROTH
 SECRETS: Final = tuple(map(Path, ("/run/secrets", "/run/credentials", "/secrets")))
 """Folders in which containers and systemd units get secrets; no other user can read them."""
 SEARCHED: Final = 10_000
@@ -407,4 +406,4 @@ def _last_digit(coin: Unit) -> int:
 def _is_read_by_others(path: Path) -> bool:
     if os.name != "posix" or any(map(path.is_relative_to, SECRETS)):
         return False
-    return bool(path.stat().st_mode & READ_BY_OTHERS)
+    return bool(path.stat().st_mode & (stat.S_IRGRP | stat.S_IROTH))

@@ -61,8 +61,6 @@ if TYPE_CHECKING:
     from mesh.ops.state._inventory import LedgerFacts
 
 
-TRIES: Final = 10
-
 ContentScope: TypeAlias = Literal["needed", "all", "none"]
 """The content files to include: those that are pinned or that unfinished jobs and waiting orders need, all, or none."""
 OpenFile: TypeAlias = "tuple[Path, BinaryIO]"
@@ -148,7 +146,7 @@ class _BackupWriter:
     async def _consistent(self, chain: Path, opened: ExitStack) -> tuple[LedgerFacts, list[OpenFile]]:
         """The contents of a chain's ledger, and its copy and the matching recordings as open files."""
         ledger, copy, later = chain / LEDGER, self._scratch / LEDGER, self._scratch / f"later-{LEDGER}"
-        for _ in range(TRIES):
+        for _ in range(10):
             facts = await _copied(ledger, copy)
             with ExitStack() as stack:
                 files: list[OpenFile] = [(ledger, stack.enter_context(copy.open("rb")))]
