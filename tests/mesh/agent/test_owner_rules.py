@@ -129,7 +129,7 @@ async def test_a_full_queue_takes_the_next_job_when_one_has_ended(place: Place) 
         first = await person.demand([("/go", Empty())])
         await until(lambda: begun == [first.address], seconds=30)
         heard: list[Progress] = []
-        second = asyncio.create_task(person.demand([("/go", Empty())], cost=1, on_progress=heard.append))
+        second = asyncio.create_task(person.demand([("/go", Empty())], cost=1, wait=True, on_progress=heard.append))
         await until(lambda: any(progress.code == "queue-full" for progress in heard), seconds=30)
         released.set()
         assert (await first.outcome()).success
