@@ -388,9 +388,9 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "a match is settled twice",
-        "mesh.market._settlement:Settlement.add",
-        "self._tasks.create_task(self._create(outcome))",
-        "[self._tasks.create_task(self._create(outcome)) for _ in range(2)]",
+        "mesh.market._settlement:Settlement._begin",
+        "self._tasks.create_task(self._create(match))",
+        "[self._tasks.create_task(self._create(match)) for _ in range(2)]",
         "late",
     ),
     Mutation(
