@@ -1,4 +1,4 @@
-"""What the agent's other devices say, in the ROS graph: a board's topics have the names that the board gives them.
+"""What the agent's boards say, in the ROS graph: their topics have the names that the boards give them.
 
 So a node hears a board on `aira edge` as it heard one on rosserial, in a job and outside.
 """
@@ -68,10 +68,11 @@ class RosDevices(Lifecycle):
             tasks.start(self._publish_all(pump), f"devices on {selector}")
 
     def _taken(self, sample: zenoh.Sample) -> tuple[str, bytes, PayloadType] | None:
-        """What a device says. Runs on the pump's thread."""
+        """What a board says; robots of ROS 2 have a graph of their own. Runs on the pump's thread."""
         if sample.kind != zenoh.SampleKind.PUT or not is_said_by_device(sample.attachment):
             return None
-        return str(sample.key_expr), sample.payload.to_bytes(), self._payloads.type_of(sample)
+        kind = self._payloads.type_of(sample)
+        return None if kind.encoding == "cdr" else (str(sample.key_expr), sample.payload.to_bytes(), kind)
 
     async def _publish_all(self, pump: Pump[tuple[str, bytes, PayloadType]]) -> None:
         async for key, payload, kind in pump:

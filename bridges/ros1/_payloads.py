@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from bridges.ros1.messages import Ros1Type
+from mesh.base.flood import BoundedDict
 from mesh.recording.ros import RosConverter
 from schemas import String
 from schemas.errors import InvalidPayload
@@ -16,9 +17,12 @@ if TYPE_CHECKING:
     import zenoh
 
     from bridges.ros1.node import Ros1Node, Ros1Publisher
+    from mesh.recording.ros import RosConversion
 
 MOST_TYPES: Final = 10_000
 """Definitions of topics' types that are remembered."""
+MOST_CONVERSIONS: Final = 256
+"""Types of ROS 2 whose conversions are remembered."""
 
 
 def type_in(header: Mapping[str, str]) -> PayloadType:
@@ -39,6 +43,8 @@ class RosPayloads:
     def __init__(self) -> None:
         self._types: dict[tuple[str, str], PayloadType] = {}
         self._converter = RosConverter(0, "jazzy")
+        self._conversions: BoundedDict[PayloadType, RosConversion] = BoundedDict(MOST_CONVERSIONS)
+        """Of types of ROS 2: to make one takes some 90 ms."""
 
     def type_of(self, sample: zenoh.Sample) -> PayloadType:
         """The type of what arrived, with its definition if that is known. On the thread of a pump."""
@@ -58,8 +64,15 @@ class RosPayloads:
                 raise InvalidPayload(kind.schema_name, "its definition is not known")
             return payload, kind
         if kind.encoding == "cdr":
-            conversion = RosConverter(1, "jazzy").of(kind)
-            return conversion.convert(payload), conversion.type
+            conversion = self._conversions.get(kind)
+            if conversion is None:
+                conversion = self._conversions[kind] = RosConverter(1, "jazzy").of(kind)
+            if conversion.why:
+                raise InvalidPayload(kind.schema_name, conversion.why)
+            try:
+                return conversion.convert(payload), conversion.type
+            except Exception as error:  # whatever rosbags raises for a stranger's payload
+                raise InvalidPayload(kind.schema_name, str(error)) from None
         changed, type = encode_value(decode_value(payload, kind))
         if type not in (JSON, RAW):
             return changed, type

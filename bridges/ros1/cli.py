@@ -155,9 +155,9 @@ async def _serve(settings: Settings, options: Ros1Options) -> None:
             "ROS 1 has no access control: who reaches %s can do what the agent allows", options.ros_ip, extra=facts
         )
     async with AsyncExitStack() as stack:
-        graph = await _graph(options, stack)
-        settings = await settings_with_parameters(graph, settings)
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen if options.agent else ""))
+        graph = await _graph(options, stack, telemetry)
+        settings = await settings_with_parameters(graph, settings)
         parts = await _parts(graph, settings, options, stack, telemetry)
         chosen = RosBridgeOptions(
             name=options.name,
@@ -187,7 +187,7 @@ def _is_loopback(address: str) -> bool:
         raise InputError(f"--ros-ip: {address!r} is no IP address", hint="as in 192.168.0.7") from None
 
 
-async def _graph(options: Ros1Options, stack: AsyncExitStack) -> Ros1Graph:
+async def _graph(options: Ros1Options, stack: AsyncExitStack, telemetry: Telemetry) -> Ros1Graph:
     """The ROS graph, on our master or on another one, for which it waits, as nodes of ROS do."""
     from bridges.ros1._wire import Ros1Error, place_of
     from bridges.ros1.master import RosMaster
@@ -212,6 +212,7 @@ async def _graph(options: Ros1Options, stack: AsyncExitStack) -> Ros1Graph:
         try:
             await graph.call("getUri")
         except Ros1Error as error:
+            telemetry.starting(str(error))
             graph.outage.failed(error, "waiting for a ROS master: start roscore, or the bridge with --master")
             await backoff.wait()
         else:
