@@ -186,6 +186,8 @@ def sensor() -> None:
 
     rospy.Subscriber("/liability/infochan/incoming/demand", Demand, on_demand)
     rospy.wait_for_service("/ipfs/add_file")
+    while not results.get_num_connections():  # what is published before is lost
+        rospy.sleep(0.01)
     say("ready")
     rospy.spin()
 
