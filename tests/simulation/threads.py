@@ -5,6 +5,7 @@ What is above them in the standard library (events, semaphores, executors) is Py
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 import queue
@@ -14,6 +15,7 @@ import sys
 import threading
 import time
 from collections import deque
+from contextlib import nullcontext
 from types import GenericAlias
 from typing import TYPE_CHECKING, Any, Final
 
@@ -246,6 +248,8 @@ def install() -> None:
     queues.time = time.monotonic
     queues.SimpleQueue = SimpleQueue
     number_in_sets(Thread, threading.Event, queue.Queue)
+    stopping: Any = importlib.import_module("mesh.role.local_stop")
+    stopping.listening = lambda *_: nullcontext()  # it waits for a real socket, on which nobody calls here
     os.urandom = lambda size: World.scheduler.random.randbytes(size)
     secrets.token_bytes = lambda size=None: World.scheduler.random.randbytes(32 if size is None else size)  # type: ignore[assignment]
 
