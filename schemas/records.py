@@ -133,3 +133,11 @@ def _read_amount(_kind: type[Any], value: Any) -> UInt256:
 
 
 _ENCODER: Final = msgspec.json.Encoder(enc_hook=lambda amount: str(int(amount)))
+
+
+class DeviceStop(Record, frozen=True, kw_only=True):
+    """What became of a stop at one device. It was `heard` if the device confirmed it; else `detail` says why not."""
+
+    device: str
+    heard: bool
+    detail: str = ""

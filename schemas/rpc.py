@@ -20,6 +20,7 @@ from schemas.errors import InvalidMessage
 from schemas.messages import Demand, Offer, Result
 from schemas.records import (
     MAX_UINT256,
+    DeviceStop,
     Liability,  # msgspec reads the annotations
     Record,
     UInt256,
@@ -245,14 +246,6 @@ class LiabilityRead(Record, frozen=True):
 
     read: bool
     liability: Liability | None = None
-
-
-class DeviceStop(Record, frozen=True, kw_only=True):
-    """What became of a stop at one device. It was `heard` if the device confirmed it; else `detail` says why not."""
-
-    device: str
-    heard: bool
-    detail: str = ""
 
 
 class Stopped(Record, frozen=True):

@@ -75,7 +75,7 @@ from schemas.keys import (
     topic_selector,
 )
 from schemas.payloads import EMPTY, STRING, Empty, PayloadType, String, decode_value, encode_as, payload_type
-from schemas.rpc import DeviceStop
+from schemas.records import DeviceStop
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:

@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from mesh.role.models import Models
     from schemas import Liability, Offer, Record
     from schemas.model import ModelDescription
-    from schemas.rpc import DeviceStop
+    from schemas.records import DeviceStop
     from schemas.verdicts import ValidatorReport
 
 

@@ -72,8 +72,7 @@ from schemas.keys import (
     topic_selector,
 )
 from schemas.payloads import JSON, STRING, PayloadType, String, defined_by, payload_type
-from schemas.records import PlaybackPosition
-from schemas.rpc import DeviceStop
+from schemas.records import DeviceStop, PlaybackPosition
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Sequence

@@ -52,7 +52,7 @@ async def test_no_offer_is_made_for_an_objective_that_can_not_be_played(
     caplog.set_level(logging.WARNING)
     robot = going(offering(place.agent("robot")))
     async with place.at_work(robot) as person:
-        unfit = asyncio.create_task(person.demand(place.save(objective(("/fly", Empty())), "unfit.mcap")))
+        unfit = asyncio.create_task(person.demand(place.save(objective(("/fly", Empty())), "unfit.mcap"), wait=True))
         await until(lambda: refused_offers(caplog), seconds=30)
         assert {error.reason for error in refused_offers(caplog)} == {"unknown-topic"}
         assert "/fly" in str(refused_offers(caplog)[0])
@@ -75,7 +75,7 @@ async def test_no_offer_is_made_for_a_message_that_its_handler_can_not_take(
 
     async with place.at_work(robot) as person:
         said = objective(("/go", Speed(1.0)), ("/go", {"metres_per_second": "fast"}))
-        unfit = asyncio.create_task(person.demand(place.save(said, "unfit.mcap")))
+        unfit = asyncio.create_task(person.demand(place.save(said, "unfit.mcap"), wait=True))
         await until(lambda: refused_offers(caplog), seconds=30)
         assert {error.reason for error in refused_offers(caplog)} == {"unfit-message"}
         assert "not a Speed" in str(refused_offers(caplog)[0])

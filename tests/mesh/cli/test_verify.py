@@ -204,8 +204,8 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
                 await asyncio.to_thread(wait_until_declared, endpoint, "any/key")
                 await play_again(source=liability, of_objective=False, to=None)
                 robots = f"aira/agent/{load_account(robot).address.lower()}/liability/{liability.lower()}"
-                keys = sorted(await asyncio.to_thread(listener.keys, 4))
-                assert keys == [f"{robots}/objective/go"] * 2 + [f"{robots}/topic/gone"] * 2
+                keys = await asyncio.to_thread(listener.keys, 4)
+                assert sorted(keys)[:4] == [f"{robots}/objective/go"] * 2 + [f"{robots}/topic/gone"] * 2
                 await play_again(source=liability, of_objective=True, to="lab/stage")
                 assert (await asyncio.to_thread(listener.keys, 6))[4:] == ["lab/stage/go"] * 2
             capsys.readouterr()
