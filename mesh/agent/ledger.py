@@ -98,6 +98,7 @@ CREATE TABLE IF NOT EXISTS outbox (
     kind TEXT NOT NULL,
     payload BLOB NOT NULL,
     deadline INTEGER,
+    robot TEXT NOT NULL,
     posted REAL NOT NULL,
     withdrawn INTEGER NOT NULL DEFAULT 0,
     tx TEXT NOT NULL DEFAULT ''
@@ -107,24 +108,17 @@ CREATE TABLE IF NOT EXISTS spent (
     kind TEXT NOT NULL,
     payload BLOB NOT NULL,
     deadline INTEGER,
+    robot TEXT NOT NULL,
     posted REAL NOT NULL,
     withdrawn INTEGER NOT NULL,
     liability TEXT NOT NULL
 );
-CREATE TABLE IF NOT EXISTS alone (
-    identity TEXT PRIMARY KEY,
-    robot TEXT NOT NULL
-);
 """
 """A withdrawn order is not sent, but may become a contract all the same, unless the transaction `tx` prevents that. The
-orders that became contracts are in `spent`; those that are for one robot alone have it in `alone`."""
-COLUMNS: Final = "identity, kind, payload, deadline, posted, withdrawn"
-POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
-ALONE: Final = "INSERT OR IGNORE INTO alone (identity, robot) SELECT ?, ? WHERE ? != ''"
-ROBOT: Final = "COALESCE((SELECT robot FROM alone WHERE alone.identity = {0}.identity), '')"
-FORGET_ALONE: Final = (
-    "DELETE FROM alone WHERE identity NOT IN (SELECT identity FROM outbox UNION SELECT identity FROM spent)"
-)
+orders that became contracts are in `spent`; `robot` is empty in those that are for any."""
+OUTGOING: Final = "identity, kind, payload, deadline, robot"
+COLUMNS: Final = f"{OUTGOING}, posted, withdrawn"
+POST: Final = f"INSERT OR IGNORE INTO outbox ({OUTGOING}, posted) VALUES (?, ?, ?, ?, ?, ?)"
 
 
 class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -275,7 +269,7 @@ class Ledger(RoleLedger):
 
     async def post(self, outgoing: Outgoing) -> None:
         """Keep a signed message for sending, until `settle`."""
-        await self._database.run_together((POST, _posted(outgoing)), _alone(outgoing))
+        await self._database.run(POST, _posted(outgoing))
 
     async def settle(self, identity: str) -> bool:
         """Remove a message whose effect was seen. False if it was not in the outbox."""
@@ -294,8 +288,8 @@ class Ledger(RoleLedger):
 
     async def spent(self, liability: str) -> list[Outgoing]:
         """The orders that became the contract at this address, withdrawn ones included."""
-        statement = f"SELECT identity, kind, payload, deadline, {ROBOT.format('spent')} FROM spent WHERE liability = ?"
-        return [Outgoing(*row) for row in await self._database.rows(statement, (liability,))]
+        rows = await self._database.rows(f"SELECT {OUTGOING} FROM spent WHERE liability = ?", (liability,))
+        return [Outgoing(*row) for row in rows]
 
     async def contracts(self, kind: str) -> list[tuple[bytes, str]]:
         """The 64 latest orders of a kind, also withdrawn, that became contracts: payload, contract's address."""
@@ -332,7 +326,7 @@ class Ledger(RoleLedger):
     async def replace(self, identity: str, outgoing: Outgoing) -> None:
         """Keep a message for sending instead of the one called `identity`."""
         remove = ("DELETE FROM outbox WHERE identity = ?", (identity,))
-        await self._database.run_together(remove, (POST, _posted(outgoing)), _alone(outgoing))
+        await self._database.run_together(remove, (POST, _posted(outgoing)))
 
     async def orders(self) -> list[StoredOrder]:
         """The orders that may still become contracts, oldest first, the withdrawn ones behind the others.
@@ -342,8 +336,8 @@ class Ledger(RoleLedger):
         return await self._stored("kind IN ('demand', 'offer') AND tx = '' ORDER BY withdrawn, posted")
 
     async def _stored(self, condition: str, values: tuple[Any, ...] = ()) -> list[StoredOrder]:
-        columns = f"identity, payload, posted, withdrawn, tx, {ROBOT.format('outbox')}"
-        rows = await self._database.rows(f"SELECT {columns} FROM outbox WHERE {condition}", values)
+        statement = f"SELECT identity, payload, posted, withdrawn, tx, robot FROM outbox WHERE {condition}"
+        rows = await self._database.rows(statement, values)
         return [
             StoredOrder(identity, payload, posted, bool(withdrawn), tx, robot)
             for identity, payload, posted, withdrawn, tx, robot in rows
@@ -356,14 +350,10 @@ class Ledger(RoleLedger):
         """
         last = head - self._reorg_depth
         rows = await self._database.rows(
-            f"SELECT identity, kind, payload, deadline, {ROBOT.format('outbox')}, withdrawn FROM outbox"
-            " WHERE NOT withdrawn OR deadline <= ?"
-            " ORDER BY rowid",
-            (last,),
+            f"SELECT {OUTGOING}, withdrawn FROM outbox WHERE NOT withdrawn OR deadline <= ? ORDER BY rowid", (last,)
         )
         if any(row[3] is not None and row[3] <= last for row in rows):
-            expired = ("DELETE FROM outbox WHERE deadline <= ?", (last,))
-            await self._database.run_together(expired, (FORGET_ALONE, ()), sync=False)
+            await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (last,), sync=False)
         return [Outgoing(*row[:5]) for row in rows if not row[5] and (row[3] is None or row[3] > head)]
 
     async def waiting_by_kind(self, *, head: int) -> dict[str, int]:
@@ -386,8 +376,4 @@ def _job(row: Any) -> JobRecord:
 
 
 def _posted(outgoing: Outgoing) -> tuple[Any, ...]:
-    return (*astuple(outgoing)[:4], time.time())
-
-
-def _alone(outgoing: Outgoing) -> tuple[str, tuple[Any, ...]]:
-    return ALONE, (outgoing.identity, outgoing.robot, outgoing.robot)
+    return (*astuple(outgoing), time.time())

@@ -260,7 +260,7 @@ async def test_what_comes_while_the_ledger_is_closed_finds_it_closed(tmp_path: P
     for turns in range(20):
         database = Database(tmp_path / "ledger.db", SCHEMA)
         await database.open()
-        row = ("INSERT OR REPLACE INTO outbox VALUES ('x', '', '', 1, 1, 0, '')", ())
+        row = ("INSERT OR REPLACE INTO outbox VALUES ('x', '', '', 1, '', 1, 0, '')", ())
         calls: list[Coroutine[Any, Any, object]] = [
             database.run(*row),
             database.run_together(row),
