@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec.structs import replace
 
 from mesh.agent.errors import DemandDeclined
+from mesh.agent.orders import DEMAND_TAKEN
 from mesh.base.log_context import log_event
 from mesh.errors import AiraError, RemoteError
 from mesh.network.services import call
@@ -78,7 +79,8 @@ class Hiring:
             providers = [*lighthouse.stakes][:PROVIDERS]
             await asyncio.gather(*(self._send_to(provider, order, demand, offer) for provider in providers))
         except DemandDeclined as error:
-            self._declined(error.declines[0])
+            if (said := error.declines[0]).code != DEMAND_TAKEN:  # else the chain soon shows the contract here, too
+                self._declined(said)
         except AiraError as error:  # it is sent again
             facts = log_event("pair-not-sent", order=order, robot=robot, code=error.code)
             log.warning("the demand %s for %s can't be sent now: %s", order, robot, error, extra=facts)

@@ -22,7 +22,7 @@ from mesh.agent.orders import ALONE, DEMAND_TAKEN, EQUAL_DECLINED, HANDLED_FOR, 
 from mesh.base.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.content import ContentTooLarge, ContentUnavailable
-from mesh.errors import ContentError, InvalidMessage, public_text
+from mesh.errors import AiraError, ContentError, InvalidMessage, public_text
 from mesh.role.database import LedgerUnusable
 from schemas import DeclineKey, Offer, Verified, message_hash
 from schemas.cid import is_cid
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import Handler
     from mesh.agent.trade import Trader
     from mesh.base.flood import Drops
-    from mesh.errors import AiraError
     from mesh.network import Channel, Subscription
     from schemas import Demand, Signer
     from schemas.rpc import AcceptDemand
@@ -347,6 +346,12 @@ class Acceptance:
         if answered.offer is None or not answered.offer.is_open:
             if not self._limiter.allow(demand.signer):
                 return BUSY
+            try:  # before what it would say to another job: it may have this one already
+                await self._trader.require_open(answered)
+            except AiraError as error:
+                if error.code != DEMAND_TAKEN:
+                    raise
+                return Grounds(DEMAND_TAKEN, "it is a contract already, or was withdrawn")
             terms = demand.message
             refused = await self._rules.refusal(demand.signer, cost=terms.cost, token=terms.token)
             if refused is not None:

@@ -22,6 +22,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from mesh.agent.handlers import Job
     from schemas import Verified
     from schemas.rpc import AcceptDemand
 
@@ -217,3 +218,25 @@ async def test_a_person_is_told_when_a_provider_gave_the_job_to_another_robot(pl
             await order.contract()
         assert (caught.value.promisor, caught.value.liability) == (rival.address, made.liability)
         assert (await person.contract(made.liability)).robot == rival.address
+
+
+async def test_a_job_that_its_robot_has_already_is_not_declined(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A person who reads the chain later than the robot sends the order again, also when the robot is full."""
+    released, robot = asyncio.Event(), place.agent("robot", queue_limit=1)
+
+    @robot.on("*")
+    async def go(job: Job, message: Any) -> None:
+        await released.wait()
+
+    async with place.provider(), offering(robot), place.agent("person") as person, asyncio.timeout(60):
+        order = await person.order(job(place), cost=4, robot=robot.address)
+        contract, hiring = await order.contract(), person.runtime.trader.hiring
+        await until(lambda: contract.address in robot.runtime.executor.at_hand)
+        with pytest.raises(DemandDeclined, match="demand-taken"):
+            await hiring._offer_of(order.message, robot.address)
+        declined: list[object] = []
+        monkeypatch.setattr(hiring, "_declined", declined.append)
+        await hiring._send(order.hash, order.message, robot.address)
+        assert declined == []
+        released.set()
+        assert (await contract.outcome()).success
