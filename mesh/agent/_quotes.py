@@ -16,7 +16,7 @@ from mesh.agent.demands import grounds_of
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call_handler
 from mesh.agent.objectives import Buyer
-from mesh.agent.orders import FEWEST_BLOCKS, HANDLED_FOR
+from mesh.agent.orders import FEWEST_BLOCKS, HANDLED_FOR, robot_stopped
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.errors import AiraError, InvalidMessage, public_text
@@ -119,6 +119,8 @@ class Quoting:
         parts = self._parts
         if not self._limiter.allow(request.asker):
             raise Declined("busy", "too many ask")
+        if self._profile.is_stopped():
+            raise robot_stopped()
         if is_cid(self._model) and request.model != self._model:
             raise Declined("other-model", f"it works for the model {self._model}")
         price: int | str | None = self._price or None

@@ -17,7 +17,7 @@ from mesh.agent._quotes import QUOTE_TIMEOUT, asked_quotes
 from mesh.agent.components import working
 from mesh.agent.contracts import nothing
 from mesh.agent.demands import HANDLED
-from mesh.agent.errors import Declined, DemandDeclined, OrderClosed
+from mesh.agent.errors import DemandDeclined, OrderClosed
 from mesh.agent.handlers import (
     ANY_TOPIC,
     DemandHandler,
@@ -43,7 +43,7 @@ from mesh.agent.handlers import (
     repeat,
 )
 from mesh.agent.objectives import ObjectiveUnfit
-from mesh.agent.orders import HANDLED_FOR, ROBOT_STOPPED, OrderState
+from mesh.agent.orders import HANDLED_FOR, OrderState, robot_stopped
 from mesh.agent.statement import period, read_statement
 from mesh.agent.validators import ValidatorSilent, check_named
 from mesh.amounts import XRT
@@ -466,7 +466,7 @@ class Agent(Program):
         """
         trader, fee = self.runtime.trader, XRT.amount(lighthouse_fee)
         if self.runtime.executor.hold.is_held:
-            raise Declined(ROBOT_STOPPED, "the robot was stopped, and takes no job before its owner releases it")
+            raise robot_stopped()
         if demand is None:
             terms = await trader.writer.terms(
                 model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime

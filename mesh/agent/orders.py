@@ -32,7 +32,7 @@ from mesh.agent.contracts import (
     report,
     stated,
 )
-from mesh.agent.errors import OrderClosed, OrderExpired
+from mesh.agent.errors import Declined, OrderClosed, OrderExpired
 from mesh.base.flood import BoundedDict
 from mesh.errors import AiraError, InputError
 from schemas import ZERO_ADDRESS, Demand, Offer, Withdrawal, message_hash
@@ -318,6 +318,13 @@ TOTAL: Final = 2048
 """Open offers that answer demands."""
 ROBOT_STOPPED: Final = "stopped"
 """The reason of a decline while a stopped robot is held."""
+
+
+def robot_stopped() -> Declined:
+    """The refusal of each job while a stopped robot is held."""
+    return Declined(ROBOT_STOPPED, "the robot was stopped, and takes no job before its owner releases it")
+
+
 EQUAL_DECLINED: Final = "equal-declined"
 """Why a demand is declined whose terms are those of an open demand that the agent has declined."""
 
