@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
-import msgspec
 
 from mesh.cli.files import file_or_cid, model_named
 from mesh.cli.options import with_json, with_settings, with_timeout
 from mesh.cli.output import format_duration, print_json, print_line, print_table, printable
 from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
+from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
     from mesh.amounts import Unit
@@ -42,7 +42,7 @@ async def command(settings: Settings, model: str, objective: str, timeout: float
         quotes = await agent.quotes(agent.model, source, timeout=timeout)
         names = {quote.agent: agent.parts.robots.name(quote.agent) for quote in quotes}
     if as_json:
-        print_json({"quotes": [msgspec.to_builtins(quote) | {"name": names[quote.agent]} for quote in quotes]})
+        print_json({"quotes": [decode_json(quote.encode()) | {"name": names[quote.agent]} for quote in quotes]})
     elif quotes:
         rows = [(names[quote.agent], quote.agent, *_shown(quote, unit)) for quote in quotes]
         print_table(("name", "address", "cost", "begins", "takes"), rows)
