@@ -231,6 +231,7 @@ async def test_a_job_that_its_robot_has_already_is_not_declined(place: Place, mo
     async with place.provider(), offering(robot), place.agent("person") as person, asyncio.timeout(60):
         order = await person.order(job(place), cost=4, robot=robot.address)
         contract, hiring = await order.contract(), person.runtime.trader.hiring
+        assert isinstance(order.message, Demand)
         await until(lambda: contract.address in robot.runtime.executor.at_hand)
         with pytest.raises(DemandDeclined, match="demand-taken"):
             await hiring._offer_of(order.message, robot.address)
