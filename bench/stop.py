@@ -84,7 +84,8 @@ def measured(folder: Path, *, stops: int, rate: int) -> dict[str, dict[str, floa
         edge(board.port, endpoint, address),
         process(serve_robot, endpoint, str(folder), robot),
     ):
-        assert here.recv() == "ready"
+        robot.close()  # the process has its own: when it ends, `here` ends
+        expect(here, "ready")
         measure = partial(stop_jobs, endpoint, here, address, falls, fell, stops)
         results = {"alone": asyncio.run(measure())}
         with process(put_noise, endpoint, address, rate):
@@ -101,7 +102,7 @@ async def stop_jobs(
         for _ in range(stops):
             liability = made_up(customer.address, promisor)
             await asyncio.to_thread(robot.send, liability.encode())
-            assert await asyncio.to_thread(robot.recv) == "moving"
+            await asyncio.to_thread(expect, robot, "moving")
             fell.clear()
             began = time.perf_counter()
             stopped = await request_stop(network.session, customer, liability, "bench")
@@ -110,7 +111,9 @@ async def stop_jobs(
                 took.append((falls[-1] - began) * 1000)
             else:
                 unheard += 1
-            assert await asyncio.to_thread(robot.recv) == "ended"
+            await asyncio.to_thread(expect, robot, "ended")
+    if not took:
+        raise AiraError(f"none of {stops} stops reached the pin", code="bench-failed")
     took.sort()
     return {
         "stops": stops,
@@ -119,6 +122,16 @@ async def stop_jobs(
         "most_ms": round(took[-1], 1),
         "unheard": unheard,
     }
+
+
+def expect(robot: Connection, word: str) -> None:
+    """Wait until the robot's process says a word. Raises `AiraError` if it does not, or has ended."""
+    try:
+        said = robot.recv() if robot.poll(TIMEOUT) else f"nothing for {TIMEOUT:g} s"
+    except EOFError:
+        said = "nothing any more, it has ended"
+    if said != word:
+        raise AiraError(f"the robot's process should say {word!r}, but said {said}", code="bench-failed")
 
 
 def made_up(promisee: str, promisor: str) -> Liability:
