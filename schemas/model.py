@@ -366,8 +366,8 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
     `objective` are the topics that an objective plays, and no others, unless `other_topics`. `result` are those of the
     recording that comes back; a success has at least one message on each required one, and is what `success` says.
     `price` is typical (`5 XRT`; `units` is the smallest unit of another token), as are the `seconds` that a job takes.
-    `on_stop` says what becomes of the cost when a job that has begun is stopped: the customer gets it back (`refund`),
-    or the robot keeps it (`paid`).
+    `on_stop` says what becomes of the cost when the customer stops a job that has begun: it comes back (`refund`), or
+    the robot keeps it (`paid`).
     """
 
     title: Annotated[str, Meta(min_length=1, max_length=80)]

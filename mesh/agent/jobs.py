@@ -705,6 +705,8 @@ class Executor:
                 telling = telling or self._halt(address, why)  # it has just begun
                 self._task_group().create_task(self._end_stopped(address), name=f"stop {address}")
         devices = () if telling is None else await telling
+        if stopped is not None and telling is None:  # nothing heard it that had not heard it
+            return devices
         unheard = ", ".join(f"{one.device}: {one.detail}" for one in devices if not one.heard)
         facts = log_event("job-stopped", by=by, unheard=unheard)
         log.warning("stopped by %s: %s%s", by, why, f"; not heard by {unheard}" if unheard else "", extra=facts)
@@ -769,8 +771,8 @@ class Executor:
 
         With success it first waits until devices have answered their commands (`JobRun.settle`). `note` says why the
         job failed, in the recording and the ledger. A job whose recording lacks what was played ends without
-        success. That of a stopped job is what the model's description says of stops. Raises `WrongPhase` if the job
-        has ended already.
+        success. That of a job that its customer stopped is what the model's description says. Raises `WrongPhase` if
+        the job has ended already.
         """
         if success and (run := self.runs.get(address)) is not None:
             await run.settle()
@@ -778,7 +780,8 @@ class Executor:
             job = await self._job(address, asked="finish")
             advance(address, job.phase, Phase.COMPLETE)
             if (stop := await self._ledger.stopped(address)) is not None:
-                success = self._is_paid_when_stopped and job.phase is Phase.RUNNING
+                is_customers = stop.by == job.liability.promisee  # who stops its own work is not paid for it
+                success = self._is_paid_when_stopped and is_customers and job.phase is Phase.RUNNING
                 note = note_of_stop(stop, job.liability)
             ended = await self._stop(address) or await self.create_run(job)
             summary = await ended.close(note, sync=False)  # its copy in the store is synced
