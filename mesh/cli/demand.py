@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from mesh import AnnouncedValidator
     from mesh.agent.agent import Agent
-    from mesh.agent.contracts import Contract, Progress
+    from mesh.agent.contracts import Contract, Outcome, Progress
     from mesh.agent.trade import Order
     from mesh.agent.validators import ValidatorDirectory
     from mesh.amounts import Unit
@@ -142,6 +142,8 @@ class JobPrinter:
         self.as_json = as_json
         self.awaited = "the payment"
         """What follows the robot's result."""
+        self.stop_cost = ""
+        """What becomes of the cost if the job is stopped; empty if it is not known."""
         self._bar = ExitStack()
         self._move: Callable[[int, int | None], None] | None = None
         self._percent = -STEP
@@ -546,6 +548,7 @@ async def demand(
             fee = await agreed_fee(agent, cid, fee, confirmed=confirmed, as_json=as_json, **terms)
             terms["validator_fee"] = fee
             printer.awaited = "the validator" if terms["validator"] else printer.awaited
+            await _say_what_a_stop_costs(agent, printer)
             order = await take_existing(agent, cid, existing, quiet=as_json, **terms)
             if order is None:
                 await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
@@ -582,7 +585,6 @@ async def _post(agent: Agent, cid: str, checked: Objective | None, printer: JobP
         size = f"{plural(objective.count, 'message')}, {format_duration(objective.duration_ns)}"
         facts = {"objective": cid, "messages": objective.count, "seconds": objective.duration_ns / 1e9}
         printer.line(f"objective {cid}: {size}", kind="objective", **facts)
-    await _say_what_a_stop_costs(agent, printer)
     order = await agent.order(cid, **terms)
     until = f"valid until block {order.deadline:,}"
     printer.line(f"posted {order.hash}, {until}", kind="posted", order=order.hash, deadline=order.deadline)
@@ -671,16 +673,11 @@ async def _stays(agent: Agent, order: Order) -> str:
 
 async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, out: Path | None) -> None:
     """Wait for the end, keep the recording, and print both. Then raises what failed."""
+    waiting = asyncio.create_task(contract.outcome(on_progress=printer), name=f"end of {contract.address}")
     try:
-        outcome = await contract.outcome(on_progress=printer)
-    except asyncio.CancelledError:
-        printer.close()
-        goes_on = f"the contract goes on; `aira liability watch {contract.address}` waits for its end"
-        click.echo(f"{goes_on}, `aira liability show` says from when the cost can be refunded", err=True)
-        if not await _is_to_stop():
-            raise
-        await _stop(contract, printer)
-        outcome = await contract.outcome(on_progress=printer)
+        outcome = await _interruptible(contract, waiting, printer)
+    finally:
+        waiting.cancel()
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
     if contract.liability.validator != ZERO_ADDRESS:
         facts["reports"] = [decode_json(one.encode()) for one in outcome.reports]
@@ -718,29 +715,55 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
         raise failure
 
 
-async def _is_to_stop() -> bool:
-    """Whether Ctrl-C is pressed again, which stops the robot, while the terminal says so."""
-    if not sys.stderr.isatty():
-        return False
+async def _interruptible(contract: Contract, waiting: asyncio.Task[Outcome], printer: JobPrinter) -> Outcome:
+    """What `waiting` returns. If it is interrupted in a terminal, another Ctrl-C stops the robot."""
+    try:
+        return await asyncio.shield(waiting)
+    except asyncio.CancelledError:
+        printer.close()
+        goes_on = f"the contract goes on; `aira liability watch {contract.address}` waits for its end"
+        click.echo(f"{goes_on}, `aira liability show` says from when the cost can be refunded", err=True)
+        is_again = sys.stderr.isatty() and await _is_interrupted_again(waiting, printer)
+        if not is_again and not waiting.done():
+            raise
+    if is_again:
+        await _stop(contract, printer)
+    return await waiting
+
+
+async def _is_interrupted_again(waiting: asyncio.Task[Outcome], printer: JobPrinter) -> bool:
+    """Whether Ctrl-C is pressed again in time, and before the contract has ended."""
     again = asyncio.Event()
     loop = asyncio.get_running_loop()
     loop.add_signal_handler(signal.SIGINT, again.set)
+    pressing = loop.create_task(again.wait(), name="Ctrl-C")
     try:
-        click.echo(f"press Ctrl-C again within {STOP_PROMPT:g} seconds to stop the robot; else it goes on", err=True)
-        with suppress(TimeoutError):
-            async with asyncio.timeout(STOP_PROMPT):
-                await again.wait()
+        cost = f" ({printer.stop_cost})" if printer.stop_cost else ""
+        click.echo(f"press Ctrl-C again within {STOP_PROMPT:g} seconds to stop the robot{cost}", err=True)
+        await asyncio.wait([pressing, waiting], timeout=STOP_PROMPT, return_when=asyncio.FIRST_COMPLETED)
     finally:
+        pressing.cancel()
         loop.remove_signal_handler(signal.SIGINT)
     return again.is_set()
 
 
 async def _stop(contract: Contract, printer: JobPrinter) -> None:
-    """Stop the job of a contract, and say what the robot's devices say."""
+    """Stop the job of a contract, and say what the robot's devices say. Raises `ServiceFailed` without an answer."""
+    from mesh.network import ServiceFailed
+
+    printer.close()
     click.echo("\nstopping the robot; Ctrl-C leaves without waiting for the end", err=True)
-    stopped = await contract.stop("the customer pressed Ctrl-C")
+    try:
+        stopped = await contract.stop("the customer pressed Ctrl-C")
+    except ServiceFailed as error:
+        if error.reason != "agent-error":
+            click.echo(f"the robot may go on; `aira liability stop {contract.address}` tries again", err=True)
+            raise
+        click.echo(f"aira: {error}", err=True)  # the job has just ended
+        return
+    printer.close()
     devices = [decode_json(one.encode()) for one in stopped.devices]
-    printer.line("the robot has stopped", kind="stopped", devices=devices)
+    printer.line("the job is stopped", kind="stopped", devices=devices)
     for line in device_lines(stopped):
         click.echo(line, err=True)
 
@@ -750,8 +773,9 @@ async def _say_what_a_stop_costs(agent: Agent, printer: JobPrinter) -> None:
     model = await agent.parts.chain.names.model(agent.model)
     described = await agent.runtime.models.find(model)
     if described is not None:
-        refund = "the cost comes back" if described.on_stop == "refund" else "the robot is paid all the same"
-        printer.line(f"if you stop the job after it has begun, {refund}", kind="on-stop", cost=described.on_stop)
+        printer.stop_cost = "the cost comes back" if described.on_stop == "refund" else "the robot is paid all the same"
+        said = f"if you stop the job after it has begun, {printer.stop_cost}"
+        printer.line(said, kind="on-stop", cost=described.on_stop)
 
 
 async def _keep_recording(contract: Contract, out: Path | None) -> Path:

@@ -316,7 +316,8 @@ async def stop(settings: Settings, address: str, why: str, as_json: bool) -> Non
         for line in device_lines(stopped):
             print_line(line)
     if missed := [one.device for one in stopped.devices if not one.heard]:
-        raise RemoteError(f"not stopped: {', '.join(map(printable, missed))}", code="not-stopped")
+        who = ", ".join(map(printable, missed))
+        raise RemoteError(f"not stopped: {who}", hint="tell who is beside it to cut its power", code="not-stopped")
 
 
 def device_lines(stopped: Stopped) -> list[str]:
