@@ -83,7 +83,7 @@ async def test_commands_that_wait_for_the_board_are_not_sent_after_a_stop(place:
 
     @robot.on("/work")
     async def work(job: Job, message: object) -> None:
-        job.publish("/slow", 1500)
+        job.publish("/slow", 5000)
         job.publish("/move", None)
         try:
             await device.call("/move")

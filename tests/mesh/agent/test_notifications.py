@@ -318,15 +318,17 @@ async def test_an_account_with_little_gas_is_reported_once(place: Place, receive
     poor = Account(secrets.token_bytes(32))
     await place.chains["provider"].tokens.send_eth(poor.address, 1000)
     settings = place.settings("poor", notify=(receiver.url,), notify_events=("low-on-gas",))
-    async with place.chain_of(poor, 3) as chain, Agent(MODEL, settings=settings, account=poor, chain=chain) as robot:
-        notifier = robot.runtime.notifier
-        await until(lambda: receiver.taken)
-        watch = OwnerWatch(robot.parts, notifier, gas_interval=0.05)
-        [(_, work)] = watch.tasks()
-        task = asyncio.create_task(work)
-        await until(lambda: len(receiver.taken) == 2)
-        await asyncio.sleep(0.5)  # ten more looks
-        task.cancel()
+    async with place.chain_of(poor, 3) as chain:
+        robot = Agent(MODEL, settings=settings, account=poor, chain=chain)
+        robot.on_demand(lambda _demand: None)  # only robots are watched
+        async with robot:
+            await until(lambda: receiver.taken)
+            watch = OwnerWatch(robot.parts, robot.runtime.notifier, gas_interval=0.05)
+            [(_, work)] = watch.tasks()
+            task = asyncio.create_task(work)
+            await until(lambda: len(receiver.taken) == 2)
+            await asyncio.sleep(0.5)  # ten more looks
+            task.cancel()
     assert receiver.kinds() == ["low-on-gas"] * 2, "once by the agent, once by the watch"
     assert receiver.taken[0]["data"]["balance"] == "1000"
     assert int(receiver.taken[0]["data"]["needed"]) > 1000

@@ -121,6 +121,7 @@ def test_every_command_that_prints_facts_prints_them_as_json() -> None:
 
 @pytest.mark.parametrize("name", [name for name in OPTIONS if isinstance(getattr(DEFAULTS, name), tuple)])
 def test_the_flag_of_a_setting_with_several_values_may_be_repeated(name: str) -> None:
-    flag, two = f"--{name.replace('_', '-')}", list(getattr(DEFAULTS, name))[:2] or ["one", "two"]
+    flag, default = f"--{name.replace('_', '-')}", list(getattr(DEFAULTS, name))
+    two = default[:2] if len(default) > 1 else ["one", "two"]
     done = aira("settings", "--json", flag, two[0], flag, two[1])
     assert json.loads(done.stdout)[name] == two
