@@ -48,11 +48,11 @@ if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
     from mesh.agent.jobs import Executor
     from schemas import Record
+    from schemas.records import DeviceStop
     from schemas.rpc import (
         AccountBalance,
         AccountToAddressAllowance,
         Approve,
-        DeviceStop,
         FinishLiability,
         LiabilityRequest,
         SendDemand,
