@@ -115,6 +115,8 @@ async def test_a_pair_that_can_be_no_contract_is_refused(
 
 
 async def test_a_pair_whose_maker_can_not_pay_is_not_kept(local: LocalMarket) -> None:
+    async with local.chain_of("poor") as poor:
+        await poor.tokens.approve(poor.factory, 0)  # other tests of this chain have approved more
     async with local.provider() as provider:
         demand, offer = local.demand("poor", cost=5), local.offer(cost=5)
         taken = await send(local, pair_of(local, demand, offer, role="poor"))
