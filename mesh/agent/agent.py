@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
 from mesh.agent._answers import Answer, Question, Unanswered, metadata_of_answer
+from mesh.agent._attempts import Attempts, check_attempts
 from mesh.agent._quotes import QUOTE_TIMEOUT, asked_quotes
 from mesh.agent.components import working
 from mesh.agent.contracts import nothing
@@ -75,7 +76,7 @@ from schemas.keys import ReadingKey
 from schemas.model import ModelDescription, topic_gap, topic_of
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterator, Mapping
+    from collections.abc import Collection, Coroutine, Iterator, Mapping
     from contextlib import AsyncExitStack
 
     from mesh.agent._runtime import AgentRuntime
@@ -214,9 +215,12 @@ class DemandTerms(TypedDict, total=False):
     lifetime: int | None
     robot: str
     max_cost: int | str | None
+    retry: int
+    start_within: float | None
 
 
-CHOICES: Final = ("cheapest", "first")
+CHEAPEST: Final = "cheapest"
+CHOICES: Final = (CHEAPEST, "first")
 """The words for a robot that is chosen by its quote."""
 MOST_EXAMINED: Final = 10_000
 """Messages that `Agent.examine` gives of a demand."""
@@ -519,6 +523,8 @@ class Agent(Program):
         lifetime: int | None = None,
         robot: str = "",
         max_cost: int | str | None = None,
+        retry: int = 0,
+        start_within: float | None = None,
     ) -> Order:
         """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
 
@@ -535,15 +541,45 @@ class Agent(Program):
         its price, if that is `max_cost` (else `cost`) at most; if it declines, from the next one. With a `max_cost`,
         `cost` is raised up to that if robots want more. Raises `RemoteError` (`no-robot-fits`).
 
+        A job that fails is ordered again up to `retry` times (10 at most), once its cost has come back: from the
+        `cheapest` of the other robots, or the `first`, for the same price at most, until the first order's deadline. A
+        robot that does not begin within `start_within` seconds after the contract is told to stop, and has failed. The
+        contract of the order stands for all attempts. It ends with this agent: a restarted one orders nothing again.
+
         Raises `InputError`, `InsufficientTokens`, `ObjectiveUnfit` if a file is not playable, or
         if the model's description is available and excludes the objective, `UnsafeValidator` and its like for a
         validator that can't be named, and `ValidatorSilent` if its fee is not known because nobody answers.
         """
-        writer = self.runtime.trader.writer
+        check_attempts(retry, start_within, robot="" if robot in CHOICES else robot)
         cid = await self._cid_of(objective)
+        others: dict[str, Any] = {"token": token, "validator": validator, "validator_fee": validator_fee}
+        chosen: dict[str, Any] = {"cost": cost, "model": model, "max_cost": max_cost, "start_within": start_within}
+        attempts = None
+        if retry or start_within is not None:
+            again = partial(self._order_by_quote, cid, **chosen, robot=robot or CHEAPEST, **others)
+            attempts = Attempts(self.parts, again, retry=retry, start_within=start_within)
         if robot in CHOICES or max_cost is not None:
-            others = {"token": token, "validator": validator, "validator_fee": validator_fee, "lifetime": lifetime}
-            return await self._order_by_quote(cid, cost=cost, max_cost=max_cost, robot=robot, model=model, **others)
+            others |= {"lifetime": lifetime, "attempts": attempts}
+            return await self._order_by_quote(cid, **chosen, robot=robot, **others)
+        return await self._order(
+            cid, cost=cost, model=model, lifetime=lifetime, robot=robot, attempts=attempts, **others
+        )
+
+    async def _order(
+        self,
+        cid: str,
+        *,
+        cost: int | str,
+        model: str,
+        token: str,
+        validator: str,
+        validator_fee: int | str | None,
+        lifetime: int | None,
+        robot: str,
+        attempts: Attempts | None,
+    ) -> Order:
+        """Demand a job at a price, of any robot or of one that was named."""
+        writer = self.runtime.trader.writer
         terms = await writer.terms(
             model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
         )
@@ -552,7 +588,7 @@ class Agent(Program):
         named = ""
         if robot:
             named = await robot_address(self.network.session, self.channel, robot, model=terms["model"])
-        return await self.runtime.trader.post(Demand, terms, robot=named, validator_fee=fee)
+        return await self.runtime.trader.post(Demand, terms, robot=named, attempts=attempts, validator_fee=fee)
 
     async def demand(
         self,
@@ -625,9 +661,22 @@ class Agent(Program):
         return await asked_quotes(self.parts, named, cid, [one.address for one in robots], timeout=timeout)
 
     async def _order_by_quote(
-        self, objective: str, *, cost: int | str, max_cost: int | str | None, robot: str, model: str, **terms: Any
+        self,
+        objective: str,
+        *,
+        cost: int | str,
+        max_cost: int | str | None,
+        start_within: float | None,
+        robot: str,
+        model: str,
+        besides: Collection[str] = (),
+        attempts: Attempts | None = None,
+        **terms: Any,
     ) -> Order:
-        """Order at the price that robots want, up to `max_cost`: from any of them, or from the one that is chosen."""
+        """Order at the price that robots want, up to `max_cost`: from any of them, or from the one that is chosen.
+
+        None of `besides` (addresses) is asked.
+        """
         named = terms["token"] or self.settings.erc20_token
         unit, token = await self.parts.chain.tokens.unit(named), await self.parts.chain.names.address(named)
         least, most = unit.amount(cost), unit.amount(cost if max_cost is None else max_cost)
@@ -635,18 +684,23 @@ class Agent(Program):
             least = 0
         elif robot:
             robot = await robot_address(self.network.session, self.channel, robot)
-        found = [quote for quote in await self.quotes(model, objective) if robot in ("", *CHOICES, quote.agent)]
+        quotes = [quote for quote in await self.quotes(model, objective) if quote.agent not in besides]
+        found = [quote for quote in quotes if robot in ("", *CHOICES, quote.agent)]
         fitting = [quote for quote in found if not quote.code and quote.token == token and quote.cost <= most]
+        if start_within is not None:
+            fitting = [quote for quote in fitting if quote.start <= start_within]
         if robot == "first":
             fitting.sort(key=lambda quote: (quote.start + quote.seconds, quote.cost))
         if not robot:
             paid = max(least, min((int(quote.cost) for quote in fitting), default=least))
-            return await self.order(objective, cost=paid, model=model, **terms)
+            return await self._order(objective, cost=paid, model=model, robot="", attempts=attempts, **terms)
         declined: list[Decline] = []
         for quote in fitting:
             try:
                 paid = max(least, int(quote.cost))
-                return await self.order(objective, cost=paid, model=model, robot=quote.agent, **terms)
+                return await self._order(
+                    objective, cost=paid, model=model, robot=quote.agent, attempts=attempts, **terms
+                )
             except DemandDeclined as error:
                 declined += error.declines
             except ServiceFailed as error:

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from mesh.agent._attempts import Attempts
     from mesh.agent.components import AgentComponents
     from mesh.chain import Chain
     from mesh.network import Subscription
@@ -129,6 +130,9 @@ Kind: TypeAlias = Literal[
     "unjudged",
     "paid",
     "refunded",
+    "late",
+    "again",
+    "given-up",
 ]
 
 
@@ -150,6 +154,10 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     - `unjudged`: the validator `agent` is `silent`, or its jurors `disagree` (the code): `position` of `total` needed
       have judged alike. `detail` says from which block the cost can be refunded.
     - `paid`, `refunded`: the contract has ended; `refunded` has the code and the detail of the failure.
+    - `late`: `agent` did not begin within `detail` seconds, and was told to stop.
+    - `again`: the job that `agent` did not do, for the reason `code` and `detail`, is ordered again, from another
+      robot: attempt `position` of `total`.
+    - `given-up`: after `agent` there is no other attempt; `code` and `detail` say why.
 
     What an agent says of its job before the end is its own word, and may be lost on the way.
     """
@@ -595,6 +603,19 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True, repr_omit_defaults=True
     reports: tuple[ValidatorReport, ...] = ()
     robot: str = ""
     """The robot that did the job, or should have: its address."""
+    contract: str = ""
+    """The contract's address."""
+    earlier: tuple[Outcome, ...] = ()
+    """How the attempts before it failed, the first one first, if it was ordered with `retry`."""
+
+
+@dataclass(eq=False)
+class Attempt:
+    """What a contract is among the attempts at one job."""
+
+    attempts: Attempts
+    following: Contract | None = None
+    """The contract of the next attempt, after this one has failed."""
 
 
 async def request_stop(session: zenoh.Session, signer: Signer, liability: Liability, why: str) -> Stopped:
@@ -616,26 +637,40 @@ async def request_stop(session: zenoh.Session, signer: Signer, liability: Liabil
 
 
 class Contract:
-    """A contract on the chain: `await contract.outcome()`, then `await contract.recording()`."""
+    """A contract on the chain: `await contract.outcome()`, then `await contract.recording()`.
+
+    Of a job that is ordered again when it fails (`retry`), it is the contract of the latest attempt.
+    """
 
     def __init__(
         self, liability: Liability, ended: asyncio.Future[Outcome], parts: AgentComponents, reports: ContractReports
     ) -> None:
-        self.liability = liability
-        """Its record, as it was when the contract was first read."""
+        self._liability = liability
         self._ended = ended
         self._parts = parts
         self._reports = reports
         self._failure: Reason | None = None
+        self.attempt: Attempt | None = None
 
     def __repr__(self) -> str:
-        liability, ended = self.liability, self._ended
+        liability, ended = self.liability, self._latest._ended
         state = "open"
         if ended.done():
             failed = ended.cancelled() or ended.exception() is not None
             state = "reverted" if failed else "paid" if ended.result().success else "refunded"
         parties = f"promisee={liability.promisee}, promisor={liability.promisor}"
         return f"Contract({self.address}, {state}, cost={liability.cost}, {parties})"
+
+    @property
+    def _latest(self) -> Contract:
+        """The contract of the latest attempt."""
+        following = None if self.attempt is None else self.attempt.following
+        return self if following is None else following._latest
+
+    @property
+    def liability(self) -> Liability:
+        """Its record, as it was when the contract was first read."""
+        return self._latest._liability
 
     @property
     def address(self) -> str:
@@ -647,28 +682,49 @@ class Contract:
         """The robot that does the job: its address."""
         return self.liability.promisor
 
-    async def outcome(self, *, on_progress: OnProgress = nothing) -> Outcome:
-        """Wait until the contract is finalized. Cancelling the wait changes nothing.
+    @property
+    def number(self) -> str:
+        """What all attempts at a job have in common, 16 hexadecimal digits: the first of its first order's hash.
 
-        `on_progress` is called with what the promisor says of the job meanwhile, and with the end.
+        Empty for a contract that this program has not ordered with `retry` or `start_within`.
+        """
+        return "" if self.attempt is None else self.attempt.attempts.number
+
+    def recreated(self, liability: Liability) -> None:
+        """It was created again after a reorganisation."""
+        self._liability = liability
+
+    async def outcome(self, *, on_progress: OnProgress = nothing) -> Outcome:
+        """Wait until the contract is finalized; with `retry`, until that of the last attempt is.
+
+        Cancelling the wait changes nothing. `on_progress` is called with what the promisor says of the job meanwhile,
+        and with the end.
 
         Raises `ClosedError` if the agent ends first, and `LiabilityReverted` if a reorganisation reverted the contract
         and it was not created again by its orders' deadline.
 
         Of a job that failed it fetches the recording, for at most `REASON_TIMEOUT`, and reads the reason.
         """
+        if self.attempt is None:
+            return await self.end(on_progress)
+        return await self.attempt.attempts.outcome(on_progress)
+
+    async def end(self, on_progress: OnProgress = nothing) -> Outcome:
+        """The same for this contract alone, whatever follows it."""
+        liability = self._liability
         async with (
-            self._reports.followed(self.liability, on_progress),
-            followed_job(self._parts, self.liability, on_progress),
+            self._reports.followed(liability, on_progress),
+            followed_job(self._parts, liability, on_progress),
         ):
-            ended = await asyncio.shield(self._ended)
-            ended = msgspec.structs.replace(ended, robot=self.robot, reports=await self._last_reports())
+            ended, liability = await asyncio.shield(self._ended), self._liability
+            facts: dict[str, Any] = {"robot": liability.promisor, "contract": liability.address}
+            ended = msgspec.structs.replace(ended, reports=await self._last_reports(), **facts)
         if not ended.success:
             if self._failure is None:
                 self._failure = await self._reason(ended)
             ended = msgspec.structs.replace(ended, reason=self._failure.text, code=self._failure.code)
         kind: Literal["paid", "refunded"] = "paid" if ended.success else "refunded"
-        report(on_progress, Progress(kind=kind, agent=self.liability.promisor, code=ended.code, detail=ended.reason))
+        report(on_progress, Progress(kind=kind, agent=liability.promisor, code=ended.code, detail=ended.reason))
         return ended
 
     async def stop(self, why: str = "") -> Stopped:
@@ -676,12 +732,15 @@ class Contract:
 
         `why`, at most 200 characters, is for people and becomes public with the recording. The robot's handlers are
         cancelled; `outcome` then waits for the end, whose code is `stopped`. What it costs is in the model's
-        description (`on_stop`); a job that had not begun costs nothing. To stop it again changes nothing.
+        description (`on_stop`); a job that had not begun costs nothing. To stop it again changes nothing. After
+        that a job with `retry` is not ordered again.
 
         Raises `ServiceFailed`: `no-answer` if the robot does not answer within `STOP_SECONDS`, or is one of the legacy
         network, which can't be stopped; `service-failed` if it refuses, or the job has ended. Raises `InputError` for
         a `why` that is too long.
         """
+        if self.attempt is not None:
+            self.attempt.attempts.is_called_off = True
         return await request_stop(self._parts.network.session, self._parts.signer, self.liability, why)
 
     async def reports(self) -> tuple[ValidatorReport, ...]:
@@ -696,7 +755,7 @@ class Contract:
 
         Raises a `ContentError` if the recording is unavailable or the contract was refunded without a result.
         """
-        ended = await asyncio.shield(self._ended)
+        ended = await asyncio.shield(self._latest._ended)
         if not ended.result:
             raise ContentUnavailable("the recording", f"contract {self.address} was refunded without a result")
         return await self._fetch(ended.result, self._parts.settings.fetch_timeout)
@@ -708,15 +767,15 @@ class Contract:
     async def _last_reports(self) -> tuple[ValidatorReport, ...]:
         """The reports at the end; those that are known if the node is away."""
         try:
-            return await self._reports.of(self.liability)
+            return await self._reports.of(self._liability)
         except AiraError as error:
             log.debug("the reports are not asked for: %s", error)
-            return self._reports.known(self.liability.address)
+            return self._reports.known(self._liability.address)
 
     async def _reason(self, ended: Outcome) -> Reason:
         """Why the job failed, as its validator or its recording says."""
         refused = refusal(ended.reports)
-        if not ended.result and self.liability.validator != ZERO_ADDRESS:
+        if not ended.result and self._liability.validator != ZERO_ADDRESS:
             return Reason("no result, or no verdict of the validator, came in time", "no-result")
         if not ended.result:
             return Reason("no result came in time", "no-result")
@@ -791,7 +850,7 @@ class WatchedContracts:
             return None
         again.reverted_until = None
         self._watched[liability.address] = self._watched.pop(again.contract.address)
-        again.contract.liability = liability
+        again.contract.recreated(liability)
         return again.contract
 
     def reverted(self, address: str, deadline: int) -> None:

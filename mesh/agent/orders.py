@@ -42,6 +42,7 @@ from schemas.signing import Refusal
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
+    from mesh.agent._attempts import Attempts
     from mesh.agent.components import AgentComponents
     from mesh.agent.contracts import OnProgress
     from mesh.agent.objectives import Buyer
@@ -91,6 +92,8 @@ class TradedOrder:
     on_progress: list[OnProgress] = field(default_factory=list)
     robot: str = ""
     """The only robot (address) that it is for: it is not published then. Empty for any."""
+    attempts: Attempts | None = None
+    """What happens when its contract fails, if anything does."""
     is_ours: bool = False
     """Whether this agent has posted it, in this run: not an earlier one, nor another program of the account."""
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent._hiring import Hiring
 from mesh.agent.contracts import (
+    Attempt,
     Contract,
     Progress,
     WatchedContracts,
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Container, Iterable, Mapping
     from contextlib import AsyncExitStack
 
+    from mesh.agent._attempts import Attempts
     from mesh.agent.components import AgentComponents
     from mesh.agent.contracts import ContractReports, OnProgress
     from mesh.agent.ledger import StoredOrder
@@ -306,17 +308,23 @@ class Trader(Lifecycle):
         answers: AnsweredDemand | None = None,
         *,
         robot: str = "",
+        attempts: Attempts | None = None,
         **fee: Any,
     ) -> Order:
         """Sign an order, which perhaps answers a demand, ensure its allowance, and post it. Cancelling withdraws it.
 
         A demand for one `robot` (address) alone is posted once that has agreed; raises `DemandDeclined`, `RemoteError`.
 
+        `attempts` are what follows when the contract of a demand fails.
+
         Raises `InsufficientTokens`, and for an offer that answers a demand `TooManyOffers`, the error of a demand that
         is taken, and `Declined` while a demand with equal terms is open that the agent has declined, or the agent has
         no place for one more job.
         """
         order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time(), robot=robot, is_ours=True)
+        if attempts is not None:
+            attempts.ordered(order.identity, order.deadline)
+            order.attempts, order.created = attempts, asyncio.get_running_loop().create_future()
         if isinstance(order.signed, Demand) and robot:
             await self.hiring.agree(order.signed, robot)
         if kind is Offer and (asked := ALONE.get()) is not None:
@@ -450,7 +458,9 @@ class Trader(Lifecycle):
 
     async def contract_of(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
         """See `Order.contract`."""
-        if order.state is OrderState.MATCHED:
+        if order.state is OrderState.MATCHED and order.attempts is not None and order.created is not None:
+            contract = await asyncio.shield(order.created)
+        elif order.state is OrderState.MATCHED:
             contract = await self.contracts.read(order.liability)
         elif not (order.is_open and self.is_open):
             raise ENDED() if order.is_open else order.why_closed
@@ -608,7 +618,11 @@ class Trader(Lifecycle):
                 if isinstance(order.signed, Offer):
                     await self.taken(liability, demand_hash, order)
                 if order.created is not None and not order.created.done():
-                    order.created.set_result(known or self.contracts.watch(liability, order=lasts))
+                    contract = known or self.contracts.watch(liability, order=lasts)
+                    if order.attempts is not None and contract.attempt is None:
+                        contract.attempt = Attempt(order.attempts)
+                        self._tasks.start(order.attempts.run(contract), f"attempts {identity}")
+                    order.created.set_result(contract)
                 is_earlier = order.nonce is not None and order.identity != identity
                 await self._renew_overtaken(order.nonce - 1 if is_earlier and order.nonce else order.nonce)
 

@@ -1,0 +1,197 @@
+"""Second chances: a job that failed is ordered again, from another robot, with the money that came back.
+
+All attempts are under one number, that of the first order, and under its deadline. A robot that does not begin in time
+is stopped, which counts as a failure. No attempt follows one that was paid, whose cost has not come back, or that its
+customer has stopped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from msgspec.structs import replace
+
+from mesh.agent.contracts import Attempt, Progress, fail_future, followed_job, report, request_stop
+from mesh.agent.errors import OrderExpired
+from mesh.agent.jobs import STOPPED
+from mesh.agent.trade import ENDED
+from mesh.base.log_context import liability_context, log_event
+from mesh.errors import AiraError, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Collection
+
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.contracts import Contract, OnProgress, Outcome
+    from mesh.agent.trade import Order
+
+log = logging.getLogger(__name__)
+
+MOST_RETRIES: Final = 10
+"""Most further attempts at a job."""
+
+
+def check_attempts(retry: int, start_within: float | None, *, robot: str) -> None:
+    """Raise `InputError` for what can't be: `robot` is the one that was named, if any."""
+    if not 0 <= retry <= MOST_RETRIES:
+        hint = f"give a number from 0 to {MOST_RETRIES}"
+        raise InputError(f"a job can't be ordered again {retry} times", hint=hint, code="invalid-retry")
+    if start_within is not None and not (0 < start_within < math.inf):
+        hint = "give a number of seconds above 0"
+        raise InputError(f"no job begins within {start_within:g} seconds", hint=hint, code="invalid-start-within")
+    if retry and robot:
+        raise InputError(
+            f"the job is for {robot} alone, so no other robot can do it when that fails",
+            hint="choose by `cheapest` or `first` instead of a name, or don't retry",
+            code="invalid-retry",
+        )
+
+
+class Attempts:
+    """The attempts at one job, for `run` with the first contract in a task.
+
+    `order_again` orders from another robot than those in `besides`, valid for `lifetime` blocks, `retry` times at most.
+    """
+
+    def __init__(
+        self,
+        parts: AgentComponents,
+        order_again: Callable[..., Awaitable[Order]],
+        *,
+        retry: int,
+        start_within: float | None,
+    ) -> None:
+        self._parts = parts
+        self._order_again = order_again
+        self._deadline = 0
+        self._total = retry + 1
+        self._start_within = start_within
+        self.number = ""
+        self.is_called_off = False
+        """Whether the customer has stopped the job: then there is no other attempt."""
+        self._ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+        self._listeners: list[OnProgress] = []
+        self._said: dict[str, Progress] = {}
+        """The last progress of each kind since the latest contract, for those who listen later."""
+
+    def ordered(self, order: str, deadline: int) -> None:
+        """The first order, which is about to be posted: its hash, and the block until which it is valid."""
+        self.number, self._deadline = order[:16], deadline
+
+    async def outcome(self, on_progress: OnProgress) -> Outcome:
+        """Wait for the end of the last attempt. Raises as `Contract.outcome`."""
+        for said in [*self._said.values()]:
+            report(on_progress, said)
+        self._listeners.append(on_progress)
+        try:
+            return await asyncio.shield(self._ended)
+        finally:
+            self._listeners.remove(on_progress)
+
+    async def run(self, first: Contract) -> None:
+        """See a contract to its end, and those that follow it."""
+        contract = first
+        earlier: tuple[Outcome, ...] = ()
+        try:
+            for number in range(2, self._total + 2):
+                ended, is_customers = await self._end_of(contract)
+                following = None
+                if not (ended.success or is_customers or number > self._total):
+                    following = await self._next(contract, (*earlier, ended), number)
+                if following is None:
+                    self._ended.set_result(replace(ended, earlier=earlier))
+                    return
+                assert contract.attempt is not None, "attempts have what they are"
+                contract.attempt.following = following
+                contract, earlier = following, (*earlier, ended)
+        except AiraError as error:
+            fail_future(self._ended, error)
+        finally:
+            fail_future(self._ended, ENDED())
+
+    async def _end_of(self, contract: Contract) -> tuple[Outcome, bool]:
+        """How a contract ends, and whether its customer has ended it."""
+        late = asyncio.create_task(self._is_late(contract), name=f"start of {contract.address}")
+        try:
+            ended = await contract.end(self._report)
+        finally:
+            late.cancel()
+            (is_late,) = await asyncio.gather(late, return_exceptions=True)
+        return ended, self.is_called_off or (ended.code == STOPPED and is_late is not True)
+
+    async def _is_late(self, contract: Contract) -> bool:
+        """Stop a job if the robot does not say in time that it has begun. Returns whether it was late."""
+        if self._start_within is None:
+            return False
+        begun, liability = asyncio.Event(), contract.liability
+
+        def seen(progress: Progress) -> None:
+            if progress.kind in ("playing", "result"):
+                begun.set()
+
+        async with followed_job(self._parts, liability, seen):
+            try:
+                async with asyncio.timeout(self._start_within):
+                    await begun.wait()
+                return False
+            except TimeoutError:
+                seconds = f"{self._start_within:g}"
+        self._report(Progress(kind="late", agent=liability.promisor, detail=seconds))
+        try:
+            parts, why = self._parts, f"it did not begin within {seconds} s"
+            await asyncio.shield(request_stop(parts.network.session, parts.signer, liability, why))
+        except AiraError as error:  # then it is done after all, or refunded at its deadline
+            facts = log_event("late-not-stopped", robot=liability.promisor, code=error.code)
+            log.warning("%s has not begun, and does not stop: %s", liability.promisor, error, extra=facts)
+        except asyncio.CancelledError:
+            pass  # the contract has ended before the robot's answer came
+        return True
+
+    async def _next(self, contract: Contract, earlier: tuple[Outcome, ...], number: int) -> Contract | None:
+        """The contract of attempt `number`; None if there is no such attempt, and those who wait are told why."""
+        failed = earlier[-1]
+        with liability_context(contract.address):
+            try:
+                await self._require_returned(contract)
+                order = await self._parts.chain.retrying(
+                    partial(self._order, {one.robot for one in earlier}), outages=self._parts.outages
+                )
+                facts = log_event("ordered-again", number=self.number, attempt=number, order=order.hash)
+                log.info("ordered again, attempt %d of %d", number, self._total, extra=facts)
+                said = {"agent": failed.robot, "code": failed.code, "detail": failed.reason}
+                self._said.clear()
+                self._report(Progress(kind="again", position=number, total=self._total, **said))
+                following = await order.contract(on_progress=self._report, wait=False)
+                following.attempt = Attempt(self)
+                return following
+            except AiraError as error:
+                facts = log_event("not-ordered-again", number=self.number, code=error.code)
+                log.warning("the job is not ordered again: %s", error, extra=facts)
+                self._report(Progress(kind="given-up", agent=failed.robot, code=error.code, detail=str(error)))
+                return None
+
+    async def _order(self, besides: Collection[str]) -> Order:
+        left = self._deadline - await self._parts.chain.block_number()
+        if left <= 0:
+            raise OrderExpired(self.number, self._deadline)
+        return await self._order_again(besides=besides, lifetime=left)
+
+    async def _require_returned(self, contract: Contract) -> None:
+        """Raise unless the cost of a contract that has failed has come back."""
+        chain, address = self._parts.chain, contract.address
+
+        async def owed() -> int:
+            return await chain.liabilities.owed_after(await chain.liabilities.get(address))
+
+        if await chain.retrying(owed, outages=self._parts.outages):
+            hint = f"`aira liability claim {address}` takes it"
+            raise AiraError("the token has refused to return the cost", hint=hint, code="cost-not-returned")
+
+    def _report(self, progress: Progress) -> None:
+        self._said[progress.kind] = progress
+        for listener in [*self._listeners]:
+            report(listener, progress)
