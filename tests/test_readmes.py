@@ -45,6 +45,7 @@ NOT_RUN: Final = {
 ENDS: Final = {
     "aira demand": "paid, result Qm",
     "person.py": "hydrogen",
+    "client.py": "Alice was paid",
     "objective show": "/patrol/goal",
     "plot.py": "measurements",
     "completion": "",
@@ -149,6 +150,7 @@ def test_no_readme_is_forgotten() -> None:
         "examples/blink": 6,
         "examples/blink_arguments": 1,
         "examples/firmware": 4,
+        "examples/forklift": 4,
         "examples/ros2_patrol": 4,
         "examples/rover": 3,
     }
@@ -164,6 +166,13 @@ def test_the_first_steps(reader: Reader) -> None:
 def test_a_job_is_ordered_of_the_rover(reader: Reader) -> None:
     (printed,) = reader.follow(blocks(ROOT / "examples/rover/README.md"))
     assert "paid, result Qm" in printed
+
+
+def test_the_other_forklift_does_what_the_cheaper_one_gives_up(reader: Reader) -> None:
+    readme = ROOT / "examples/forklift/README.md"
+    (printed,) = reader.follow(blocks(readme))
+    (shown,) = re.findall(r"It prints:\n\n((?:    .*\n)+)", readme.read_text(encoding="utf-8"))
+    assert printed.splitlines() == [line.strip() for line in shown.splitlines()]
 
 
 @pytest.mark.full
