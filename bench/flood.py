@@ -6,7 +6,8 @@ flood, and the most memory that provider and robot had. Each flood has a market 
 another machine, so it runs at low priority.
 
 Bars: every honest demand succeeds; during the flood p50 is at most 2 times and p99 at most 4 times that of before, and
-after it, too; provider and robot stay under 200 MB. The exit status is 1 if a flood misses one.
+after it, too, where less than half a block before counts as half a block; provider and robot stay under 200 MB. The
+exit status is 1 if a flood misses one.
 """
 
 from __future__ import annotations
@@ -60,6 +61,8 @@ DEADLINE: Final = 400
 BRIDGE_FLOOD: Final = "bridge-dead-cids"
 """The flood of `bridge_flood.py`, which has a bridge and IPFS daemons instead of a market."""
 P50_BAR, P99_BAR, MEMORY_BAR = 2.0, 4.0, 200.0
+BLOCK_TIME: Final = 1.0
+"""Seconds between blocks. A demand waits for half of that on average; a dozen demands may have waited less by luck."""
 START: Final = 90.0
 
 
@@ -163,7 +166,9 @@ async def measure(name: str) -> dict[str, Any]:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         endpoint, pid = stack.enter_context(router())
         served = await stack.enter_async_context(
-            serve_chain(Settings(data_dir=folder), host="127.0.0.1", port=0, block_time=1.0, anvil=installed_anvil())
+            serve_chain(
+                Settings(data_dir=folder), host="127.0.0.1", port=0, block_time=BLOCK_TIME, anvil=installed_anvil()
+            )
         )
         place = Place(
             endpoint=endpoint,
@@ -290,8 +295,8 @@ def _judged(results: dict[str, Any]) -> dict[str, Any]:
     quiet, missed = results["before"], []
     for part in ("during", "after"):
         for name, bar in (("p50_s", P50_BAR), ("p99_s", P99_BAR)):
-            if results[part][name] > bar * quiet[name]:
-                missed.append(f"{name} {part} is {results[part][name] / quiet[name]:.1f} times that of before")
+            if (times := results[part][name] / max(quiet[name], BLOCK_TIME / 2)) > bar:
+                missed.append(f"{name} {part} is {times:.1f} times that of before")
     missed += [f"{name} is {results[name]}" for name in ("provider_mb", "robot_mb") if results[name] >= MEMORY_BAR]
     if results["success"] < 1:
         missed.append(f"only {results['success']:.0%} of the demands succeeded")
