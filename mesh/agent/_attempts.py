@@ -11,25 +11,27 @@ import asyncio
 import logging
 import math
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec.structs import replace
 
 from mesh.agent.contracts import Attempt, Progress, fail_future, followed_job, report, request_stop
-from mesh.agent.errors import OrderExpired
+from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.jobs import STOPPED
 from mesh.agent.trade import ENDED
 from mesh.base.log_context import liability_context, log_event
 from mesh.errors import AiraError, InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection
+    from collections.abc import Awaitable, Callable, Collection, Coroutine
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.contracts import Contract, OnProgress, Outcome
     from mesh.agent.trade import Order
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 MOST_RETRIES: Final = 10
 """Most further attempts at a job."""
@@ -71,8 +73,10 @@ class Attempts:
         self._total = retry + 1
         self._start_within = start_within
         self.number = ""
-        self.is_called_off = False
-        """Whether the customer has stopped the job: then there is no other attempt."""
+        self._called_off = asyncio.Event()
+        """Set when the customer has stopped the job: then there is no other attempt."""
+        self._ordering: asyncio.Task[Contract | None] | None = None
+        """While there is no contract, because the next one is being ordered."""
         self._ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._listeners: list[OnProgress] = []
         self._said: dict[str, Progress] = {}
@@ -92,6 +96,12 @@ class Attempts:
         finally:
             self._listeners.remove(on_progress)
 
+    async def call_off(self) -> None:
+        """Order no more. What is being ordered is withdrawn, unless it has just become a contract."""
+        self._called_off.set()
+        if self._ordering is not None:
+            await asyncio.wait([self._ordering])
+
     async def run(self, first: Contract) -> None:
         """See a contract to its end, and those that follow it."""
         contract = first
@@ -101,12 +111,12 @@ class Attempts:
                 ended, is_customers = await self._end_of(contract)
                 following = None
                 if not (ended.success or is_customers or number > self._total):
-                    following = await self._next(contract, (*earlier, ended), number)
+                    ordering = self._next(contract, (*earlier, ended), number)
+                    self._ordering = asyncio.create_task(ordering, name=f"attempt {number} of {self.number}")
+                    following, self._ordering = await self._ordering, None
                 if following is None:
                     self._ended.set_result(replace(ended, earlier=earlier))
                     return
-                assert contract.attempt is not None, "attempts have what they are"
-                contract.attempt.following = following
                 contract, earlier = following, (*earlier, ended)
         except AiraError as error:
             fail_future(self._ended, error)
@@ -121,7 +131,7 @@ class Attempts:
         finally:
             late.cancel()
             (is_late,) = await asyncio.gather(late, return_exceptions=True)
-        return ended, self.is_called_off or (ended.code == STOPPED and is_late is not True)
+        return ended, self._called_off.is_set() or (ended.code == STOPPED and is_late is not True)
 
     async def _is_late(self, contract: Contract) -> bool:
         """Stop a job if the robot does not say in time that it has begun. Returns whether it was late."""
@@ -153,26 +163,50 @@ class Attempts:
 
     async def _next(self, contract: Contract, earlier: tuple[Outcome, ...], number: int) -> Contract | None:
         """The contract of attempt `number`; None if there is no such attempt, and those who wait are told why."""
-        failed = earlier[-1]
+        failed, chain = earlier[-1], self._parts.chain
         with liability_context(contract.address):
             try:
                 await self._require_returned(contract)
-                order = await self._parts.chain.retrying(
-                    partial(self._order, {one.robot for one in earlier}), outages=self._parts.outages
-                )
+                asking = partial(self._order, {one.robot for one in earlier})
+                order = await self._unless_called_off(chain.retrying(asking, outages=self._parts.outages))
+                if order is None:
+                    return None
                 facts = log_event("ordered-again", number=self.number, attempt=number, order=order.hash)
                 log.info("ordered again, attempt %d of %d", number, self._total, extra=facts)
                 said = {"agent": failed.robot, "code": failed.code, "detail": failed.reason}
                 self._said.clear()
                 self._report(Progress(kind="again", position=number, total=self._total, **said))
-                following = await order.contract(on_progress=self._report, wait=False)
-                following.attempt = Attempt(self)
-                return following
+                following = await self._unless_called_off(order.contract(on_progress=self._report, wait=False))
+                if following is None and not await self._is_withdrawn(order):
+                    following = await order.contract()
             except AiraError as error:
                 facts = log_event("not-ordered-again", number=self.number, code=error.code)
                 log.warning("the job is not ordered again: %s", error, extra=facts)
                 self._report(Progress(kind="given-up", agent=failed.robot, code=error.code, detail=str(error)))
                 return None
+        if following is not None and contract.attempt is not None:
+            following.attempt, contract.attempt.following = Attempt(self), following
+        return following
+
+    async def _unless_called_off(self, doing: Coroutine[Any, Any, T]) -> T | None:
+        """What `doing` returns; None if the customer stops the job meanwhile."""
+        task, called_off = asyncio.create_task(doing), asyncio.create_task(self._called_off.wait())
+        try:
+            await asyncio.wait((task, called_off), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            called_off.cancel()
+            if not task.done():
+                task.cancel()
+                await asyncio.wait([task])
+        return None if task.cancelled() else task.result()
+
+    async def _is_withdrawn(self, order: Order) -> bool:
+        """Withdraw an order. False if it has become a contract."""
+        try:
+            await order.withdraw()
+        except OrderClosed:
+            return False
+        return True
 
     async def _order(self, besides: Collection[str]) -> Order:
         left = self._deadline - await self._parts.chain.block_number()

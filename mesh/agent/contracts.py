@@ -44,6 +44,7 @@ from schemas import (
     market_selector,
 )
 from schemas.keys import report_selector
+from schemas.rpc import Stopped
 from schemas.signing import LONGEST_WHY, Decline, Rejection, SignedRecord, StopRequest
 from schemas.verdicts import ValidatorReport
 
@@ -59,7 +60,6 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from mesh.network import Subscription
     from schemas import Demand, Signer
-    from schemas.rpc import Stopped
 
 
 log = logging.getLogger(__name__)
@@ -740,7 +740,9 @@ class Contract:
         a `why` that is too long.
         """
         if self.attempt is not None:
-            self.attempt.attempts.is_called_off = True
+            await self.attempt.attempts.call_off()
+            if (ended := self._latest._ended).done() and not ended.exception() and not ended.result().success:
+                return Stopped()  # between two attempts
         return await request_stop(self._parts.network.session, self._parts.signer, self.liability, why)
 
     async def reports(self) -> tuple[ValidatorReport, ...]:

@@ -27,11 +27,16 @@ if TYPE_CHECKING:
 CHEAP, DEAR = 30, 80
 
 
-def priced(robot: Agent, cost: int, work: Callable[[Job], Any]) -> Agent:
+async def at_once() -> None:
+    """Think no longer."""
+
+
+def priced(robot: Agent, cost: int, work: Callable[[Job], Any], think: Callable[[], Any] = at_once) -> Agent:
     """The same robot, which wants `cost` for every job."""
 
     @robot.on_quote
     async def quote(request: QuoteRequest) -> int:
+        await think()
         return cost
 
     @robot.on_demand
@@ -55,12 +60,14 @@ async def battery_low(job: Job) -> None:
 
 
 @asynccontextmanager
-async def market(place: Place, cheap: Callable[[Job], Any], dear: Callable[[Job], Any]) -> AsyncIterator[list[Agent]]:
-    """A provider, a person, and a cheap and a dear robot with this work."""
+async def market(
+    place: Place, cheap: Callable[[Job], Any], dear: Callable[[Job], Any], think: Callable[[], Any] = at_once
+) -> AsyncIterator[list[Agent]]:
+    """A provider, a person, and a cheap and a dear robot with this work; the dear one thinks before it quotes."""
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(place.provider())
         robots = [priced(place.agent("robot"), CHEAP, cheap), await stack.enter_async_context(another(place))]
-        priced(robots[1], DEAR, dear)
+        priced(robots[1], DEAR, dear, think)
         for robot in (*robots, person := place.agent("person")):
             await stack.enter_async_context(robot)
         await stack.enter_async_context(asyncio.timeout(90))
@@ -128,6 +135,45 @@ async def test_a_job_that_its_customer_stops_is_not_ordered_again(place: Place) 
         await contract.stop("changed my mind")
         outcome = await contract.outcome()
         assert (outcome.code, outcome.robot, outcome.earlier) == ("stopped", cheap.address, ())
+        assert person.orders() == []
+
+
+async def test_a_job_that_is_stopped_while_other_robots_are_asked_is_not_ordered_again(place: Place) -> None:
+    thoughts: list[None] = []
+    asked = asyncio.Event()
+
+    async def think() -> None:
+        thoughts.append(None)
+        if len(thoughts) == 2:
+            asked.set()
+            await asyncio.sleep(1)
+
+    async with market(place, battery_low, done, think) as (person, cheap, dear):
+        contract = await person.demand(job(place), cost=DEAR, robot="cheapest", retry=2)
+        await asked.wait()
+        assert (await contract.stop("changed my mind")).devices == ()
+        outcome = await contract.outcome()
+        assert (outcome.success, outcome.robot, outcome.code) == (False, cheap.address, "battery-low")
+        assert person.orders() == await dear.parts.ledger.jobs() == []
+
+
+async def test_a_job_that_is_stopped_while_its_next_order_is_open_is_not_paid(place: Place) -> None:
+    async def stuck(job: Job) -> None:
+        await asyncio.Event().wait()
+
+    stopping: list[asyncio.Task[Any]] = []
+    async with market(place, battery_low, stuck) as (person, _, _dear):
+        before = await place.balance("person")
+        contract = await person.demand(job(place), cost=DEAR, robot="cheapest", retry=2)
+
+        def stop(seen: Progress) -> None:
+            if seen.kind == "again":
+                stopping.append(asyncio.create_task(contract.stop("changed my mind")))
+
+        outcome = await contract.outcome(on_progress=stop)
+        assert not outcome.success
+        await asyncio.gather(*stopping)
+        assert await place.balance("person") == before
         assert person.orders() == []
 
 
