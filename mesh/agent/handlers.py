@@ -340,7 +340,7 @@ class TopicHandlers:
 
     def obstacle(self, topic: str, value: Any) -> str:
         """Why the handler of a topic can't take a decoded message; empty if it can."""
-        if (found := self._find(topic)) is not None:
+        if (found := self.find(topic)) is not None:
             try:
                 found.convert(value)
             except InvalidPayload as error:
@@ -352,13 +352,13 @@ class TopicHandlers:
         typed = []
         for message in messages:
             value = decode_value(message.payload, message.type)
-            found = self._find(message.topic)
+            found = self.find(message.topic)
             typed.append((message.topic, value if found is None else found.convert(value)))
         return ObjectiveMessages(typed)
 
     async def handle(self, job: Job, message: Played) -> None:
         """Decode a played message and await its handler. Raises what the handler raises, and `JobFailed`."""
-        found = self._find(message.topic)
+        found = self.find(message.topic)
         assert found is not None, "objectives with other topics are refused before they are played"
         try:
             value = found.convert(decode_value(message.payload, message.type))
@@ -366,7 +366,8 @@ class TopicHandlers:
             raise JobFailed(f"a message on {message.topic} is {error}") from None
         await call_handler(found.handler, job, value)
 
-    def _find(self, topic: str) -> TypedHandler | None:
+    def find(self, topic: str) -> TypedHandler | None:
+        """The handler of a topic; None if no message on it is handled."""
         return self._handlers.get(topic) or self._handlers.get(ANY_TOPIC)
 
 

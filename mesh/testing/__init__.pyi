@@ -1,0 +1,7 @@
+from mesh.testing._assertions import (
+    assert_declined as assert_declined,
+    assert_paid as assert_paid,
+    assert_refunded as assert_refunded,
+)
+from mesh.testing._fake_job import FakeJob as FakeJob, run as run
+from mesh.testing._outcomes import JobRecording as JobRecording, RecordedOutcome as RecordedOutcome
