@@ -100,6 +100,7 @@ class Audit:
         may be mined.
         """
         node = SimulatedNode(self._chain, NodeFaults())
+        self._market.steps.attempts.at_end()
         told = {order.contract: order for person in self._market.people for order in person.orders if order.contract}
         dead = {
             order.order: order
@@ -107,13 +108,9 @@ class Audit:
             for order in person.orders
             if order.order and order.is_dead
         }
-        makers: dict[object, str] = {}
         async with Chain(node, ens=self._market.deployed.market.deployment.ens) as chain:
             for address in self.liabilities():
                 demand, _ = (await chain.liabilities.get_with_orders(address))[1]
-                maker = self._market.steps.demands.get(demand.hex())
-                if maker is not None and (other := makers.setdefault(maker, address)) != address:
-                    self._market.violated("ordered-twice", f"{maker[0].name}'s job {maker[1]}: {other} and {address}")
                 if (believed := dead.get(demand.hex())) is not None and not self._chain.reorganisations:
                     self._market.violated("promise-broken", f"{believed.person} was told {believed.told!r}; {address}")
                 record = await chain.liabilities.get(address)
@@ -172,14 +169,17 @@ class Audit:
     def liveness(self) -> None:
         """Without faults, orders that stay open are matched, and robots bring their results before the refund."""
         calm, blocks = self._market.calm_since, self._blocks()
+        left = [robot for robot in self._market.robots if robot.has_left]
+        gone = {address for robot in left for address in self.jobs_of(robot)}
         for person in self._market.people:
             for order in person.orders:
+                if self._market.steps.attempts.robots.get(order.order) in {robot.account.address for robot in left}:
+                    continue
                 open_for = order.deadline - max(order.posted, calm)
                 patience = MATCHED_WITHIN + DEARER_WITHIN * self._dearer(order)
                 if order.told == "expired" and open_for >= patience:
                     detail = f"{person.name} waited {open_for} blocks without faults for {order.order[:12]}"
                     self._market.violated("order-starved", detail)
-        gone = {address for robot in self._market.robots if robot.has_left for address in self.jobs_of(robot)}
         for address, (created, ended, result) in blocks.items():
             if address not in gone and ended and not result and ended - max(created, calm) >= DONE_WITHIN:
                 self._market.violated("job-abandoned", f"{address}: {ended - max(created, calm)} blocks without faults")

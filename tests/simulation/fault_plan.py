@@ -52,8 +52,21 @@ class FaultPlan:
     """That a person takes the allowance for an order away for a while."""
     short_lived: float = 0.0
     """That an order is valid for a few blocks only."""
+    pair: float = 0.0
+    """That a person orders from one robot alone, which is named or chosen by its quote."""
+    retry: float = 0.0
+    """That a job is ordered again when it has failed, or begins late."""
+    stop: float = 0.0
+    """That a person stops a job."""
+    owner_stop: float = 0.0
+    """That the owner of a robot stops a job."""
     lasts: float = 0.0
     """Seconds after which all faults stop, though people go on; zero: not before people are done, or time is up."""
+
+    @property
+    def has_faults(self) -> bool:
+        """Whether anything happens that people and robots' owners do not do by themselves."""
+        return any(getattr(self, kind) for kind in RANGES)
 
 
 RANGES: Final[dict[str, tuple[float, float]]] = {
@@ -88,8 +101,12 @@ WHIMS: Final[dict[str, tuple[float, ...]]] = {
     "withdraw": (0.1, 0.2, 0.7),
     "revoke": (0.0, 0.0, 0.5),
     "short_lived": (0.4,),
+    "pair": (0.0, 0.3, 0.7),
+    "retry": (0.0, 0.6),
+    "stop": (0.0, 0.1, 0.4),
+    "owner_stop": (0.0, 0.0, 0.3),
 }
-"""What people do that leaves an order without a job, and how often: in all histories that do not exclude it."""
+"""What people and robots' owners do by themselves, and how often: in all histories that do not exclude it."""
 KINDS: Final = (*RANGES, *WHIMS)
 LASTS: Final = (10, 150)
 

@@ -45,7 +45,7 @@ class Faults:
         for faults in (faults for role in market.roles for faults in role.all_node_faults):
             faults.unreachable, faults.silent, faults.late = plan.unreachable, plan.silent, plan.late
             faults.spoilt, faults.lost_after_sending = plan.spoilt, plan.lost_after_sending
-        market.withdrawn, market.revoked, market.short_lived = plan.withdraw, plan.revoke, plan.short_lived
+        market.whims = plan
         if self._draw("robot-left", plan.leave):
             self._scheduler.call_later(self._draw.random.uniform(5, 300), self._leave)
         self._every = {

@@ -15,6 +15,7 @@ from schemas import EMPTY, cid_of_file
 from tests.simulation.chance import FaultDraw
 from tests.simulation.deployment import ROBOTS, Deployed, MarketPlan
 from tests.simulation.disk import SimulatedDisk
+from tests.simulation.fault_plan import FaultPlan
 from tests.simulation.roles import JurorRole, PersonRole, ProviderRole, RobotRole, Role
 from tests.simulation.router import Router
 from tests.simulation.scheduler import SECOND, Process, Scheduler
@@ -48,12 +49,8 @@ class Market:
     plan_crash: Callable[[Role, Process], None] = lambda role, process: None
     lines: list[str] = field(default_factory=list)
     audit: Audit | None = None
-    withdrawn: float = 0.0
-    """How many orders people withdraw."""
-    revoked: float = 0.0
-    """For how many orders people take the allowance away for a while."""
-    short_lived: float = 0.0
-    """How many orders are valid for a few blocks only."""
+    whims: FaultPlan = field(default_factory=FaultPlan)
+    """How often people and robots' owners do what they do by themselves."""
     settled_head: int = 0
     settled_blocks: int = 0
     plan: MarketPlan = field(default_factory=MarketPlan)
@@ -76,6 +73,7 @@ class Market:
         self.roles: list[Role] = [*self.providers, *self.robots, *self.people, *self.jurors]
         self.steps = StepAudit(self)
         self.router.tap = self.steps.sent
+        self.router.asked = self.steps.asked
         self.deployed.chain.on_block = self.steps.block
         self.deployed.chain.most_in_block = self.plan.most_in_block
 

@@ -280,6 +280,61 @@ MUTATIONS: Final = (
         "continue",
         "late,revoke",
     ),
+    Mutation(
+        "a job that was stopped is a success",
+        "mesh.agent.jobs:Executor.finish",
+        "success = self._is_paid_when_stopped and",
+        "success = True or",
+        "stop,owner_stop",
+    ),
+    Mutation(
+        "a job is ordered again before its cost has come back",
+        "mesh.agent._attempts:Attempts._end_of",
+        "ended = await contract.end(self._report)",
+        "failed = asyncio.Event()\n"
+        "        hear = lambda said: failed.set() if said.code == 'failed' else None\n"
+        "        ends = asyncio.ensure_future(contract.end(hear)), asyncio.ensure_future(failed.wait())\n"
+        "        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)\n"
+        "        from mesh.agent.contracts import Outcome\n"
+        "        early = Outcome(success=False, result='', robot=contract.robot, contract=contract.address)\n"
+        "        ended = ends[0].result() if ends[0].done() else early",
+        "retry,owner_stop",
+    ),
+    Mutation(
+        "a job is ordered again from the robot that has failed",
+        "mesh.agent._attempts:Attempts._next",
+        "{one.robot for one in earlier}",
+        "()",
+        "retry,owner_stop",
+    ),
+    Mutation(
+        "a job that its customer has stopped is ordered again",
+        "mesh.agent._attempts:Attempts.run",
+        "if not (ended.success or is_customers or number > self._total):",
+        "self._called_off.clear()\n            if not (ended.success or number > self._total):",
+        "retry,stop",
+    ),
+    Mutation(
+        "a job that failed is not ordered again",
+        "mesh.agent._attempts:Attempts.run",
+        "if not (ended.success or is_customers or number > self._total):",
+        "if False:",
+        "retry,owner_stop",
+    ),
+    Mutation(
+        "a demand for one robot is shown to all",
+        "mesh.agent._outbox:Outbox.send_due",
+        "if not one.robot:",
+        "if True:",
+        "pair",
+    ),
+    Mutation(
+        "a pair is sent to the providers once",
+        "mesh.agent._hiring:Hiring.send",
+        "task.add_done_callback(lambda _task: self._under_way.discard(order))",
+        "pass",
+        "pair,drop",
+    ),
 )
 
 CANDIDATES: Final = (

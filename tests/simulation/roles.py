@@ -7,9 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent.agent import Agent
+from mesh.agent.agent import CHOICES, Agent
 from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
 from mesh.agent.handlers import JobFailed
+from mesh.agent.jobs import STOPPED
+from mesh.agent.ledger import Phase
 from mesh.agent.orders import OrderState
 from mesh.chain import XRT, Chain
 from mesh.errors import AiraError
@@ -26,13 +28,22 @@ from tests.simulation.scheduler import Process
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from mesh.agent.contracts import Contract
+    from mesh.agent.agent import DemandTerms
+    from mesh.agent.contracts import Contract, Outcome, Progress
     from mesh.market import Match
     from schemas import Demand
     from tests.simulation.market import Market
 
 
 CENT: Final = XRT // 100
+BROKEN_OFF_WITHIN: Final = (1.0, 8.0)
+"""Seconds within which jobs are stopped and handed back: before they begin, while they are done, and after."""
+START_WITHIN: Final = (None, None, 1.0, 15.0)
+MOST_RETRIES: Final = 3
+STOPPED_WITHIN: Final = (4.0, 4.0, 60.0)
+"""The same for people: soon after the contract, or also what follows it."""
+TRACED: Final = ("late", "again", "given-up", "contract")
+"""What people hear of further attempts."""
 REFUND_CHECK: Final = 20.0
 """Seconds after which people look again whether they can take a cost back."""
 
@@ -49,6 +60,12 @@ class Ordered:
     posted: int = 0
     """The block at which the order was posted."""
     deadline: int = 0
+    retry: int = 0
+    """How often it is ordered again when it fails, at most."""
+    called_off_ns: int = 0
+    """When the person stopped it; 0: not, or in an earlier start of its program."""
+    is_stopped: bool = False
+    """Whether the robot has said then that it stops."""
     used_up: bool = False
     """Whether the withdrawal of the order is on the chain."""
     told: str = ""
@@ -200,6 +217,17 @@ class RobotRole(Role):
 
     agent: Agent | None = None
 
+    def start(self) -> None:
+        """Start the process."""
+        self._tasks: set[asyncio.Future[None]] = set()
+        super().start()
+
+    def price(self, asker: str) -> int:
+        """What it wants for the job that a person wants next: some robots want more than the person gives."""
+        order = next(one for one in self.market.people if one.account.address == asker).orders[-1]
+        number = order.number * 7 + self.market.robots.index(self) * 3
+        return order.cost - number % 3 * CENT if number % 10 else order.cost + CENT
+
     async def main(self) -> None:
         """Offer, and work."""
         market = self.market
@@ -217,11 +245,34 @@ class RobotRole(Role):
             async def offer(demand: Any) -> None:
                 await agent.offer(demand)
 
+            @agent.on_quote
+            async def quote(request: Any) -> int:
+                return self.price(request.asker)
+
             @agent.on_liability
             async def phase(phase: Any, liability: Any) -> None:
                 market.trace(self.name, f"job-{phase.value}", liability=liability.address)
+                if phase is Phase.INCOMING:
+                    self._break_off(agent, liability.address)
 
             await agent.serve()
+
+    def _break_off(self, agent: Agent, address: str) -> None:
+        """Perhaps hand a new job back soon, or let the robot's owner stop it."""
+        whims, draw = self.market.whims, self.market.draw
+        if draw("robot-stopped", whims.owner_stop):
+            self._tasks.add(asyncio.ensure_future(self._stop(agent, address)))
+
+    async def _wait(self) -> None:
+        chance = self.market.draw.random
+        await asyncio.sleep(chance.uniform(0, chance.choice(BROKEN_OFF_WITHIN)))
+
+    async def _stop(self, agent: Agent, address: str) -> None:
+        await self._wait()
+        with suppress(AiraError):
+            await (await agent.contract(address)).stop("its owner needs the lamp")
+            self.market.trace(self.name, "stopped", liability=address)
+            self.market.steps.attempts.stopped(address, f"the owner of {self.name}")
 
 
 class JurorRole(Role):
@@ -308,26 +359,39 @@ class PersonRole(Role):
         """Post an order, and wait for its contract; some are withdrawn."""
         chance, draw = self.market.scheduler.random, self.market.draw
         objective = self.market.objective(chance.randint(2, 12))
-        lifetime = chance.choice(SHORT_LIFETIMES if draw("order-short-lived", self.market.short_lived) else LIFETIMES)
-        self.market.trace(self.name, "demands", number=wanted.number, cost=wanted.cost)
-        order = await agent.order(
-            objective,
-            cost=wanted.cost,
-            lifetime=lifetime,
-            validator=self.market.deployed.validator,
-            validator_fee=0,
+        lifetime = chance.choice(
+            SHORT_LIFETIMES if draw("order-short-lived", self.market.whims.short_lived) else LIFETIMES
         )
+        self.market.trace(self.name, "demands", number=wanted.number, cost=wanted.cost)
+        terms = self._choose(wanted)
+        terms |= {"cost": wanted.cost, "lifetime": lifetime}
+        terms |= {"validator": self.market.deployed.validator, "validator_fee": 0}
+        order = await agent.order(objective, **terms)
         wanted.order, wanted.told = order.hash, "ordered"
         wanted.posted, wanted.deadline = self.market.deployed.chain.evm.head, order.message.deadline
-        if draw("allowance-revoked", self.market.revoked) and (self._revoking is None or self._revoking.done()):
+        if draw("allowance-revoked", self.market.whims.revoke) and (self._revoking is None or self._revoking.done()):
             self._revoking = asyncio.ensure_future(self._revoke(agent))
-        if draw("order-withdrawn", self.market.withdrawn):
+        if draw("order-withdrawn", self.market.whims.withdraw):
             await asyncio.sleep(chance.uniform(0.1, 20))
             on_chain = chance.random() < 0.5
             await (order.withdraw_on_chain() if on_chain else order.withdraw())
             wanted.used_up = on_chain
             self.market.trace(self.name, "withdrew", order=order.hash[:12], on_chain=on_chain)
         return await order.contract()
+
+    def _choose(self, wanted: Ordered) -> DemandTerms:
+        """From whom a person orders, and what happens when the job fails. Several at a time have no quotes here."""
+        chance, draw, market = self.market.scheduler.random, self.market.draw, self.market
+        terms: DemandTerms = {}
+        has_quotes = market.plan.at_once == 1
+        if draw("order-paired", market.whims.pair):
+            named = [robot.account.address for robot in market.robots]
+            terms["robot"] = chance.choice([*named, *(2 * CHOICES if has_quotes else ())])
+        if terms.get("robot", "") in ("", *CHOICES) and has_quotes and draw("order-retried", market.whims.retry):
+            wanted.retry = terms["retry"] = chance.randint(1, MOST_RETRIES)
+            terms["start_within"] = chance.choice(START_WITHIN)
+        self.market.trace(self.name, "chooses", number=wanted.number, **terms)
+        return terms
 
     async def _revoke(self, agent: Agent) -> None:
         """Take the factory's allowance away for a while: providers then reject orders, which are still valid."""
@@ -342,19 +406,27 @@ class PersonRole(Role):
             await chain.retrying(lambda: chain.tokens.approve(chain.factory, allowed))
 
     async def _take_up(self, agent: Agent, wanted: Ordered) -> Contract:
-        """What a person finds after a crash: the contract, the open order that the agent says it has, or nothing."""
-        if wanted.contract:
+        """What a person finds after a crash: the contract, the open order that the agent says it has, or nothing.
+
+        Of a job that is ordered again, the open order or the contract may be of a further attempt, which is the last.
+        """
+        wanted.called_off_ns, wanted.is_stopped = 0, False
+        if wanted.contract and not wanted.retry:
             return await agent.contract(wanted.contract)
         known = {order.order for order in self.orders if order is not wanted}
         for order in agent.orders(OrderState.OPEN, OrderState.WITHDRAWN):
             is_it = self.market.plan.at_once == 1 or order.message.cost == wanted.cost
             if order.kind == "demand" and order.hash not in known and is_it:
+                if wanted.order != order.hash and wanted.retry:
+                    wanted.posted = self.market.deployed.chain.evm.head
                 wanted.order = order.hash
                 return await order.contract()
         mine = {demand for demand, maker in self.market.steps.demands.items() if maker == (self, wanted.number)}
         for payload, address in await agent.parts.ledger.contracts("demand"):
             if message_hash(decode(payload)).hex() in mine:
                 return await agent.contract(address)
+        if wanted.contract:
+            return await agent.contract(wanted.contract)
         raise NothingFound("no order of before the crash is open")
 
     async def _finish(self, agent: Agent, wanted: Ordered, contract_of: Coroutine[Any, Any, Contract]) -> None:
@@ -363,7 +435,7 @@ class PersonRole(Role):
             contract = await contract_of
             wanted.contract, wanted.told = contract.address, "accepted"
             self.market.trace(self.name, "accepted", liability=contract.address)
-            outcome = await contract.outcome()
+            outcome = await self._outcome(contract, wanted)
             wanted.contract, wanted.told = contract.address, "paid" if outcome.success else "refunded"
         except OrderExpired:
             wanted.told = "expired"
@@ -375,6 +447,52 @@ class PersonRole(Role):
             wanted.told = error.code
         self.market.trace(self.name, wanted.told, number=wanted.number)
         self.market.steps.told(self, wanted.number)
+
+    async def _outcome(self, contract: Contract, wanted: Ordered) -> Outcome:
+        """Wait for the end of a contract, and of those that follow it; some are stopped."""
+        said: list[Progress] = []
+
+        def hear(progress: Progress) -> None:
+            if progress.kind in TRACED:
+                said.append(progress)
+                self.market.trace(self.name, progress.kind, code=progress.code, detail=progress.detail)
+            if progress.kind == "contract":
+                wanted.contract = progress.detail
+            if wanted.is_stopped and progress.kind in ("again", "given-up"):
+                self.market.violated("ordered-after-stop", f"{self.name}'s job {wanted.number}: {progress}")
+
+        stopping = None
+        if self.market.draw("job-stopped", self.market.whims.stop):
+            stopping = asyncio.ensure_future(self._stop(contract, wanted))
+        try:
+            outcome = await (contract.outcome(on_progress=hear) if contract.number else contract.outcome())
+        finally:
+            if stopping is not None:
+                stopping.cancel()
+        self._check_attempts(wanted, outcome, {progress.kind for progress in said} if contract.number else None)
+        return outcome
+
+    def _check_attempts(self, wanted: Ordered, outcome: Outcome, said: set[str] | None) -> None:
+        """The outcome of a job names each attempt; it has no fewer than the person wants, unless they are told why."""
+        robots = [one.robot for one in (*outcome.earlier, outcome)]
+        if len(set(robots)) < len(robots) or any(one.success for one in outcome.earlier):
+            self.market.violated("attempts-untrue", f"{self.name}'s job {wanted.number}: {outcome}")
+        is_given_up = said is None or "given-up" in said or len(robots) > wanted.retry
+        if not (outcome.success or is_given_up or wanted.called_off_ns or outcome.code == STOPPED):
+            self.market.violated("not-ordered-again", f"{self.name}'s job {wanted.number}: {outcome}")
+
+    async def _stop(self, contract: Contract, wanted: Ordered) -> None:
+        chance = self.market.scheduler.random
+        await asyncio.sleep(chance.uniform(0, chance.choice(STOPPED_WITHIN)))
+        wanted.called_off_ns = self.market.scheduler.now_ns
+        try:
+            await contract.stop("changed my mind")
+        except AiraError as error:
+            self.market.trace(self.name, "not-stopped", liability=contract.address, code=error.code)
+        else:
+            wanted.is_stopped = True
+            self.market.trace(self.name, "stopped", liability=contract.address)
+            self.market.steps.attempts.stopped(contract.address, self.name)
 
     async def _take_back(self, agent: Agent) -> None:
         """Take back the cost of each contract that nobody ended in time, also of orders that were withdrawn."""

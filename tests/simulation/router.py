@@ -13,7 +13,7 @@ import zenoh
 
 from tests.simulation.chance import FaultDraw
 from tests.simulation.messages import Callback, CancellationToken, FifoChannel, RingChannel, Sample, matches
-from tests.simulation.queries import Query
+from tests.simulation.queries import PendingGet, Query
 from tests.simulation.scheduler import SECOND
 from tests.simulation.sessions import Session
 from tests.simulation.threads import scheduler
@@ -21,10 +21,11 @@ from tests.simulation.threads import scheduler
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.simulation.queries import PendingGet
     from tests.simulation.scheduler import Process
 
 LATENCY: Final = (0.0005, 0.004)
+SIGNED: Final = ("/rpc/accept", "/rpc/pair", "/rpc/quote", "/rpc/stop")
+"""Ends of the keys of services whose requests are signed: anybody may repeat one. Faults happen to these requests."""
 LOST_LINK_SECONDS: Final = 2.0
 """How long until the router notices that a session is gone."""
 
@@ -53,6 +54,9 @@ class Router:
         self.sessions: list[Session] = []
         self.is_up = True
         self.tap: Callable[[Sample, Session], None] = lambda sample, sender: None
+        self.asked: Callable[[str, bytes, Session], None] = lambda key, payload, sender: None
+        """Called with each signed request: its key, its payload, and who sends it."""
+        self._stranger: Session | None = None
         self.cut: set[frozenset[str]] = set()
         """Pairs of session names between which nothing passes."""
 
@@ -159,14 +163,31 @@ class Router:
         self, pending: PendingGet, sender: Session, key: str, payload: bytes | None, parameters: dict[str, str]
     ) -> None:
         """Bring a query to all queryables."""
+        is_signed = payload is not None and key.endswith(SIGNED)
+        if payload is not None and is_signed:
+            self.asked(key, payload, sender)
         for session in self.sessions:
             if not self.linked(sender, session):
                 continue
             for receiver in session.queryables:
                 if matches(receiver.selector, key):
                     pending.outstanding += 1
+                    if payload is not None and is_signed and not self._arrives(key, payload):
+                        continue
                     query = Query(pending, receiver, payload, parameters)
                     self.later(session, sender, receiver.deliver, query)
+
+    def _arrives(self, key: str, payload: bytes) -> bool:
+        """Whether a signed request arrives; a stranger may repeat it later."""
+        faults, draw = self.faults, self.faults.draw
+        if draw("message-replayed", faults.replay):
+            scheduler().call_later(draw.random.uniform(0, faults.old), self._repeat, key, payload)
+        return not draw("message-dropped", faults.drop)
+
+    def _repeat(self, key: str, payload: bytes) -> None:
+        if self._stranger is None:
+            self._stranger = Session(self, None, "stranger")
+        self.query(PendingGet(self, self._stranger, key, None), self._stranger, key, payload, {})
 
 
 def install(router_of: Callable[[], Router]) -> None:

@@ -12,6 +12,7 @@ from mesh.chain import Finalized, NewLiability, Transfer
 from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, Offer, Result, address_bytes, decode
 from schemas.messages import lasting_hash, message_hash
 from schemas.signing import Refusal, Rejection
+from tests.simulation.attempts import AttemptAudit
 from tests.simulation.scheduler import SECOND
 
 if TYPE_CHECKING:
@@ -39,8 +40,9 @@ class StepAudit:
         holders = [account.address for account in market.deployed.accounts.values()]
         self._providers = {address_bytes(one.account.address) for one in market.providers}
         self._begin = {one: self._balance(one) for one in (*holders, deployment.factory, deployment.lighthouse)}
-        self._liabilities: dict[str, str] = {}
-        """Of each liability the demand's hash."""
+        self.liabilities: dict[str, str] = {}
+        """Of each liability on the chain the demand's hash."""
+        self.attempts = AttemptAudit(market, self, self._call)
         self._reorganisations = 0
         self.reorganised_ns = -UNSETTLED_NS
         """When the last one was."""
@@ -57,24 +59,25 @@ class StepAudit:
         """What each juror has signed of each liability: result and success."""
 
     def _forget(self) -> None:
-        self._before = self._liabilities
+        self._before = self.liabilities
         self._read = self._chain.began
         self._expected: Counter[str] = Counter(self._begin)
-        self._ended: set[str] = set()
+        self.ended: dict[str, bool] = {}
+        """Of each liability that has ended, whether with success."""
         self._payouts: dict[str, int] = defaultdict(int)
         self._submitted: set[tuple[bytes, bytes]] = set()
         """Senders and data of the providers' transactions that did what they wanted."""
-        self._liabilities = {}
+        self.liabilities = {}
 
     def is_ended(self, liability: str) -> bool:
         """Whether a liability has ended on the chain."""
-        return liability in self._ended
+        return liability in self.ended
 
     def contracts_of(self, person: PersonRole) -> list[str]:
         """The liabilities of a person's demands."""
         return [
             liability
-            for liability, demand in self._liabilities.items()
+            for liability, demand in self.liabilities.items()
             if demand in self.demands and self.demands[demand][0] is person
         ]
 
@@ -91,9 +94,10 @@ class StepAudit:
             if isinstance(event, NewLiability):
                 self._created(event.liability)
             elif isinstance(event, Finalized):
-                if event.liability in self._ended:
+                if event.liability in self.ended:
                     self._market.violated("finalized-twice", event.liability)
-                self._ended.add(event.liability)
+                self.ended[event.liability] = event.success
+                self.attempts.ended(event.liability, success=event.success)
             elif isinstance(event, Transfer):
                 self._moved(event)
                 changed |= {event.sender, event.recipient}
@@ -124,21 +128,23 @@ class StepAudit:
     def _moved(self, event: Transfer) -> None:
         self._expected[event.sender] -= event.value
         self._expected[event.recipient] += event.value
-        if event.sender in self._liabilities and event.value:
+        if event.sender in self.liabilities and event.value:
             self._payouts[event.sender] += 1
             if self._payouts[event.sender] > 1:
                 self._market.violated("paid-twice", event.sender)
 
     def _created(self, liability: str) -> None:
         demand = self._call(liability, DEMAND_HASH).hex()
-        self._liabilities[liability] = demand
+        self.liabilities[liability] = demand
         if demand not in self.demands:
             self._market.violated("unannounced-payment", f"{liability} is of a demand that was never sent")
             return
         person, number = self.demands[demand]
         order = person.orders[number]
+        self.attempts.created(liability, demand)
         is_excused = order.told_ns < self.reorganised_ns + UNSETTLED_NS
-        if order.is_dead and (not is_excused or order.told == "nothing-found"):
+        is_dead = order.is_dead and (not order.retry or demand in self.attempts.versions(order.order))
+        if is_dead and (not is_excused or order.told == "nothing-found"):
             self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
         self._check_withdrawn(liability, demand)
         versions = {one for one, maker in self.demands.items() if maker == (person, number)}
@@ -162,7 +168,9 @@ class StepAudit:
         if not order.is_dead or order.told_ns < self.reorganised_ns + UNSETTLED_NS:
             return
         mine = {demand for demand, maker in self.demands.items() if maker == (person, number)}
-        found = [liability for liability, demand in self._liabilities.items() if demand in mine]
+        if order.retry:
+            mine &= self.attempts.versions(order.order)
+        found = [liability for liability, demand in self.liabilities.items() if demand in mine]
         if found:
             self._market.violated("promise-broken", f"{person.name} is told {order.told!r}; {found[0]}")
 
@@ -197,9 +205,23 @@ class StepAudit:
         if isinstance(message, Demand | Offer):
             self.orders.setdefault(message_hash(message).hex(), sample)
         if isinstance(message, Demand):
-            person: Any = role
-            maker = self._makers.setdefault(lasting_hash(message), (person, person.number_of(message)))
-            self.demands.setdefault(message_hash(message).hex(), maker)
+            self._demanded(role, message)
+
+    def asked(self, key: str, payload: bytes, sender: Session) -> None:
+        """A signed request was sent."""
+        role = next((one for one in self._market.people if sender.process is one.process), None)
+        if role is not None and (demand := self.attempts.asked(key, payload)) is not None:
+            self._demanded(role, demand)
+
+    def _demanded(self, role: Any, demand: Demand) -> None:
+        """Somebody has sent a demand to the market, or to a provider."""
+        identity = message_hash(demand).hex()
+        if identity not in self.demands:
+            person: PersonRole = role
+            lasting = lasting_hash(demand)
+            maker = self._makers.setdefault(lasting, (person, person.number_of(demand)))
+            self.demands[identity] = maker
+            self.attempts.sent(maker, identity, lasting)
 
     def matched(self, provider: str, match: Match) -> None:
         """A provider matched two orders."""

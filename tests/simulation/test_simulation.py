@@ -19,7 +19,7 @@ from tests.simulation.runs import numbers_in, ranges
 
 FAULTS = (
     "crash,crash_every,delay,drop,duplicate,late,leave_out,lost_after_sending,partition_every,preempt,"
-    "withdraw,revoke,short_lived"
+    "withdraw,revoke,short_lived,pair,retry,stop,owner_stop"
 )
 
 
@@ -27,7 +27,8 @@ HAPPEN = {
     *("message-cut-off", "message-delayed", "message-dropped", "message-duplicated", "message-replayed"),
     *("answer-spoilt", "node-late", "node-unreachable", "reorganisation", "transaction-left-out"),
     *("clock-jump", "crash-planned", "disk-full", "kill", "partition", "power-failure", "write-refused"),
-    *("allowance-revoked", "order-short-lived", "order-withdrawn"),
+    *("allowance-revoked", "order-short-lived", "order-withdrawn", "order-paired", "order-retried"),
+    *("job-stopped", "robot-stopped"),
 }
 """Kinds of faults as they are counted."""
 
