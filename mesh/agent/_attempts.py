@@ -73,6 +73,7 @@ class Attempts:
         self._total = retry + 1
         self._start_within = start_within
         self.number = ""
+        self.order = ""
         self._called_off = asyncio.Event()
         """Set when the customer has stopped the job: then there is no other attempt."""
         self._ordering: asyncio.Task[Contract | None] | None = None
@@ -175,15 +176,18 @@ class Attempts:
                 log.info("ordered again, attempt %d of %d", number, self._total, extra=facts)
                 said = {"agent": failed.robot, "code": failed.code, "detail": failed.reason}
                 self._said.clear()
+                self.order = order.hash
                 self._report(Progress(kind="again", position=number, total=self._total, **said))
                 following = await self._unless_called_off(order.contract(on_progress=self._report, wait=False))
                 if following is None and not await self._is_withdrawn(order):
                     following = await order.contract()
             except AiraError as error:
                 facts = log_event("not-ordered-again", number=self.number, code=error.code)
-                log.warning("the job is not ordered again: %s", error, extra=facts)
+                log.info("the job is not ordered again: %s", error, extra=facts)
                 self._report(Progress(kind="given-up", agent=failed.robot, code=error.code, detail=str(error)))
                 return None
+            finally:
+                self.order = ""
         if following is not None and contract.attempt is not None:
             following.attempt, contract.attempt.following = Attempt(self), following
         return following
@@ -212,7 +216,8 @@ class Attempts:
         left = self._deadline - await self._parts.chain.block_number()
         if left <= 0:
             raise OrderExpired(self.number, self._deadline)
-        return await self._order_again(besides=besides, lifetime=left)
+        lifetime = min(left, self._parts.settings.deadline_limit)  # the default lifetime may be above it
+        return await self._order_again(besides=besides, lifetime=lifetime)
 
     async def _require_returned(self, contract: Contract) -> None:
         """Raise unless the cost of a contract that has failed has come back."""

@@ -58,7 +58,7 @@ from mesh.role.models import Models, description_in
 from mesh.role.program import RESEND, OpenRole, Program
 from mesh.role.status import WatcherStatus
 from mesh.settings import load
-from mesh.watching.robots import RobotDirectory, robot_address
+from mesh.watching.robots import RobotDirectory, labelled, robot_address
 from schemas import (
     ZERO_ADDRESS,
     Demand,
@@ -654,9 +654,10 @@ class Agent(Program):
         """What the robots of a model (CID or name) that are present want for an objective, as in `order`.
 
         The cheapest is first; those with a `code` don't want the job. Not listed is who does not answer within
-        `timeout` seconds, and robots of the legacy network. A quote binds nobody.
+        `timeout` seconds, and robots of the legacy network. A quote binds nobody. Raises `ObjectiveUnfit` as `order`.
         """
         cid, named = await self._cid_of(objective), await self.parts.chain.names.model(model or self.model)
+        await self.runtime.require_fit(cid, named)
         robots = await self.parts.robots.present(named, timeout=timeout)
         return await asked_quotes(self.parts, named, cid, [one.address for one in robots], timeout=timeout)
 
@@ -707,12 +708,12 @@ class Agent(Program):
                 log.info(
                     "%s does not answer: %s", quote.agent, error, extra=log_event("robot-silent", robot=quote.agent)
                 )
-        said = [f"{one.agent} declines ({one.code})" for one in declined]
-        said += [
-            f"{one.agent} {f'declines ({one.code})' if one.code else f'wants {unit.show(one.cost)}'}"
-            for one in found
-            if one not in fitting
-        ]
+        refusals = [(one.agent, f"declines ({one.code})") for one in declined]
+        for one in (one for one in found if one not in fitting):
+            is_late = start_within is not None and one.start > start_within and not one.code
+            why = f"begins in {one.start:g} s" if is_late else f"wants {unit.show(one.cost)}"
+            refusals.append((one.agent, f"declines ({one.code})" if one.code else why))
+        said = [f"{labelled(agent, self.parts.robots.name(agent))} {why}" for agent, why in refusals]
         raise RemoteError(
             f"no robot does it for {unit.show(most)}: {'; '.join(said[:5]) or 'none of this model answers'}",
             hint="give a higher max_cost, or see `aira quotes`",

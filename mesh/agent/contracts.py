@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, TypeVar
 
 import msgspec
 
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.agent._attempts import Attempts
     from mesh.agent.components import AgentComponents
     from mesh.chain import Chain
     from mesh.network import Subscription
@@ -609,11 +608,32 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True, repr_omit_defaults=True
     """How the attempts before it failed, the first one first, if it was ordered with `retry`."""
 
 
+class JobAttempts(Protocol):
+    """The attempts at one job, as orders and contracts know them; `Attempts` are these."""
+
+    number: str
+    """What they have in common; see `Contract.number`."""
+    order: str
+    """The order (hash) for the next one, while it is no contract."""
+
+    def ordered(self, order: str, deadline: int) -> None:
+        """The first order, which is about to be posted: its hash, and the block until which it is valid."""
+
+    async def run(self, first: Contract) -> None:
+        """See a contract to its end, and those that follow it."""
+
+    async def outcome(self, on_progress: OnProgress) -> Outcome:
+        """Wait for the end of the last attempt."""
+
+    async def call_off(self) -> None:
+        """Order no more."""
+
+
 @dataclass(eq=False)
 class Attempt:
     """What a contract is among the attempts at one job."""
 
-    attempts: Attempts
+    attempts: JobAttempts
     following: Contract | None = None
     """The contract of the next attempt, after this one has failed."""
 
@@ -689,6 +709,11 @@ class Contract:
         Empty for a contract that this program has not ordered with `retry` or `start_within`.
         """
         return "" if self.attempt is None else self.attempt.attempts.number
+
+    @property
+    def order(self) -> str:
+        """The order (hash) for the next attempt at the job, after this one has failed, while it is no contract."""
+        return "" if self.attempt is None else self.attempt.attempts.order
 
     def recreated(self, liability: Liability) -> None:
         """It was created again after a reorganisation."""

@@ -42,9 +42,8 @@ from schemas.signing import Refusal
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
-    from mesh.agent._attempts import Attempts
     from mesh.agent.components import AgentComponents
-    from mesh.agent.contracts import OnProgress
+    from mesh.agent.contracts import JobAttempts, OnProgress
     from mesh.agent.objectives import Buyer
     from mesh.chain import Chain
     from schemas import Liability, Verified
@@ -92,7 +91,7 @@ class TradedOrder:
     on_progress: list[OnProgress] = field(default_factory=list)
     robot: str = ""
     """The only robot (address) that it is for: it is not published then. Empty for any."""
-    attempts: Attempts | None = None
+    attempts: JobAttempts | None = None
     """What happens when its contract fails, if anything does."""
     is_ours: bool = False
     """Whether this agent has posted it, in this run: not an earlier one, nor another program of the account."""
@@ -303,9 +302,10 @@ class TermsWriter:
         return order
 
 
-def is_repeated(demand: Demand, terms: Terms, *, validator_fee: int) -> bool:
-    """Whether a demand differs from these terms in nonce and deadline only."""
-    return demand.validator_fee == validator_fee and all(getattr(demand, field) == terms[field] for field in REPEATED)
+def is_repeated(demand: Demand, terms: Terms, *, payable: range) -> bool:
+    """Whether a demand is for the same job as these terms, at a cost that is `payable` for it, too."""
+    same = {**terms, "cost": demand.cost}
+    return demand.cost in payable and all(getattr(demand, field) == same[field] for field in REPEATED)
 
 
 async def lifetime_of(chain: Chain, seconds: float = LIFETIME) -> int:

@@ -59,9 +59,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Container, Iterable, Mapping
     from contextlib import AsyncExitStack
 
-    from mesh.agent._attempts import Attempts
     from mesh.agent.components import AgentComponents
-    from mesh.agent.contracts import ContractReports, OnProgress
+    from mesh.agent.contracts import ContractReports, JobAttempts, OnProgress
     from mesh.agent.ledger import StoredOrder
     from mesh.agent.orders import Terms
     from schemas import Liability, Verified
@@ -157,6 +156,11 @@ class Order:
     def deadline(self) -> int:
         """The block before which it can become a contract."""
         return self.message.deadline
+
+    @property
+    def robot(self) -> str:
+        """The only robot (address) that it is for; empty for any."""
+        return self._traded.robot
 
     @property
     def honoured_by(self) -> frozenset[str]:
@@ -308,7 +312,7 @@ class Trader(Lifecycle):
         answers: AnsweredDemand | None = None,
         *,
         robot: str = "",
-        attempts: Attempts | None = None,
+        attempts: JobAttempts | None = None,
         **fee: Any,
     ) -> Order:
         """Sign an order, which perhaps answers a demand, ensure its allowance, and post it. Cancelling withdraws it.

@@ -1,6 +1,7 @@
 """`aira demand`: publishes a demand and waits until its liability has ended.
 
-Before it signs it says who judges, and what it does if an equal demand of the account is open or has become a contract.
+Before it signs it says who judges, and what it does if an equal demand of the account is open or has become a contract:
+the same job, at a price that this command could pay, and not for another robot than the one that is named.
 While it waits it prints the progress of the demand and its job, and losses of the router.
 """
 
@@ -31,12 +32,12 @@ from mesh.cli.order import withdraw_orders, withdrawal_lines
 from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress, wait_for_broken_pipe
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
-from mesh.watching.robots import labelled
+from mesh.watching.robots import labelled, robot_address
 from schemas.address import ZERO_ADDRESS
 from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
 
     from mesh import AnnouncedValidator
     from mesh.agent.agent import Agent
@@ -62,6 +63,8 @@ STOP_TIMEOUT: Final = 1.0
 """Seconds that an interrupted command waits for the node, to say for how long the demand stays valid."""
 BEHIND: Final = 32
 """Blocks that the agent has yet to read, above which the command says so."""
+RECENT: Final = 8
+"""Contracts of equal demands, the latest ones, of which one may go on."""
 SILENCE: Final = 5.0
 """Seconds without an offer and a decline after which the command says who is present."""
 CHOICES: Final = {
@@ -72,25 +75,38 @@ CHOICES: Final = {
 
 
 async def take_existing(
-    agent: Agent, objective: str, existing: str | None, *, quiet: bool, lifetime: int | None = None, **terms: Any
+    agent: Agent,
+    objective: str,
+    existing: str | None,
+    *,
+    printer: JobPrinter,
+    validator: str,
+    payable: range,
+    robot: str,
 ) -> Order | Contract | None:
-    """What to wait for instead of a new demand: the open one with these terms, or its contract. None: post a new one.
+    """What to wait for instead of a new demand: the open one for the same job, or its contract. None: post a new one.
 
-    `existing` is the choice; without one, the user is asked. Raises `ConfigurationError` without a terminal.
+    `payable` are the costs that a new one may have, `robot` is the one that it names (address), if any. `existing` is
+    the choice; without one, the user is asked. Raises `ConfigurationError` without a terminal.
     """
-    demands, contract = await _equal(agent, objective, **terms)
+    find = partial(_equal, agent, objective, validator=validator, payable=payable, robot=robot)
+    demands, contract = await find()
     if demands:  # perhaps one became a contract while nothing of the account ran
         await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
-        demands, contract = await _equal(agent, objective, **terms)
+        demands, contract = await find()
     if others := len(agent.orders()) - len(demands):
         click.echo(f"this account also has {plural(others, 'other open order')}; see `aira order list`", err=True)
     if not demands and contract is None:
         return None
+    for robot in {one.robot for one in (*demands, *([contract] if contract else ())) if one.robot}:
+        await agent.parts.robots.find(robot)  # to show its name
     for order in demands:
-        click.echo(f"the equal demand {order.hash} is open until block {order.deadline:,}", err=True)
+        terms = printer.terms(order.message.cost, order.robot)
+        click.echo(f"the equal demand {order.hash}, {terms}, is open until block {order.deadline:,}", err=True)
     if contract is not None:
-        click.echo(f"an equal demand became the contract {contract.address}, which has not ended", err=True)
-    if existing is None and (quiet or not sys.stdin.isatty()):
+        terms = printer.terms(contract.liability.cost, contract.robot)
+        click.echo(f"an equal demand became the contract {contract.address}, {terms}, which has not ended", err=True)
+    if existing is None and (printer.as_json or not sys.stdin.isatty()):
         choices = ", ".join(f"--existing {choice} ({meaning})" for choice, meaning in CHOICES.items())
         raise ConfigurationError(
             "an equal demand is open; a second one would be paid too", hint=f"choose: {choices}", code="demand-exists"
@@ -108,25 +124,30 @@ async def take_existing(
 
 
 async def _equal(
-    agent: Agent, objective: str, *, cost: int, validator: str = "", validator_fee: int
+    agent: Agent, objective: str, *, validator: str, payable: range, robot: str
 ) -> tuple[list[Order], Contract | None]:
-    """The open demands with these terms, and the latest contract of one if it has not ended."""
+    """The open demands that are equal, and the latest contract of one that has not ended, of the `RECENT` ones."""
     from mesh.agent.orders import is_repeated
     from schemas import Demand, decode
 
-    fields: dict[str, Any] = {"model": agent.model, "objective": objective, "cost": cost, "validator": validator}
-    wanted = await agent.runtime.trader.writer.terms(**fields, token="", lifetime=1)
+    fields: dict[str, Any] = {"model": agent.model, "objective": objective, "validator": validator}
+    wanted = await agent.runtime.trader.writer.terms(**fields, cost=payable.start, token="", lifetime=1)
 
     def is_equal(message: object) -> bool:
-        return isinstance(message, Demand) and is_repeated(message, wanted, validator_fee=validator_fee)
+        return isinstance(message, Demand) and is_repeated(message, wanted, payable=payable)
 
+    def may_do_it(who: str) -> bool:
+        return not robot or who in ("", robot)
+
+    demands = [order for order in agent.orders() if is_equal(order.message) and may_do_it(order.robot)]
     contracts = await agent.parts.ledger.contracts("demand")
-    latest = next((address for payload, address in contracts if is_equal(decode(payload))), "")
-    demands = [order for order in agent.orders() if is_equal(order.message)]
     liabilities = agent.parts.chain.liabilities
-    if not latest or not await liabilities.exists(latest) or (await liabilities.get(latest)).is_finalized:
-        return demands, None
-    return demands, await agent.contract(latest)
+    for address in [address for payload, address in contracts if is_equal(decode(payload))][:RECENT]:
+        if await liabilities.exists(address):
+            liability = await liabilities.get(address)
+            if not liability.is_finalized and may_do_it(liability.promisor):
+                return demands, await agent.contract(address)
+    return demands, None
 
 
 class JobPrinter:
@@ -142,11 +163,15 @@ class JobPrinter:
         self.as_json = as_json
         self.awaited = "the payment"
         """What follows the robot's result."""
-        self.stop_cost = ""
-        """What becomes of the cost if the job is stopped; empty if it is not known."""
+        self.number = ""
+        """That of the job, if it has several attempts."""
+        self.on_stop = ""
+        """What becomes of the cost if the job is stopped, `refund` or `paid`; empty if it is not known."""
         self._bar = ExitStack()
         self._move: Callable[[int, int | None], None] | None = None
         self._percent = -STEP
+        self.has_contract = False
+        """Whether there is a contract that has not ended."""
         self._offers: set[str] = set()
         self._declines: dict[str, str] = {}
 
@@ -160,6 +185,8 @@ class JobPrinter:
             self._offers.add(seen.agent)
         if seen.kind == "declined":
             self._declines[seen.agent] = seen.code
+        if seen.kind in ("contract", "paid", "refunded"):
+            self.has_contract, self._percent = seen.kind == "contract", -STEP
         if self.as_json:
             print_json(_json(seen, self._name_of(seen.agent)))
         elif seen.kind == "playing":
@@ -174,6 +201,23 @@ class JobPrinter:
             print_line(text)
         elif facts:
             print_json(facts)
+
+    def terms(self, cost: int, robot: str) -> str:
+        """What is paid, and to which robot (address; empty for any), for people."""
+        return f"{self._unit.show(cost)} for {labelled(robot, self._name_of(robot)) if robot else 'any robot'}"
+
+    def posted(self, order: Order) -> None:
+        """Print an order for the job."""
+        facts: dict[str, Any] = {"order": order.hash, "cost": str(order.message.cost), "robot": order.robot}
+        facts |= {"name": name} if (name := self._name_of(order.robot)) else {}
+        facts |= {"number": self.number} if self.number else {}
+        words = f"{self.terms(order.message.cost, order.robot)}, valid until block {order.deadline:,}"
+        self.line(f"posted {order.hash}, {words}", kind="posted", **facts, deadline=order.deadline)
+
+    @property
+    def stop_cost(self) -> str:
+        """What becomes of the cost if the job is stopped, for people."""
+        return "the robot is paid all the same" if self.on_stop == "paid" else "the cost comes back"
 
     def close(self) -> None:
         """End the bar."""
@@ -216,6 +260,13 @@ class JobPrinter:
                 return f"robot {who} is gone; the contract holds the cost while it waits for it"
             case "back":
                 return f"robot {who} is back"
+            case "late":
+                return f"robot {who} has not begun within {seen.detail} s; stopping it"
+            case "again":
+                attempt = f"attempt {seen.position} of {seen.total}"
+                return f"job {self.number}: {who} did not do it: {why}; ordering again, {attempt}"
+            case "given-up":
+                return f"job {self.number}: not ordered again: {why}"
             case "result" if seen.code:
                 return "the robot has given up; waiting for the chain to return the cost"
             case "result":
@@ -252,6 +303,8 @@ def _json(seen: Progress, name: str) -> dict[str, Any]:
         return facts | {"position": seen.position, "total": seen.total}
     if seen.kind in ("judged", "unjudged"):
         facts |= {"votes": seen.position, "needed": seen.total}
+    if seen.kind == "again":
+        facts |= {"attempt": seen.position, "attempts": seen.total}
     return facts | {"code": seen.code, "detail": seen.detail}
 
 
@@ -451,6 +504,19 @@ async def agreed_fee(
 @click.option(
     "--max-cost", type=AmountText(), help="raise --cost up to this if robots want more; the most for a chosen robot"
 )
+@click.option(
+    "--retry",
+    type=click.IntRange(0, 10),
+    default=0,
+    show_default=True,
+    help="how often a job that fails is ordered again, from another robot, when its cost is back",
+)
+@click.option(
+    "--start-within",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="stop a robot that does not begin so many seconds after the contract; the job has failed then [wait]",
+)
 @click.option("--validator", type=ADDRESS, default="", help="address or ENS name of the validator of the result [none]")
 @click.option(
     "--validator-fee", type=AmountText(), help="the validator's fee, in XRT (or wn) [what the validator announces]"
@@ -491,6 +557,8 @@ async def demand(
     confirmed: bool = False,
     robot: str = "",
     max_cost: str | None = None,
+    retry: int = 0,
+    start_within: float | None = None,
     wait: bool = False,
     existing: str | None = None,
     withdraw_on_exit: bool = False,
@@ -505,6 +573,10 @@ async def demand(
     reasons; --wait keeps it open. With --robot only that robot gets the job. It is asked first, and if it declines
     the command ends with its reason.
 
+    With --retry a job that fails is ordered again from the cheapest of the other robots (or the first), up to the same
+    price, before the first demand's deadline. All attempts have one number, which is printed. A job that you stop is
+    not ordered again. The command does that: if it ends, the contract goes on, and no attempt follows.
+
     Ctrl-C stops waiting, but does not withdraw the demand (--withdraw-on-exit or `aira order withdraw` does) or cancel
     the contract. In a terminal a second Ctrl-C, within five seconds, stops the robot, as `aira liability stop` does.
     A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks
@@ -518,6 +590,7 @@ async def demand(
     an object for each thing that happens, with its `kind`, and one when the contract has ended; that has an `error` if
     the exit code is 1.
     """
+    from mesh.agent.agent import CHOICES as BY_QUOTE
     from mesh.agent.agent import Agent
 
     model = await asyncio.to_thread(model_named, terms.pop("model"))
@@ -543,18 +616,32 @@ async def demand(
             if model.file is not None:  # for robots and pages that read its description
                 await agent.add(model.file)
             cid = source if isinstance(source, str) else await agent.add(source)
-            terms["cost"] = unit.parse(terms["cost"])
-            most = None if max_cost is None else unit.parse(max_cost)
-            fee = await agreed_fee(agent, cid, fee, confirmed=confirmed, as_json=as_json, **terms)
-            terms["validator_fee"] = fee
+            cost = terms["cost"] = unit.parse(terms["cost"])
+            most = cost if max_cost is None else unit.parse(max_cost)
+            if most < cost:
+                raise InputError("--max-cost is less than --cost", hint="omit one of them", code="invalid-options")
+            named = await _address_of(agent, robot) if robot and robot not in BY_QUOTE else ""
+            terms["validator_fee"] = await agreed_fee(agent, cid, fee, confirmed=confirmed, as_json=as_json, **terms)
             printer.awaited = "the validator" if terms["validator"] else printer.awaited
-            await _say_what_a_stop_costs(agent, printer)
-            order = await take_existing(agent, cid, existing, quiet=as_json, **terms)
+            printer.on_stop = await _on_stop(agent)
+            payable = range(0 if robot in BY_QUOTE else cost, most + 1)
+            order = await take_existing(
+                agent,
+                cid,
+                existing,
+                printer=printer,
+                validator=terms["validator"],
+                payable=payable,
+                robot=named,
+            )
             if order is None:
-                await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
-                order = await _post(agent, cid, checked, printer, robot=robot, max_cost=most, **terms)
+                await check_balance(agent.parts.chain, unit, most, token=agent.settings.erc20_token)
+                terms |= {"robot": named or robot, "max_cost": None if max_cost is None else most}
+                order = await _post(agent, cid, checked, printer, retry=retry, start_within=start_within, **terms)
+            elif retry or start_within is not None:
+                click.echo("aira: --retry and --start-within are only for new demands", err=True)
             contract = await _contract(agent, order, printer, withdraw_on_exit=withdraw_on_exit, wait=wait)
-            await _wait_for_end(agent, contract, printer, out)
+            await _wait_for_end(agent, contract, printer, out, withdraw_on_exit=withdraw_on_exit)
 
 
 def _check_objective(settings: Settings, path: Path) -> Objective:
@@ -579,16 +666,36 @@ async def _check_held(agent: Agent, cid: str) -> Objective | None:
     return None
 
 
-async def _post(agent: Agent, cid: str, checked: Objective | None, printer: JobPrinter, **terms: Any) -> Order:
+async def _post(
+    agent: Agent, cid: str, checked: Objective | None, printer: JobPrinter, *, retry: int, **terms: Any
+) -> Order:
     """Publish the demand; first check its objective, unless that was done."""
     if (objective := checked or await _check_held(agent, cid)) is not None:
         size = f"{plural(objective.count, 'message')}, {format_duration(objective.duration_ns)}"
         facts = {"objective": cid, "messages": objective.count, "seconds": objective.duration_ns / 1e9}
         printer.line(f"objective {cid}: {size}", kind="objective", **facts)
-    order = await agent.order(cid, **terms)
-    until = f"valid until block {order.deadline:,}"
-    printer.line(f"posted {order.hash}, {until}", kind="posted", order=order.hash, deadline=order.deadline)
+    try:
+        order = await agent.order(cid, retry=retry, **terms)
+    except RemoteError as error:
+        if error.code == "no-robot-fits":
+            error.hint = "give a higher --max-cost, or see `aira quotes`"
+        raise
+    printer.number = order.hash[:16] if retry else ""
+    printer.posted(order)
+    if retry:
+        printer.line(f"job {printer.number}: {retry + 1} attempts at most until then")
+    if printer.on_stop:
+        said = f"if you stop the job after it has begun, {printer.stop_cost}"
+        printer.line(said, kind="on-stop", cost=printer.on_stop)
     return order
+
+
+async def _address_of(agent: Agent, robot: str) -> str:
+    """The address of the robot that is named. Raises as `robot_address`."""
+    model = await agent.parts.chain.names.model(agent.model)
+    address = await robot_address(agent.network.session, agent.channel, robot, model=model)
+    await agent.parts.robots.find(address)  # for those who show its name
+    return address
 
 
 async def _contract(
@@ -596,7 +703,6 @@ async def _contract(
 ) -> Contract:
     """Wait until an order is a contract. When that is interrupted, say what becomes of the order, or withdraw it."""
     from mesh.agent.contracts import Contract, Progress
-    from mesh.agent.trade import Order
 
     if isinstance(order, Contract):
         await agent.parts.robots.find(order.liability.promisor)
@@ -607,11 +713,7 @@ async def _contract(
             tasks.start(_say_who_is_present(agent, printer), "silence")
             return await order.contract(on_progress=printer, wait=wait)
     except asyncio.CancelledError:
-        if withdraw_on_exit and isinstance(order, Order):
-            for line in withdrawal_lines(await withdraw_orders(agent.parts, [order], on_chain=False)):
-                click.echo(line, err=True)
-        else:
-            click.echo(await _stays(agent, order), err=True)
+        await _leave(agent, order, withdraw_on_exit=withdraw_on_exit)
         raise
     except OrderExpired:
         if printer.is_silent:
@@ -619,6 +721,15 @@ async def _contract(
         else:
             click.echo(printer.summary(), err=True)
         raise
+
+
+async def _leave(agent: Agent, order: Order, *, withdraw_on_exit: bool) -> None:
+    """When the command ends before an order is a contract, withdraw it, or say what becomes of it."""
+    if withdraw_on_exit:
+        for line in withdrawal_lines(await withdraw_orders(agent.parts, [order], on_chain=False)):
+            click.echo(line, err=True)
+    else:
+        click.echo(await _stays(agent, order), err=True)
 
 
 async def _say_who_is_present(agent: Agent, printer: JobPrinter) -> None:
@@ -671,14 +782,30 @@ async def _stays(agent: Agent, order: Order) -> str:
     return f"{until}{about}; withdraw it with `aira order withdraw {order.hash[:16]}`"
 
 
-async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, out: Path | None) -> None:
+async def _wait_for_end(
+    agent: Agent, contract: Contract, printer: JobPrinter, out: Path | None, *, withdraw_on_exit: bool
+) -> None:
     """Wait for the end, keep the recording, and print both. Then raises what failed."""
-    waiting = asyncio.create_task(contract.outcome(on_progress=printer), name=f"end of {contract.address}")
+
+    def seen(progress: Progress) -> None:
+        printer(progress)
+        if progress.kind == "again":
+            with suppress(BrokenPipeError):
+                for order in _orders_of(agent, contract):
+                    printer.posted(order)
+
+    waiting = asyncio.create_task(contract.outcome(on_progress=seen), name=f"end of {contract.address}")
+
+    async def leave() -> None:
+        for order in _orders_of(agent, contract):
+            await _leave(agent, order, withdraw_on_exit=withdraw_on_exit)
+
     try:
-        outcome = await _interruptible(contract, waiting, printer)
+        outcome = await _interruptible(contract, waiting, printer, leave)
     finally:
         waiting.cancel()
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
+    facts |= {"robot": outcome.robot, **_attempts(printer.number, outcome)}
     if contract.liability.validator != ZERO_ADDRESS:
         facts["reports"] = [decode_json(one.encode()) for one in outcome.reports]
     printer.close()
@@ -711,20 +838,49 @@ async def _wait_for_end(agent: Agent, contract: Contract, printer: JobPrinter, o
         print_json(facts)
     elif facts["recording"]:
         print_line(f"recording {facts['recording']}")
+    if printer.number:
+        attempts = plural(len(outcome.earlier) + 1, "attempt")
+        printer.line(f"job {printer.number}: {'done' if outcome.success else 'not done'} in {attempts}")
     if failure is not None:
         raise failure
 
 
-async def _interruptible(contract: Contract, waiting: asyncio.Task[Outcome], printer: JobPrinter) -> Outcome:
-    """What `waiting` returns. If it is interrupted in a terminal, another Ctrl-C stops the robot."""
+def _orders_of(agent: Agent, contract: Contract) -> list[Order]:
+    """The order for another attempt at a job, while it is no contract."""
+    return [order for order in agent.orders() if order.hash == contract.order]
+
+
+def _attempts(number: str, outcome: Outcome) -> dict[str, Any]:
+    """The number of a job that may have several attempts, and those that failed, for JSON."""
+    if not number:
+        return {}
+    fields = {"liability": "contract", "robot": "robot", "code": "code", "reason": "reason", "result": "result"}
+    earlier = [{name: getattr(one, field) for name, field in fields.items()} for one in outcome.earlier]
+    return {"number": number, "earlier": earlier}
+
+
+async def _interruptible(
+    contract: Contract,
+    waiting: asyncio.Task[Outcome],
+    printer: JobPrinter,
+    leave: Callable[[], Awaitable[None]],
+) -> Outcome:
+    """What `waiting` returns. If it is interrupted in a terminal, another Ctrl-C stops the robot.
+
+    Without another one, `leave` is called.
+    """
     try:
         return await asyncio.shield(waiting)
     except asyncio.CancelledError:
         printer.close()
-        goes_on = f"the contract goes on; `aira liability watch {contract.address}` waits for its end"
-        click.echo(f"{goes_on}, `aira liability show` says from when the cost can be refunded", err=True)
+        if printer.has_contract:
+            goes_on = f"the contract goes on; `aira liability watch {contract.address}` waits for its end"
+            click.echo(f"{goes_on}, `aira liability show` says from when the cost can be refunded", err=True)
+        if printer.number:
+            click.echo(f"job {printer.number}: not ordered again when this command has ended", err=True)
         is_again = sys.stderr.isatty() and await _is_interrupted_again(waiting, printer)
         if not is_again and not waiting.done():
+            await leave()
             raise
     if is_again:
         await _stop(contract, printer)
@@ -738,7 +894,7 @@ async def _is_interrupted_again(waiting: asyncio.Task[Outcome], printer: JobPrin
     loop.add_signal_handler(signal.SIGINT, again.set)
     pressing = loop.create_task(again.wait(), name="Ctrl-C")
     try:
-        cost = f" ({printer.stop_cost})" if printer.stop_cost else ""
+        cost = f" ({printer.stop_cost})" if printer.on_stop else ""
         click.echo(f"press Ctrl-C again within {STOP_PROMPT:g} seconds to stop the robot{cost}", err=True)
         await asyncio.wait([pressing, waiting], timeout=STOP_PROMPT, return_when=asyncio.FIRST_COMPLETED)
     finally:
@@ -768,14 +924,10 @@ async def _stop(contract: Contract, printer: JobPrinter) -> None:
         click.echo(line, err=True)
 
 
-async def _say_what_a_stop_costs(agent: Agent, printer: JobPrinter) -> None:
-    """Say what becomes of the cost if the job is stopped, as the model's description says."""
-    model = await agent.parts.chain.names.model(agent.model)
-    described = await agent.runtime.models.find(model)
-    if described is not None:
-        printer.stop_cost = "the cost comes back" if described.on_stop == "refund" else "the robot is paid all the same"
-        said = f"if you stop the job after it has begun, {printer.stop_cost}"
-        printer.line(said, kind="on-stop", cost=described.on_stop)
+async def _on_stop(agent: Agent) -> str:
+    """What the model's description says of the cost of a job that is stopped; empty without a description."""
+    described = await agent.runtime.models.find(await agent.parts.chain.names.model(agent.model))
+    return "" if described is None else described.on_stop
 
 
 async def _keep_recording(contract: Contract, out: Path | None) -> Path:

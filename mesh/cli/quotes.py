@@ -12,6 +12,7 @@ from mesh.cli.files import file_or_cid, model_named
 from mesh.cli.options import with_json, with_settings, with_timeout
 from mesh.cli.output import format_duration, print_json, print_line, print_table, printable
 from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
+from mesh.watching.robots import labelled
 from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
@@ -44,15 +45,17 @@ async def command(settings: Settings, model: str, objective: str, timeout: float
     if as_json:
         print_json({"quotes": [decode_json(quote.encode()) | {"name": names[quote.agent]} for quote in quotes]})
     elif quotes:
-        rows = [(names[quote.agent], quote.agent, *_shown(quote, unit)) for quote in quotes]
-        print_table(("name", "address", "cost", "begins", "takes"), rows)
+        offers = [(*_shown(quote, unit), names[quote.agent], quote.agent) for quote in quotes if not quote.code]
+        if offers:
+            print_table(("cost", "begins", "takes", "name", "address"), offers)
+        for quote in (quote for quote in quotes if quote.code):
+            why = f"{printable(quote.detail)} ({printable(quote.code)})".lstrip()
+            print_line(f"{labelled(quote.agent, names[quote.agent])} declines: {why}")
     else:
         print_line("no robot of this model answers")
 
 
 def _shown(quote: Quote, unit: Unit) -> tuple[str, str, str]:
-    """What a quote says, for people."""
-    if quote.code:
-        return f"declines: {printable(quote.detail)} ({printable(quote.code)})", "", ""
-    takes = format_duration(round(quote.seconds * 1e9)) if quote.seconds else "unknown"
-    return unit.show(quote.cost), f"in {format_duration(round(quote.start * 1e9))}" if quote.start else "now", takes
+    """What a robot wants, when it would begin, and how long it takes, for people."""
+    begins = f"in {format_duration(round(quote.start * 1e9))}" if quote.start else "now"
+    return unit.show(quote.cost), begins, format_duration(round(quote.seconds * 1e9)) if quote.seconds else "unknown"

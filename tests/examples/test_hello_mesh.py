@@ -42,7 +42,7 @@ def test_the_flow_of_the_readme_ends_paid(market: dict[str, str], tmp_path: Path
         done = run("env", *variables, *AIRA, "demand", *order)
         person, _, posted, *happened, outcome, kept = done.stdout.splitlines()
         assert re.fullmatch(rf"demand by 0x\w{{40}} for {model}", person)
-        assert re.fullmatch(r"posted [0-9a-f]{64}, valid until block [\d,]+", posted)
+        assert re.fullmatch(r"posted [0-9a-f]{64}, 0\.000001 XRT for any robot, valid until block [\d,]+", posted)
         assert any(re.fullmatch(r"contract 0x\w{40} with 0x\w{40}", line) for line in happened)
         assert (outcome, kept) == (f"paid, result {cid_of_file(out)}", f"recording {out}")
         greeting = f"Hello {person.split()[2]}, you would pay 1000 for {cid_of_file(EXAMPLE / 'blink.mcap')}."

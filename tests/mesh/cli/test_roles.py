@@ -97,7 +97,7 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
         assert [kind for kind in kinds if kind not in ("offer", "gone", "back")] == [
             "objective", "posted", "contract", "ready", "playing", "result", "paid",
         ]  # fmt: skip
-        assert set(end) == {"liability", "success", "result", "recording"}
+        assert set(end) == {"liability", "robot", "success", "result", "recording"}
         assert cid_of_file(Path(end["recording"])) == end["result"]
         assert str(tmp_path) in end["recording"]
         printed.text = ""

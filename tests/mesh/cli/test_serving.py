@@ -112,7 +112,7 @@ def test_a_job_is_done_and_paid_between_processes(development: Development, tmp_
         watcher.wait_until_said("you would pay 1000 for")
         again = development.demand(*order, "--json")
         summed = json.loads(again.stdout.splitlines()[-1])
-        assert set(summed) == {"liability", "success", "result", "recording"}
+        assert set(summed) == {"liability", "robot", "success", "result", "recording"}
         assert summed["success"]
         code, seconds = robot.end(signal.SIGINT)
         assert code == 0
