@@ -5,16 +5,20 @@ from __future__ import annotations
 from ast import literal_eval
 from typing import TYPE_CHECKING, Any, Final
 
+import requests
 from eth_tester import EthereumTester, PyEVMBackend  # type: ignore[import-untyped]
 from eth_tester.exceptions import TransactionFailed  # type: ignore[import-untyped]
 from web3 import EthereumTesterProvider, HTTPProvider, Web3
 from web3.exceptions import ContractLogicError, Web3RPCError
+from web3.middleware import AttributeDictMiddleware
 
+import mesh.dev  # noqa: F401 -- chooses the quicker keccak
 from mesh.chain.answers import explain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from web3.providers import BaseProvider
     from web3.types import RPCEndpoint
 
 MNEMONIC: Final = "test test test test test test test test test test test junk"
@@ -25,8 +29,9 @@ FUNDS_WEI: Final = 10**24
 class Chain:
     """A chain whose accounts are unlocked, with the methods of a development node: mining on demand and snapshots."""
 
-    def __init__(self, web3: Web3, keys: Sequence[bytes]) -> None:
-        self.web3 = web3
+    def __init__(self, provider: BaseProvider, keys: Sequence[bytes]) -> None:
+        # Without those that ask the node for the chain and the latest block before each transaction.
+        self.web3 = Web3(provider, middleware=[(AttributeDictMiddleware, "attrdict")])
         self.keys = tuple(keys)
 
     def mine(self, blocks: int) -> None:
@@ -73,13 +78,14 @@ def py_evm() -> Chain:
         hd_path="m/44'/60'/0'/0",
         genesis_parameters=PyEVMBackend.generate_genesis_params({"gas_limit": 30_000_000}),
     )
-    web3 = Web3(EthereumTesterProvider(EthereumTester(backend)))
-    return Chain(web3, [key.to_bytes() for key in backend.account_keys])
+    return Chain(EthereumTesterProvider(EthereumTester(backend)), [key.to_bytes() for key in backend.account_keys])
 
 
 def remote(url: str, keys: Sequence[bytes]) -> Chain:
     """A development node behind JSON-RPC."""
-    return Chain(Web3(HTTPProvider(url)), keys)
+    session = requests.Session()
+    session.trust_env = False  # it would look for proxies in the environment before each request
+    return Chain(HTTPProvider(url, session=session), keys)
 
 
 def _endpoint(method: str) -> RPCEndpoint:

@@ -9,6 +9,7 @@ import pytest
 from tests.contracts.chains import py_evm, remote
 from tests.contracts.market import Market
 from tests.contracts.suite import Suite
+from tests.support.ci import IN_CI
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
@@ -17,14 +18,14 @@ if TYPE_CHECKING:
     from tests.contracts.chains import Chain
 
 
-@pytest.fixture(scope="package", params=["py-evm", "anvil"])
-def chain(request: pytest.FixtureRequest) -> Iterator[Chain]:
-    """A chain for all tests of the package."""
-    if request.param == "py-evm":
-        yield py_evm()
-    else:
+@pytest.fixture(scope="package")
+def chain() -> Iterator[Chain]:
+    """A chain for all tests of the package: anvil in CI, which is quicker; gas and histories are py-evm's there, too."""
+    if IN_CI:
         with Anvil() as node:
             yield remote(node.url, node.private_keys)
+    else:
+        yield py_evm()
 
 
 @pytest.fixture(scope="package")
