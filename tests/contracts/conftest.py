@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="package")
 def chain() -> Iterator[Chain]:
-    """A chain for all tests of the package: anvil in CI, which is quicker; gas and histories are py-evm's there, too."""
+    """A chain for all tests of the package: anvil in CI, where only gas and histories are py-evm's."""
     if IN_CI:
         with Anvil() as node:
             yield remote(node.url, node.private_keys)

@@ -24,22 +24,24 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 PROTOCOLS = ("frames", "rosserial")
 
 
-@pytest.fixture
-def market(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """Router, chain and provider; returns the environment variables of the other processes, without the keyfile.
+@pytest.fixture(scope="module")
+def market(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """Router, chain and provider of a module; returns the environment variables of the other processes, without the
+    keyfile.
 
     At the end, other programs must be able to read all that was recorded.
     """
+    folder = tmp_path_factory.mktemp("market")
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
-    up = ("up", "--data-dir", tmp_path, "--listen", endpoint, "--port", str(port))
+    up = ("up", "--data-dir", folder, "--listen", endpoint, "--port", str(port))
     with Serving(*AIRA, *up, says="provider    0x"):
         yield {
             "AIRA_CONNECT": endpoint,
             "AIRA_WEB3_HTTP_PROVIDER": f"http://127.0.0.1:{port}",
-            "AIRA_DATA_DIR": str(tmp_path),
-            "AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "development" / "password"),
+            "AIRA_DATA_DIR": str(folder),
+            "AIRA_KEYFILE_PASSWORD_FILE": str(folder / "development" / "password"),
         }
-    for path in recordings_in(tmp_path):
+    for path in recordings_in(folder):
         check_recording(path)
 
 

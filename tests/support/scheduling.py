@@ -14,10 +14,11 @@ TOGETHER: Final = ("tests/web", "tests/bridges/ipfs", "tests/bridges/ros1", "tes
 
 SECONDS: Final[dict[str, int]] = {
     "tests/web": 805,
-    "tests/contracts": 610,
     "tests/bridges/ipfs": 510,
-    "tests/examples/test_blink.py": 235,
-    "tests/simulation/test_model.py": 165,
+    "tests/mesh/agent/test_jobs_behind_providers.py": 300,
+    "tests/contracts": 220,
+    "tests/examples/test_blink.py": 200,
+    "tests/simulation/test_model.py": 150,
     "tests/mesh/recording/test_hostile.py": 145,
     "tests/simulation/test_simulation.py": 130,
     "tests/mesh/cli/test_serving.py": 125,
