@@ -19,6 +19,7 @@ ROOT: Final = Path(__file__).parents[1]
 PACKAGES: Final = ("schemas", "mesh", "bridges")
 SHARED: Final = {
     "Log": "the name that Ethereum gives an entry of a receipt, and Foxglove a line of a log",
+    "Market": "what a test trades on, and what the page knows of the market that it shows",
     "Robot": "what is present on a market, and what a program that speaks ROS 2 gives its node to",
 }
 """Class names that are defined in several modules on purpose, each with the reason."""

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from mesh.base.extras import needs_extra
 from schemas.loading import on_demand
 
 _load, __all__ = on_demand(__name__)
 
 
 def __getattr__(name: str) -> Any:
-    return _load(name)
+    with needs_extra("testing", "mesh.testing"):
+        return _load(name)

@@ -1,0 +1,198 @@
+"""`mesh.testing.Market`: whole jobs in one process, and what can go wrong with them."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh import XRT, Agent, AiraError, Declined, Demand, DemandDeclined, Job, JobFailed, Settings, Verified
+from mesh.testing import Market, assert_declined, assert_paid, assert_refunded
+from schemas import Withdrawal
+
+if TYPE_CHECKING:
+    from mesh.testing import MarketChain
+
+ANYTHING = "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82"
+PRICE = XRT.parse("3 XRT")
+
+
+class Forklift(Agent):
+    """Lifts for 3 XRT; a lift above 4 m fails, and one of 0 m waits until `released`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.released = asyncio.Event()
+        self.lifts = 0
+        self.on_demand(self._offer)
+        self.on("/lift", float)(self._lift)
+
+    async def _offer(self, demand: Verified[Demand]) -> None:
+        if demand.message.cost < PRICE:
+            raise Declined("too-cheap", "a job costs 3 XRT")
+        await self.offer(demand)
+
+    async def _lift(self, job: Job, metres: float) -> None:
+        self.lifts += 1
+        if metres > 4:
+            raise JobFailed("the battery is empty", code="battery-empty")
+        if not metres:
+            await self.released.wait()
+        job.publish("/height", metres)
+
+
+@pytest.fixture
+def forklift() -> Forklift:
+    return Forklift()
+
+
+async def xrt_of(agent: Agent) -> int:
+    return await agent.chain.tokens.balance(agent.address)
+
+
+async def test_a_job_is_paid_and_its_recording_is_at_hand(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        person, before = await market.person(), await xrt_of(forklift)
+        outcome = await market.order(forklift, [("/lift", 1.5), ("/lift", 2.0)], by=person, cost="5 XRT")
+
+        assert_paid(outcome)
+        assert outcome.recording.values("/height") == [1.5, 2.0]
+        assert outcome.recording.published == [("/height", 1.5), ("/height", 2.0)]
+        assert outcome.robot == forklift.address
+        assert await xrt_of(forklift) == before + XRT.parse("5 XRT")
+        assert await xrt_of(person) == XRT.parse("995 XRT")
+
+
+async def test_a_failed_job_and_a_declined_one_say_why(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        assert_refunded(await market.order(forklift, [("/lift", 5.0)], cost=PRICE), code="battery-empty")
+        with pytest.raises(DemandDeclined) as caught:
+            await market.order(forklift, [("/lift", 1.5)], cost="1 XRT")
+        assert_declined(caught.value, code="too-cheap")
+
+
+async def test_a_model_is_ordered_of_any_robot(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        assert_paid(await market.order(ANYTHING, [("/lift", 1.5)], cost=PRICE))
+
+
+async def test_markets_that_follow_each_other_know_nothing_of_each_other(
+    market_chain: MarketChain, forklift: Forklift
+) -> None:
+    seen = []
+    for _ in range(2):
+        async with Market(market_chain) as market, market.robot(forklift):
+            assert_paid(await market.order(forklift, [("/lift", 1.0)], cost=PRICE))
+            seen.append((market.lighthouse, market.endpoint, forklift.address, await xrt_of(forklift)))
+    (first, second) = seen
+    assert not set(first[:3]) & set(second[:3])
+    assert first[3] == second[3] == XRT.parse("1003 XRT")
+
+
+async def test_a_robot_has_its_own_settings_again_afterwards(market: Market) -> None:
+    own = Settings(connect=("tcp/127.0.0.1:1",), name="Alice", keyfile="/nowhere.json")
+    robot = Agent(settings=own)
+    async with market.robot(robot):
+        assert robot.settings.name == "Alice"
+        assert robot.settings.connect == (market.endpoint,)
+    assert robot.settings == own
+
+
+async def test_a_job_is_stopped_once_it_runs(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        contract = await market.demand(forklift, [("/lift", 0.0)], cost=PRICE)
+        await market.stop(contract, "enough")
+        outcome = await market.outcome(contract)
+        assert_refunded(outcome, code="stopped")
+        assert "enough" in outcome.reason
+
+
+async def test_a_killed_robot_goes_on_where_it_was_and_is_paid_once(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        contract = await market.demand(forklift, [("/lift", 1.0), ("/lift", 0.0)], cost=PRICE)
+        await market.running(contract)
+        address, before = forklift.address, await xrt_of(forklift)
+        await market.kill(forklift)
+        assert not forklift.is_open
+        with pytest.raises(AiraError) as caught:
+            await market.kill(forklift)
+        assert caught.value.code == "closed-error"
+
+        forklift.released.set()
+        await market.restart(forklift)
+        assert_paid(await market.outcome(contract))
+        assert (forklift.address, await xrt_of(forklift)) == (address, before + PRICE)
+
+
+async def test_a_killed_robot_says_nothing_more(market: Market) -> None:
+    killed, ended = Agent(ANYTHING), Agent(ANYTHING)
+    watcher = await market.person()
+    async with watcher.channel.subscribe(Withdrawal) as withdrawals, market.robot(killed):
+        async with market.robot(ended):
+            for robot in (killed, ended):
+                await robot.offer(objective=ANYTHING)
+            await market.kill(killed)
+            address = ended.address
+        # One that ends in good order withdraws its offer.
+        assert (await anext(withdrawals)).signer == address
+
+
+async def test_a_robot_at_work_is_restarted_in_good_order(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        assert_paid(await market.order(forklift, [("/lift", 1.0)], cost=PRICE))
+        await market.restart(forklift)
+        assert_paid(await market.order(forklift, [("/lift", 1.0)], cost=PRICE))
+
+
+async def test_a_contract_that_a_reorganisation_reverts_is_made_again_and_paid_once(
+    market: Market, forklift: Forklift
+) -> None:
+    async with market.robot(forklift):
+        before = await xrt_of(forklift)
+        contract = await market.demand(forklift, [("/lift", 0.0)], cost=PRICE)
+        await market.running(contract)
+        await market.reorg(1)
+        forklift.released.set()
+        assert_paid(await market.outcome(contract))
+        assert await xrt_of(forklift) == before + PRICE
+
+
+async def test_a_reorganisation_can_not_take_the_market_away(market: Market) -> None:
+    for depth in (0, 10_000):
+        with pytest.raises(AiraError) as caught:
+            await market.reorg(depth)
+        assert caught.value.code == "too-deep"
+
+
+async def test_orders_expire_when_blocks_are_mined(market: Market) -> None:
+    person = await market.person()
+    order = await person.order([("/lift", 1.0)], model=ANYTHING, lifetime=5)
+    await market.mine(6)
+    with pytest.raises(AiraError) as caught:
+        await order.contract(wait=True)
+    assert caught.value.code == "order-expired"
+
+
+async def test_what_does_not_come_about_is_an_error_that_says_so(market: Market, forklift: Forklift) -> None:
+    with pytest.raises(AiraError) as caught:
+        await market.order(ANYTHING, [("/lift", 1.0)], timeout=0.5)
+    assert caught.value.code == "no-contract"
+    with pytest.raises(AiraError) as caught:
+        await market.order(forklift, [("/lift", 1.0)])
+    assert caught.value.code == "closed-error"
+    async with market.robot(forklift):
+        contract = await market.demand(forklift, [("/lift", 0.0)], cost=PRICE)
+        with pytest.raises(AiraError) as caught:
+            await market.outcome(contract, timeout=0.2)
+        assert caught.value.code == "no-outcome"
+        forklift.released.set()
+        assert_paid(await market.outcome(contract))
+
+
+async def test_a_robot_that_can_not_start_says_why(market: Market) -> None:
+    with pytest.raises(AiraError, match=re.escape("can't read the model")):
+        async with market.robot(Agent(Path("/nowhere.json"))):
+            """It does not come here."""
