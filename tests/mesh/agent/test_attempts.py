@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import JobFailed
+from mesh.agent.orders import FEWEST_BLOCKS
 from mesh.errors import InputError
 from tests.mesh.agent.test_hiring import another
 from tests.mesh.agent.trades import job, known
@@ -61,14 +62,21 @@ async def battery_low(job: Job) -> None:
 
 @asynccontextmanager
 async def market(
-    place: Place, cheap: Callable[[Job], Any], dear: Callable[[Job], Any], think: Callable[[], Any] = at_once
+    place: Place,
+    cheap: Callable[[Job], Any],
+    dear: Callable[[Job], Any],
+    think: Callable[[], Any] = at_once,
+    **options: Any,
 ) -> AsyncIterator[list[Agent]]:
-    """A provider, a person, and a cheap and a dear robot with this work; the dear one thinks before it quotes."""
+    """A provider, a person, and a cheap and a dear robot with this work; the dear one thinks before it quotes.
+
+    `options` are settings of the person.
+    """
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(place.provider())
         robots = [priced(place.agent("robot"), CHEAP, cheap), await stack.enter_async_context(another(place))]
         priced(robots[1], DEAR, dear, think)
-        for robot in (*robots, person := place.agent("person")):
+        for robot in (*robots, person := place.agent("person", **options)):
             await stack.enter_async_context(robot)
         await stack.enter_async_context(asyncio.timeout(90))
         yield [person, *robots]
@@ -120,6 +128,13 @@ async def test_an_open_demand_gets_a_second_chance_and_nobody_has_two(place: Pla
         ("again", "battery-low"),
         ("given-up", "no-robot-fits"),
     ]
+
+
+async def test_a_default_lifetime_above_the_limit_allows_another_attempt(place: Place) -> None:
+    async with market(place, battery_low, done, deadline_limit=FEWEST_BLOCKS // 2) as (person, _, dear):
+        contract = await person.demand(job(place), cost=DEAR, robot="cheapest", retry=1)
+        outcome = await contract.outcome()
+        assert (outcome.success, outcome.robot) == (True, dear.address)
 
 
 async def test_a_job_that_its_customer_stops_is_not_ordered_again(place: Place) -> None:
