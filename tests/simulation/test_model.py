@@ -21,7 +21,7 @@ from tests.simulation.model_history import ModelHistory, twins
 from tests.simulation.model_twins import call_of
 from tests.support.ci import IN_CI, seed_of_part
 
-HISTORIES: Final = int(os.environ.get("AIRA_MODEL_HISTORIES", "30" if IN_CI else "8"))
+HISTORIES: Final = int(os.environ.get("AIRA_MODEL_HISTORIES", "12" if IN_CI else "8"))
 AT_A_TIME: Final = 6
 """Histories in one test: few enough to stay far below the time limit of a test on a busy machine."""
 STEPS: Final = 60

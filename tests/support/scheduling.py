@@ -18,7 +18,7 @@ SECONDS: Final[dict[str, int]] = {
     "tests/mesh/agent/test_jobs_behind_providers.py": 300,
     "tests/contracts": 220,
     "tests/examples/test_blink.py": 200,
-    "tests/simulation/test_model.py": 150,
+    "tests/simulation/test_model.py": 100,
     "tests/mesh/recording/test_hostile.py": 145,
     "tests/simulation/test_simulation.py": 130,
     "tests/mesh/cli/test_serving.py": 125,
