@@ -169,7 +169,7 @@ async def test_a_job_that_is_stopped_while_other_robots_are_asked_is_not_ordered
         assert (await contract.stop("changed my mind")).devices == ()
         outcome = await contract.outcome()
         assert (outcome.success, outcome.robot, outcome.code) == (False, cheap.address, "battery-low")
-        assert person.orders() == await dear.parts.ledger.jobs() == []
+        assert (person.orders(), await dear.parts.ledger.jobs()) == ([], [])
 
 
 async def test_a_job_that_is_stopped_while_its_next_order_is_open_is_not_paid(place: Place) -> None:
