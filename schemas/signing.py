@@ -350,8 +350,10 @@ LONGEST_WHY: Final = 200
 """Characters of the reason for a stop."""
 
 
-class StopRequest(SignedRecord, frozen=True, kw_only=True):
+class StopRequest(SignedRecord, frozen=True, kw_only=True, omit_defaults=True):
     """A request to stop the job of `liability`, by its promisee or its promisor; `why` is for people.
+
+    With a `code`, a word for programs, its promisor hands it back: the robot can't do it.
 
     To repeat one, or to send an old one again, changes nothing: a job is stopped once, and never continues.
     """
@@ -367,9 +369,12 @@ class StopRequest(SignedRecord, frozen=True, kw_only=True):
     """At most `LONGEST_WHY` characters."""
     time: int
     """When it was signed (Unix time, seconds)."""
+    code: str = ""
 
     def __post_init__(self) -> None:
         Record.__post_init__(self)
+        if self.code and not is_word(self.code):
+            raise InvalidRecord("StopRequest", f"code: expected words of letters and digits, at most {_LONGEST_WORD}")
         if len(self.why) > LONGEST_WHY:
             raise InvalidRecord("StopRequest", f"why: expected at most {LONGEST_WHY} characters")
 

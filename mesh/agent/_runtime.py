@@ -516,9 +516,9 @@ class AgentRuntime(Lifecycle):
         selector = market_selector(self.parts.channel.lighthouse, "created", model)
         return declared(session, session.declare_subscriber(selector, lambda _sample: call_in_loop(loop, look)))
 
-    async def stop(self, address: str, *, why: str, by: str) -> tuple[DeviceStop, ...]:
+    async def stop(self, address: str, *, why: str, by: str, code: str = "") -> tuple[DeviceStop, ...]:
         """Stop a job; if the agent is held then, it withdraws its offers. As `Executor.stop`."""
-        devices = await self.executor.stop(address, why=why, by=by)
+        devices = await self.executor.stop(address, why=why, by=by, code=code)
         if self.executor.hold.is_held:
             await self.trader.take_back_offers("the robot was stopped")
             self.profile.changed()

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from msgspec.structs import replace
 
+from mesh.agent.jobs import check_stop
 from mesh.agent.ledger import WrongPhase
 from mesh.base.log_context import log_event
 from mesh.errors import AiraError, InputError, public_text
@@ -71,7 +72,7 @@ if TYPE_CHECKING:
     class Stopping(Protocol):
         """`AgentRuntime.stop`."""
 
-        def __call__(self, address: str, *, why: str, by: str) -> Awaitable[tuple[DeviceStop, ...]]: ...
+        def __call__(self, address: str, *, why: str, by: str, code: str = "") -> Awaitable[tuple[DeviceStop, ...]]: ...
 
 
 log = logging.getLogger(__name__)
@@ -140,20 +141,26 @@ def job_services(executor: Executor) -> dict[str, Service]:
 
 
 def stop_service(parts: AgentComponents, executor: Executor, stop: Stopping) -> Service:
-    """`stop`, for the customer of a job and for the agent's own account, by their signatures."""
+    """`stop`, for the customer of a job and for the agent's own account, by their signatures.
+
+    Only the own account may give a code: with it, it hands the job back.
+    """
 
     async def stop_job(request: StopRequest) -> Stopped:
         address = parse_address(request.liability)
         liability = await executor.read(address)
-        if request.by not in (liability.promisee, parts.signer.address) or not request.is_signed:
+        own = parts.signer.address
+        may_stop = request.by == own or (request.by == liability.promisee and not request.code)
+        if not may_stop or not request.is_signed:
             facts = log_event("stop-refused", liability=address, by=request.by)
             log.warning("refused to stop %s for %s", address, request.by, extra=facts)
             raise AiraError(
-                f"{request.by} may not stop {address}",
-                hint="only its customer and the robot's own account may, by their signature",
+                f"{request.by} may not {'hand back' if request.code else 'stop'} {address}",
+                hint="its customer may stop it, and the robot's own account may stop it or hand it back",
                 code="stop-refused",
             )
-        return Stopped(await stop(address, why=request.why, by=request.by))
+        check_stop(request.why, request.code or None)
+        return Stopped(await stop(address, why=request.why, by=request.by, code=request.code))
 
     return stop_job
 

@@ -43,6 +43,8 @@ from mesh.agent.handlers import (
     invalid_topic,
     repeat,
 )
+from mesh.agent.jobs import check_stop
+from mesh.agent.ledger import WrongPhase
 from mesh.agent.objectives import ObjectiveUnfit
 from mesh.agent.orders import HANDLED_FOR, OrderState, robot_stopped
 from mesh.agent.statement import period, read_statement
@@ -74,6 +76,7 @@ from schemas.cid import is_cid
 from schemas.errors import InvalidKey
 from schemas.keys import ReadingKey
 from schemas.model import ModelDescription, topic_gap, topic_of
+from schemas.rpc import Stopped
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Coroutine, Iterator, Mapping
@@ -738,6 +741,24 @@ class Agent(Program):
         """
         since, until = period(first, last)
         return await read_statement(self.chain, self.address, since=since, until=until)
+
+    async def hand_back(self, address: str, code: str, why: str = "") -> Stopped:
+        """Give back the job of the liability at `address`, because the robot can't do it: its customer is refunded.
+
+        At once, in any phase before its end. A job that has begun is stopped as by `Contract.stop`, except that
+        `hold_when_stopped` does not apply: what the robot's devices say is returned. `code` is a word for programs
+        (`tool-broken`), `why` a line of at most 200 characters for people; both become public with the recording. To
+        hand a job back again changes nothing, nor does it after a stop. A handler of the job itself is cancelled by
+        this; it rather raises `JobFailed("why", code="tool-broken")`.
+
+        Raises `InputError` for another code or a `why` that is too long, and `WrongPhase` for a job that has ended, or
+        is not this agent's.
+        """
+        address = parse_address(address)
+        check_stop(why, code)
+        if not self.settings.enable_executor:
+            raise WrongPhase(address, asked="hand back", phase=None)
+        return Stopped(await self.runtime.executor.hand_back(address, code=code, why=why))
 
     async def finish(self, address: str, *, success: bool) -> str:
         """End the job of the liability at `address` now; returns the recording's CID. Raises `WrongPhase`."""

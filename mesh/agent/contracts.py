@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, Type
 import msgspec
 
 from mesh.agent.errors import LiabilityReverted
-from mesh.agent.jobs import Reason, read_reason
+from mesh.agent.jobs import Reason, check_stop, read_reason
 from mesh.agent.validators import accepted_of, signed_answers
 from mesh.base.background import Background, call_in_loop
 from mesh.base.flood import BoundedDict, FairQueue, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import liability_context, log_event
 from mesh.content import ContentUnavailable
-from mesh.errors import AiraError, InputError
+from mesh.errors import AiraError
 from mesh.network import Pump, ServiceFailed, call
 from mesh.network.services import declared
 from mesh.watching.market import JobEvent, query_all, read_event
@@ -45,7 +45,7 @@ from schemas import (
 )
 from schemas.keys import report_selector
 from schemas.rpc import Stopped
-from schemas.signing import LONGEST_WHY, Decline, Rejection, SignedRecord, StopRequest
+from schemas.signing import Decline, Rejection, SignedRecord, StopRequest
 from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
@@ -638,11 +638,16 @@ class Attempt:
     """The contract of the next attempt, after this one has failed."""
 
 
-async def request_stop(session: zenoh.Session, signer: Signer, liability: Liability, why: str) -> Stopped:
-    """Ask the promisor of a liability to stop its job, signed by `signer`. Raises as `Contract.stop`."""
-    if len(why) > LONGEST_WHY:
-        raise InputError(f"the reason has {len(why)} characters, the most are {LONGEST_WHY}", code="why-too-long")
-    request = StopRequest(liability=liability.address, by=signer.address, why=why, time=int(time.time()))
+async def request_stop(
+    session: zenoh.Session, signer: Signer, liability: Liability, why: str, *, code: str | None = None
+) -> Stopped:
+    """Ask the promisor of a liability to stop its job, signed by `signer`; with a `code` it is handed back.
+
+    Raises as `Contract.stop`.
+    """
+    check_stop(why, code)
+    fields: dict[str, Any] = {"liability": liability.address, "why": why, "code": code or "", "time": int(time.time())}
+    request = StopRequest(by=signer.address, **fields)
     signed, until = request.signed_by(signer), time.monotonic() + STOP_SECONDS
     while True:
         left = max(until - time.monotonic(), 0.1)

@@ -73,6 +73,7 @@ from schemas.keys import (
 )
 from schemas.payloads import JSON, STRING, PayloadType, String, defined_by, payload_type
 from schemas.records import DeviceStop, PlaybackPosition
+from schemas.signing import LONGEST_WHY, is_word
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
@@ -92,8 +93,21 @@ if TYPE_CHECKING:
 HANDLER_FAILED: Final = "handler-failed"
 """The code of an exception that has none: one of a handler's own."""
 STOPPED: Final = "stopped"
-"""The code of a job that was stopped."""
+"""The code of a job that its customer stopped."""
+ROBOT_STOPPED: Final = "robot-stopped"
+"""The code of a job that the robot's side stopped; one that it handed back has a code of its own."""
 _CODE: Final = re.compile(r"(.*) \[([a-z0-9-]{1,64})\]", re.DOTALL)
+
+
+def check_stop(why: str, code: str | None = None) -> None:
+    """Raise `InputError` for a reason that is too long, and for a code that a job can't be handed back with."""
+    if len(why) > LONGEST_WHY:
+        raise InputError(f"the reason has {len(why)} characters, the most are {LONGEST_WHY}", code="why-too-long")
+    if code is not None and not is_word(code):
+        hint = "use lower-case letters, digits and hyphens, 64 characters at most"
+        raise InputError(f"{code!r} is not a valid code", hint=hint, code="invalid-code")
+    if code in (STOPPED, ROBOT_STOPPED):
+        raise InputError(f"a job that is handed back can't have the code {code}", code="invalid-code")
 
 
 class Reason(NamedTuple):
@@ -110,10 +124,11 @@ def note_of(error: Exception) -> str:
     return f"{public_text(''.join(format_exception_only(error)).strip())} [{HANDLER_FAILED}]"
 
 
-def note_of_stop(stop: Stop, liability: Liability) -> str:
+def note_of_stop(stop: Stop) -> str:
     """The note at the end of a stopped job's recording. It becomes public with the recording."""
-    who = "the customer" if stop.by == liability.promisee else "the robot's side"
-    return f"stopped by {who}{': ' if stop.why else ''}{public_text(stop.why)} [{STOPPED}]"
+    whats = {STOPPED: "stopped by the customer", ROBOT_STOPPED: "stopped by the robot's side"}
+    what = whats.get(stop.code, "handed back by the robot")
+    return f"{what}{': ' if stop.why else ''}{public_text(stop.why)} [{stop.code}]"
 
 
 def read_reason(recording: Path) -> Reason:
@@ -686,24 +701,30 @@ class Executor:
             await self._begin(job)
 
     @with_liability_context
-    async def stop(self, address: str, *, why: str, by: str) -> tuple[DeviceStop, ...]:
+    async def stop(self, address: str, *, why: str, by: str, code: str = "") -> tuple[DeviceStop, ...]:
         """Stop a job for good, also after a restart, and return what its devices say: each has heard it, or why not.
 
         `by` is the account that asks, which the caller has checked. The devices hear it first, then the handlers are
         cancelled. After that the handlers of `on_stop` bring the robot to a safe state, and the job ends with the code
-        `stopped`: this does not wait for it. To stop a job again tells the devices again. Raises `WrongPhase` for a job
+        `stopped`, or `robot-stopped` if not the customer asks: this does not wait for it. With another `code` the robot
+        hands the job back: it is not held. To stop a job again tells the devices again. Raises `WrongPhase` for a job
         that has ended otherwise.
         """
         telling = self._halt(address, why)  # before anything that takes its time
+        await self.wait_until_open()
         async with self._changing:
-            job, stopped = await self._job(address, asked="stop"), await self._ledger.stopped(address)
+            asked = "hand back" if code else "stop"
+            job, stopped = await self._job(address, asked=asked), await self._ledger.stopped(address)
             if stopped is None:
                 if job.phase not in TO_BE_DONE:
-                    raise WrongPhase(address, asked="stop", phase=job.phase)
-                await self._ledger.stop(address, Stop(why, by))
-                if self._holds_when_stopped:
+                    raise WrongPhase(address, asked=asked, phase=job.phase)
+                whose = STOPPED if by == job.liability.promisee else ROBOT_STOPPED
+                await self._ledger.stop(address, Stop(why, code or whose))
+                if self._holds_when_stopped and not code:
                     await asyncio.to_thread(self.hold.hold, why)
                 self._fetched.pop(address, None)
+                if (preparing := self.preparing.get(address)) is not None:
+                    preparing.cancel()
                 telling = telling or self._halt(address, why)  # it has just begun
                 self._task_group().create_task(self._end_stopped(address), name=f"stop {address}")
         devices = () if telling is None else await telling
@@ -713,6 +734,16 @@ class Executor:
         facts = log_event("job-stopped", by=by, unheard=unheard)
         log.warning("stopped by %s: %s%s", by, why, f"; not heard by {unheard}" if unheard else "", extra=facts)
         return devices
+
+    async def hand_back(self, address: str, *, code: str, why: str) -> tuple[DeviceStop, ...]:
+        """Stop a job that the robot can't do, with a `code` of its own. As `stop`.
+
+        A handler of the job that calls it is cancelled here, and the job is stopped all the same.
+        """
+        context = copy_context()
+        context.run(_playing.set, "")
+        stopping = self.stop(address, why=why, by=self._signer.address, code=code)
+        return await asyncio.shield(asyncio.create_task(stopping, name=f"hand back {address}", context=context))
 
     def _halt(self, address: str, why: str) -> asyncio.Future[tuple[DeviceStop, ...]] | None:
         """Begin to tell the devices of a job that has begun to stop, and cancel its playback; None if it has not."""
@@ -782,9 +813,9 @@ class Executor:
             job = await self._job(address, asked="finish")
             advance(address, job.phase, Phase.COMPLETE)
             if (stop := await self._ledger.stopped(address)) is not None:
-                is_customers = stop.by == job.liability.promisee  # who stops its own work is not paid for it
+                is_customers = stop.code == STOPPED  # who stops its own work is not paid for it
                 success = self._is_paid_when_stopped and is_customers and job.phase is Phase.RUNNING
-                note = note_of_stop(stop, job.liability)
+                note = note_of_stop(stop)
             ended = await self._stop(address) or await self.create_run(job)
             summary = await ended.close(note, sync=False)  # its copy in the store is synced
             if success and (missing := ended.missing + summary.lost_played):

@@ -90,7 +90,7 @@ CREATE TABLE IF NOT EXISTS jobs (
 CREATE TABLE IF NOT EXISTS stops (
     liability TEXT PRIMARY KEY,
     why TEXT NOT NULL,
-    by TEXT NOT NULL
+    code TEXT NOT NULL
 );
 CREATE INDEX IF NOT EXISTS jobs_by_phase ON jobs (phase, changed) WHERE NOT aside;
 CREATE TABLE IF NOT EXISTS outbox (
@@ -138,10 +138,10 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Stop(msgspec.Struct, frozen=True):
-    """A job was stopped: `why`, for people, and by which account."""
+    """A job was stopped: `why`, for people, and the `code` that it ends with."""
 
     why: str
-    by: str
+    code: str
 
 
 class Outgoing(msgspec.Struct, frozen=True):
@@ -227,11 +227,11 @@ class Ledger(RoleLedger):
 
     async def stop(self, liability: str, stop: Stop) -> None:
         """Keep that the job at `liability` (address) was stopped. The first stop counts."""
-        await self._database.run("INSERT OR IGNORE INTO stops VALUES (?, ?, ?)", (liability, stop.why, stop.by))
+        await self._database.run("INSERT OR IGNORE INTO stops VALUES (?, ?, ?)", (liability, stop.why, stop.code))
 
     async def stopped(self, liability: str) -> Stop | None:
         """How the job at `liability` (address) was stopped; None if it was not."""
-        rows = await self._database.rows("SELECT why, by FROM stops WHERE liability = ?", (liability,))
+        rows = await self._database.rows("SELECT why, code FROM stops WHERE liability = ?", (liability,))
         return Stop(*rows[0]) if rows else None
 
     async def job(self, liability: str) -> JobRecord | None:

@@ -296,11 +296,36 @@ async def stop(settings: Settings, address: str, why: str, as_json: bool) -> Non
     """Stop the job of the liability at ADDRESS, with the key of its promisee or its promisor. WHY becomes public with
     the recording.
 
-    The robot's devices hear it, its handlers are cancelled, and the job ends with the code `stopped`. Whether the cost
-    comes back says the description of the model (`aira model show`).
+    The robot's devices hear it, its handlers are cancelled, and the job ends with the code `stopped`, or
+    `robot-stopped` if the promisor stops it. The cost comes back then; if the promisee stops it, that is what the
+    description of the model says (`aira model show`).
 
     The exit code is 1 if the robot does not answer, or a device could not stop.
     """
+    stopped = await _stopped(settings, address, why)
+    _print_stopped(stopped, f"stopped {address}", as_json)
+
+
+@command.command("hand-back", short_help="give the job of one back, as its robot")
+@click.argument("address", type=ADDRESS)
+@click.option("--code", default="handed-back", show_default=True, help="why, for programs: a word such as tool-broken")
+@click.option("--why", default="", help="why, for people: at most 200 characters")
+@with_json
+@with_settings(NetworkSettings, AccountSettings, ChainSettings)
+async def hand_back(settings: Settings, address: str, code: str, why: str, as_json: bool) -> None:
+    """Hand back the job of the liability at ADDRESS, which the robot can't do, with the key of its promisor: the
+    promisee gets the cost back, whatever the description of the model says. The code and the reason become public with
+    the recording.
+
+    A job that has begun is stopped. The robot goes on with the next one, also with `hold_when_stopped`.
+
+    The exit code is 1 if the robot does not answer, or a device could not stop.
+    """
+    stopped = await _stopped(settings, address, why, code=code)
+    _print_stopped(stopped, f"handed back {address}", as_json)
+
+
+async def _stopped(settings: Settings, address: str, why: str, *, code: str | None = None) -> Stopped:
     from mesh.agent.contracts import request_stop
     from mesh.network import Network
     from mesh.role.composition import endpoints_of, load_account
@@ -308,11 +333,15 @@ async def stop(settings: Settings, address: str, why: str, as_json: bool) -> Non
     account = await asyncio.to_thread(load_account, settings)
     async with open_chain(settings) as chain, Network(endpoints_of(settings)) as network:
         liability = await chain.liabilities.get(address)
-        stopped = await request_stop(network.session, account.signer, liability, why)
+        return await request_stop(network.session, account.signer, liability, why, code=code)
+
+
+def _print_stopped(stopped: Stopped, done: str, as_json: bool) -> None:
+    """Print that it is `done`. Raises `RemoteError` if a device did not hear it."""
     if as_json:
         print_json(stopped)
     else:
-        print_line(f"stopped {liability.address}")
+        print_line(done)
         for line in device_lines(stopped):
             print_line(line)
     if missed := [one.device for one in stopped.devices if not one.heard]:

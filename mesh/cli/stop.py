@@ -24,7 +24,7 @@ def command(settings: Settings, *, why: str, is_release: bool, as_json: bool) ->
     """Stop the agents and the devices (`aira edge`) of this machine that use the same data folder. It needs no router
     and no chain.
 
-    Devices hear the stop, and the jobs that have begun end with the code `stopped`; WHY becomes public with their
+    Devices hear the stop, and the jobs that have begun end with the code `robot-stopped`; WHY becomes public with their
     recordings. No agent of the data folder takes or begins a job until `aira stop --release`, also after a restart.
     Jobs that had not begun wait.
 

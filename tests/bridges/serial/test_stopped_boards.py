@@ -141,7 +141,7 @@ async def test_the_owner_stops_a_robot_whose_router_is_down(place: Place, router
             await until(lambda: not robot.runtime.executor.runs, what="the end of the job", seconds=LONG)
             job = await robot.parts.ledger.job(contract.address)
             assert job is not None
-            assert (job.success, job.note) == (False, "stopped by the robot's side: a person fell [stopped]")
+            assert (job.success, job.note) == (False, "stopped by the robot's side: a person fell [robot-stopped]")
             router.start()
 
 

@@ -114,7 +114,11 @@ async def test_the_robot_itself_may_stop_its_job(place: Place) -> None:
         contract = await person.demand(words(place), cost=COST)
         await until(lambda: len(said) == 3)
         await (await robot.contract(contract.address)).stop("a person is in the way")
-        assert (await contract.outcome()).reason == "stopped by the robot's side: a person is in the way"
+        outcome = await contract.outcome()
+        assert (outcome.reason, outcome.code) == (
+            "stopped by the robot's side: a person is in the way",
+            "robot-stopped",
+        )
 
 
 async def test_a_sync_handler_goes_on_but_publishes_nothing_any_more(place: Place) -> None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 GROUPS = {
     "account": ("new", "import", "show"),
     "chain": ("up", "deploy", "status"),
-    "liability": ("show", "list", "watch", "cancel", "claim", "stop"),
+    "liability": ("show", "list", "watch", "cancel", "claim", "stop", "hand-back"),
     "lighthouse": ("create", "list", "info", "join", "leave"),
     "xrt": ("balance", "allowance", "approve", "transfer"),
 }

@@ -1,0 +1,81 @@
+"""`aira liability hand-back` and `stop`: of a robot at work in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from tests.support.commands import AIRA, Serving, aira
+from tests.support.objectives import objective
+from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+MODEL = "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82"
+ROBOT = f"""
+import asyncio
+from mesh import Agent
+agent = Agent("{MODEL}")
+@agent.on_demand
+async def offer(demand):
+    await agent.offer(demand)
+@agent.on("/go")
+async def go(job, message):
+    print("begun", flush=True)
+    await asyncio.Event().wait()
+agent.run()
+"""
+
+
+@contextmanager
+def ordered(folder: Path) -> Iterator[tuple[str, Serving, dict[str, dict[str, str]]]]:
+    """A job that a robot has begun and never ends: its contract, the demand's process, the settings of each role."""
+    (folder / "robot.py").write_text(ROBOT)
+    (folder / "objective.mcap").write_bytes(objective(("/go", "there")))
+    endpoint, port, data = f"tcp/127.0.0.1:{free_port()}", str(free_port()), folder / "data"
+    keys = data / "development"
+    shared = {
+        "AIRA_CONNECT": endpoint,
+        "AIRA_WEB3_HTTP_PROVIDER": f"http://127.0.0.1:{port}",
+        "AIRA_DATA_DIR": str(data),
+        "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
+    }
+    roles = {role: shared | {"AIRA_KEYFILE": str(keys / f"{role}.json")} for role in ("robot", "person", "provider")}
+    words = ("up", "--port", port, "--listen", endpoint, "--data-dir", data, "--engine", "embedded")
+    demand = ("demand", "--model", MODEL, "--objective", folder / "objective.mcap", "--cost", "5 XRT", "--json")
+    with (
+        Serving(*AIRA, *words, says="provider    0x"),
+        Serving(sys.executable, folder / "robot.py", says="account 0x", variables=roles["robot"]) as robot,
+        Serving(*AIRA, *demand, says='"playing"', variables=roles["person"]) as ordering,
+    ):
+        robot.wait_until_said("begun")
+        [job] = json.loads(aira("liability", "list", "--state", "open", "--json", **roles["robot"]).stdout)
+        yield job["address"], ordering, roles
+
+
+def test_an_owner_hands_a_job_back_and_its_customer_is_refunded_and_told_why(tmp_path: Path) -> None:
+    with ordered(tmp_path) as (address, ordering, roles):
+        said = ("--code", "arm-broken", "--why", "the arm is broken")
+        for role in ("person", "provider"):
+            refused = aira("liability", "hand-back", address, *said, **roles[role])
+            assert (refused.returncode, f"may not hand back {address}" in refused.stderr) == (1, True), refused.stderr
+        unfit = aira("liability", "hand-back", address, "--code", "Arm Broken", **roles["robot"])
+        assert (unfit.returncode, "[invalid-code]" in unfit.stderr) == (2, True), unfit.stderr
+        done = aira("liability", "hand-back", address, *said, **roles["robot"])
+        assert (done.returncode, done.stdout) == (0, f"handed back {address}\n"), done.stderr
+        assert ordering.wait() == 1
+        assert "handed back by the robot: the arm is broken (arm-broken); the cost was returned" in ordering.log()
+        late = aira("liability", "hand-back", address, **roles["robot"])
+        assert (late.returncode, late.stderr) == (0, ""), "to hand it back again changes nothing"
+
+
+def test_a_job_that_its_robot_stops_has_another_code_than_one_that_its_customer_stops(tmp_path: Path) -> None:
+    with ordered(tmp_path) as (address, ordering, roles):
+        done = aira("liability", "stop", address, "smoke", "--json", **roles["robot"])
+        assert (done.returncode, json.loads(done.stdout)) == (0, {"devices": []}), done.stderr
+        assert ordering.wait() == 1
+        assert "stopped by the robot's side: smoke (robot-stopped)" in ordering.log()
