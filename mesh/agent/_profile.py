@@ -7,6 +7,7 @@ time says how old it is.
 from __future__ import annotations
 
 import asyncio
+import heapq
 import logging
 import math
 import time
@@ -110,10 +111,17 @@ class OwnProfile:
         """
         jobs, runs = await self._parts.ledger.jobs_by_phase(), self._executor.runs.values()
         waiting, running = sum(jobs.get(phase, 0) for phase in (Phase.INCOMING, Phase.READY)), jobs.get("running", 0)
-        played = sum(one.position / one.total for run in runs if (one := run.playback) is not None and one.total)
-        parallel = self._executor.parallel
-        left = max(0.0, waiting + running - played) if waiting + running >= parallel else 0.0
-        return waiting, math.ceil(self._seconds * left / parallel)
+        played = [one.position / one.total for run in runs if (one := run.playback) is not None and one.total]
+        # After which part of a job each of the `parallel` places is free.
+        free = (
+            [0.0] * (self._executor.parallel - running)
+            + [1 - part for part in played]
+            + [1.0] * (running - len(played))
+        )
+        heapq.heapify(free)
+        for _ in range(min(waiting, MOST_WAITING)):
+            heapq.heapreplace(free, free[0] + 1)
+        return waiting, math.ceil(self._seconds * free[0])
 
     async def present(self) -> Profile:
         """The signed profile of this moment."""

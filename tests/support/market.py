@@ -125,7 +125,7 @@ class Place:
         )
         return dataclasses.replace(settings, **options)
 
-    def agent(self, role: str, model: str = MODEL, **options: Any) -> Agent:
+    def agent(self, role: str, model: str | Path = MODEL, **options: Any) -> Agent:
         """An agent of that role, not yet running; handlers can be added. Always with the same memory."""
         settings = self.settings(role, **options)
         account, chain = self.market.accounts[role], self.chains[role]

@@ -105,8 +105,8 @@ _READ_CONTENT: Final = _grant("get", "aira/agent/*/cid/*")
 """Who holds content serves it in its own space."""
 _READINGS: Final = _grant("subscribe", "aira/agent/*/reading/**")
 _PROFILES: Final = _grant("get subscribe", "aira/agent/*/profile")
-_STOPS: Final = _grant("get", "aira/agent/*/rpc/stop")
-"""Requests to stop a job; their signatures say who asks."""
+_ORDERS: Final = _grant("get", *(f"aira/agent/*/rpc/{service}" for service in ("quote", "accept", "pair", "stop")))
+"""What those who order ask of robots and providers; their signatures say who asks."""
 
 ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
     {
@@ -118,7 +118,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _READ_CONTENT,
             _READINGS,
             _PROFILES,
-            _STOPS,
+            _ORDERS,
         ),
         # A person who orders work also runs an agent.
         "person": (
@@ -129,7 +129,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _READ_CONTENT,
             _READINGS,
             _PROFILES,
-            _STOPS,
+            _ORDERS,
         ),
         "provider": (
             _OWN_SPACE,

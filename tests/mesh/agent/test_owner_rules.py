@@ -11,6 +11,8 @@ import pytest
 
 from mesh import Agent, AiraError, ConfigurationError, Empty, Progress
 from mesh.agent._owner_rules import Hours
+from mesh.agent.contracts import Contract
+from mesh.agent.errors import DemandDeclined
 from mesh.amounts import InvalidAmount
 from tests.mesh.agent.conftest import other_token
 from tests.support.market import MODEL, QUICK_RESEND, Place, offering
@@ -19,6 +21,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from mesh.agent.handlers import Job
     from mesh.agent.trade import Order
+    from schemas import Demand, Verified
 
 STRANGER = "0x000000000000000000000000000000000000bEEF"
 
@@ -152,6 +155,29 @@ async def test_a_burst_of_demands_never_gets_more_contracts_than_the_queue_has_p
         for contract in await asyncio.gather(*contracts):
             assert (await contract.outcome()).success
         assert robot.runtime.executor.at_hand == set()
+
+
+async def test_two_people_who_want_this_robot_alone_never_get_more_contracts_than_the_queue_has_places(
+    place: Place,
+) -> None:
+    """Both find a place when the robot is asked, and one of them none when it makes its offer."""
+    robot, asked = place.agent("robot", queue_limit=1), asyncio.Barrier(2)
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await asked.wait()
+        await robot.offer(demand)
+
+    @robot.on("/go")
+    async def go(job: Job, message: Empty) -> None: ...
+
+    async with place.at_work(robot) as person, place.agent("provider") as other:
+        wanted = [one.demand([("/go", Empty())], cost=1, robot=robot.address) for one in (person, other)]
+        found = await asyncio.gather(*wanted, return_exceptions=True)
+        (declined,) = [one for one in found if isinstance(one, DemandDeclined)]
+        (contract,) = [one for one in found if isinstance(one, Contract)]
+        assert [one.code for one in declined.declines] == ["queue-full"]
+        assert (await contract.outcome()).success
 
 
 @pytest.mark.parametrize("parallel", [1, 2])

@@ -140,6 +140,40 @@ async def test_a_job_changes_the_state_and_the_queue(place: Place) -> None:
         assert last == {robot.address: (0, 1)}
 
 
+async def test_a_robot_that_does_several_jobs_at_once_says_when_its_first_place_is_free(place: Place) -> None:
+    """Two jobs of 2 s are half done, and one waits: it takes the first place that is free, the next job the second."""
+    go_on, model = asyncio.Event(), place.save(DRIVE.encode(), "model.json")
+    robot = Agent(
+        model,
+        settings=place.settings("robot"),
+        account=place.market.accounts["robot"],
+        chain=place.chains["robot"],
+        parallel=2,
+    )
+
+    @robot.on("/drive")
+    async def drive(job: Job, move: Move) -> None: ...
+
+    @robot.on("/stop")
+    async def stop(job: Job, nothing: Empty) -> None:
+        await go_on.wait()
+
+    source = place.save(objective(("/drive", {"speed": 1.0}), ("/stop", Empty())))
+    waits = [(0, 0), (0, 1), (1, 1), (2, 3)]
+    async with place.at_work(offering(robot)) as person:
+        contracts = []
+        for cost, expected in enumerate(waits, 1):
+            contracts.append(await person.demand(source, cost=cost, model=DRIVE.cid))
+
+            async def is_so(expected: tuple[int, int] = expected) -> bool:
+                return await robot.runtime.profile.queue() == expected
+
+            await until_found(is_so, what=f"{expected}")
+        go_on.set()
+        for contract in contracts:
+            assert (await contract.outcome()).success
+
+
 async def test_a_robot_that_is_stopped_or_closed_says_so(place: Place) -> None:
     async with offering(place.agent("robot")) as robot, place.agent("person") as person:
         own = robot.runtime.profile

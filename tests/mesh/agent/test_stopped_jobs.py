@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.agent.errors import DemandDeclined
 from mesh.agent.ledger import Phase
 from mesh.errors import ClosedError, InputError
 from mesh.network import ServiceFailed, call
 from mesh.recording import open_objective
+from mesh.role.local_stop import release, stop_folder
 from schemas import Signer, String
 from schemas.payloads import decode_value
 from schemas.signing import LONGEST_WHY, StopRequest
@@ -88,6 +90,25 @@ async def test_the_next_job_begins_when_the_robot_is_safe(place: Place) -> None:
         assert (await first.outcome()).code == "stopped"
         await in_phase(robot, second, Phase.RUNNING)
     assert order == [first.address, "safe", second.address]
+
+
+async def test_a_robot_that_its_customer_has_stopped_is_held_if_its_owner_said_so(place: Place) -> None:
+    said: list[str] = []
+    robot = speaking(offering(place.agent("robot", hold_when_stopped=True)), said, stuck_at="3")
+    async with place.at_work(robot) as person:
+        first = await person.demand(words(place), cost=COST)
+        await until(lambda: len(said) == 3)
+        second = await person.demand(words(place), cost=COST + 1)
+        await in_phase(robot, second, Phase.READY)
+        await first.stop("smoke")
+        assert (await first.outcome()).code == "stopped"
+        await until(lambda: not robot.runtime.executor._stopping)
+        assert robot.runtime.executor.hold.is_held
+        with raises_with(DemandDeclined, code="demand-declined", match="before its owner releases it"):
+            await person.demand(words(place), cost=COST + 2)
+        await in_phase(robot, second, Phase.READY)
+        assert release(stop_folder(robot.settings)) == 1
+        await in_phase(robot, second, Phase.RUNNING)
 
 
 async def test_a_stranger_can_not_stop_a_job(place: Place) -> None:

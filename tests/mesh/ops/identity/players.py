@@ -56,6 +56,8 @@ WHO = ("arm", "ann", "miner", "judge", "boss", "board", "bridge", "screen", "str
 
 MODEL = "QmWATWQ7fVPP2EFGu71UkfnqhYXDYH566qy47CnJDgvs8u"
 LIABILITY = "0x" + "ee" * 20
+ORDERING = ("quote", "accept", "pair", "stop")
+"""The services by which a robot is chosen and stopped."""
 
 
 def space(agent: str, device: str) -> dict[str, str]:
@@ -68,6 +70,7 @@ def space(agent: str, device: str) -> dict[str, str]:
         "reading": str(ReadingKey(agent, "/a/b")),
         "profile": str(ProfileKey(agent)),
         "rpc": str(RpcKey(agent, "eth/transfer")),
+        **{service: str(RpcKey(agent, service)) for service in ORDERING},
         "eth": str(EthEventKey(agent, "transfer")),
         "cid": str(CidKey(agent, MODEL)),
     }
@@ -125,6 +128,7 @@ OTHER = {
     "other reading",
     "other profile",
     "other rpc",
+    *(f"other {service}" for service in ORDERING),
     "other eth",
     "other cid",
 }
@@ -168,8 +172,8 @@ TOKEN = NOBODY | {
     "bridge": OWN | {"as bridge", "as bridge-turn-0-00000000000000ff"},
 }
 GET = NOBODY | {
-    "arm": OWN | MARKETS | {"other cid", "other profile"},
-    "ann": OWN | MARKETS | {"other cid", "other profile"},
+    "arm": OWN | MARKETS | {"other cid", "other profile"} | {f"other {service}" for service in ORDERING},
+    "ann": OWN | MARKETS | {"other cid", "other profile"} | {f"other {service}" for service in ORDERING},
     "miner": OWN | MARKETS,
     "judge": OWN | MARKETS | {"other cid"},
     "boss": OWN | OTHER | MARKETS,

@@ -36,6 +36,40 @@ def router(site: Site) -> Serving:
     return Serving(*AIRA, "router", *flags, *own, says="admitted by certificate")
 
 
+async def test_a_robot_is_chosen_by_its_price_and_stopped(anvil: Anvil, tmp_path: Path) -> None:
+    site = Site(tmp_path / "site")
+    market = await Market.found(anvil.url, anvil.private_keys, site.endpoint, tmp_path)
+    folders = {
+        name: site.enlist(Member(name=name, address=market.address(name), roles=(role,)))  # type: ignore[arg-type]
+        for name, role in ROLES.items()
+    }
+    done: list[str] = []
+    robot = market.agent("robot", **tls(folders["robot"]))
+    person = market.agent("person", **tls(folders["person"]))
+    variables = market.variables("provider", **tls(folders["provider"]))
+    provider = Serving(*AIRA, "provider", says="serves ", variables=variables)
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand, lighthouse_fee=FEE)
+
+    @robot.on_quote
+    def price(request: object) -> int:
+        return COST
+
+    @robot.on("/say")
+    async def say(job: object, message: Any) -> None:
+        done.append(message.data)
+        await asyncio.Event().wait()
+
+    async with asyncio.timeout(3 * PATIENCE), router(site), provider, robot, person:
+        contract = await person.demand(market.job("word"), cost=2 * COST, robot="cheapest")
+        await until(lambda: bool(done), what="the job under way", seconds=PATIENCE)
+        assert (contract.robot, contract.liability.cost) == (robot.address, COST)
+        await contract.stop("enough")
+        assert (await contract.outcome()).reason == "stopped by the customer: enough"
+
+
 async def test_a_running_job_is_paid_while_one_member_is_revoked_and_another_renewed(
     anvil: Anvil, tmp_path: Path
 ) -> None:

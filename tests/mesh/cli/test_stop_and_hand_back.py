@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 MODEL = "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82"
 ROBOT = f"""
-import asyncio
+import asyncio, sys
 from mesh import Agent
 agent = Agent("{MODEL}")
 @agent.on_demand
@@ -27,13 +28,20 @@ async def offer(demand):
 async def go(job, message):
     print("begun", flush=True)
     await asyncio.Event().wait()
+@agent.on_stop
+async def make_safe(job, why):
+    print("safe after", why, flush=True)
+    await asyncio.sleep(float(sys.argv[1]))
 agent.run()
 """
 
 
 @contextmanager
-def ordered(folder: Path) -> Iterator[tuple[str, Serving, dict[str, dict[str, str]]]]:
-    """A job that a robot has begun and never ends: its contract, the demand's process, the settings of each role."""
+def ordered(folder: Path, *, safe: float = 0.0) -> Iterator[tuple[str, Serving, Serving, dict[str, dict[str, str]]]]:
+    """A job that a robot has begun and never ends: its contract, the processes of demand and robot, the settings.
+
+    The robot is safe `safe` seconds after it was stopped.
+    """
     (folder / "robot.py").write_text(ROBOT)
     (folder / "objective.mcap").write_bytes(objective(("/go", "there")))
     endpoint, port, data = f"tcp/127.0.0.1:{free_port()}", str(free_port()), folder / "data"
@@ -49,16 +57,16 @@ def ordered(folder: Path) -> Iterator[tuple[str, Serving, dict[str, dict[str, st
     demand = ("demand", "--model", MODEL, "--objective", folder / "objective.mcap", "--cost", "5 XRT", "--json")
     with (
         Serving(*AIRA, *words, says="provider    0x"),
-        Serving(sys.executable, folder / "robot.py", says="account 0x", variables=roles["robot"]) as robot,
+        Serving(sys.executable, folder / "robot.py", str(safe), says="account 0x", variables=roles["robot"]) as robot,
         Serving(*AIRA, *demand, says='"playing"', variables=roles["person"]) as ordering,
     ):
         robot.wait_until_said("begun")
         [job] = json.loads(aira("liability", "list", "--state", "open", "--json", **roles["robot"]).stdout)
-        yield job["address"], ordering, roles
+        yield job["address"], ordering, robot, roles
 
 
 def test_an_owner_hands_a_job_back_and_its_customer_is_refunded_and_told_why(tmp_path: Path) -> None:
-    with ordered(tmp_path) as (address, ordering, roles):
+    with ordered(tmp_path) as (address, ordering, _, roles):
         said = ("--code", "arm-broken", "--why", "the arm is broken")
         for role in ("person", "provider"):
             refused = aira("liability", "hand-back", address, *said, **roles[role])
@@ -73,9 +81,15 @@ def test_an_owner_hands_a_job_back_and_its_customer_is_refunded_and_told_why(tmp
         assert (late.returncode, late.stderr) == (0, ""), "to hand it back again changes nothing"
 
 
-def test_a_job_that_its_robot_stops_has_another_code_than_one_that_its_customer_stops(tmp_path: Path) -> None:
-    with ordered(tmp_path) as (address, ordering, roles):
-        done = aira("liability", "stop", address, "smoke", "--json", **roles["robot"])
-        assert (done.returncode, json.loads(done.stdout)) == (0, {"devices": []}), done.stderr
-        assert ordering.wait() == 1
-        assert "stopped by the robot's side: smoke (robot-stopped)" in ordering.log()
+def test_a_job_that_was_stopped_ends_stopped_also_if_its_robot_is_killed_right_after_its_answer(tmp_path: Path) -> None:
+    with ordered(tmp_path, safe=50.0) as (address, ordering, robot, roles):
+        done = aira("liability", "stop", address, "smoke", **roles["person"])
+        robot.end(signal.SIGKILL)
+        assert done.returncode == 0, done.stderr
+        begun = robot.log().count("begun")
+        again = (sys.executable, tmp_path / "robot.py", "0")
+        with Serving(*again, says="account 0x", variables=roles["robot"]) as restarted:
+            assert ordering.wait() == 1
+            assert "stopped by the customer: smoke (stopped)" in ordering.log()
+            assert "safe after smoke" in restarted.log()
+            assert (begun, restarted.log().count("begun")) == (1, 0)
