@@ -91,10 +91,9 @@ async def test_queries_for_others_or_for_missing_blocks_get_no_reply(
         await until_held(session, cid, holders=1)
         served = holder.statistics().served
         for selector in (cid_selector(), cid_selector(cid=not_held), cid_selector("0x" + "ab" * 20, cid)):
-            begin = time.monotonic()
-            replies = await asyncio.to_thread(session.get, selector, timeout=30.0)
-            assert await asyncio.to_thread(list, replies) == []
-            assert time.monotonic() - begin < 10
+            with at_most(5):
+                replies = await asyncio.to_thread(session.get, selector, timeout=30.0)
+                assert await asyncio.to_thread(list, replies) == []
         assert holder.statistics().served == served
         assert (holder.statistics().missed, holder.statistics().ignored) == (1, 1)
 
