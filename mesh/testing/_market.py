@@ -201,8 +201,8 @@ class Market(Lifecycle):
             place = self._place(account.address)
             host = self._hosts[id(agent)] = _Host(agent, account, chain, place, self._session)
         with host.moved():
-            await host.start()
             try:
+                await host.start()
                 yield agent
             finally:
                 await host.end()
