@@ -148,7 +148,11 @@ def stop_service(parts: AgentComponents, executor: Executor, stop: Stopping) -> 
 
     async def stop_job(request: StopRequest) -> Stopped:
         address = parse_address(request.liability)
-        liability = await executor.read(address)
+        try:
+            liability = await executor.read(address)
+        except WrongPhase:
+            hint = "ask again: its contract may be in a block that the agent has not read yet"
+            raise AiraError(f"{address} is not a job of this agent", hint=hint, code="busy") from None
         own = parts.signer.address
         may_stop = request.by == own or (request.by == liability.promisee and not request.code)
         if not may_stop or not request.is_signed:

@@ -60,6 +60,8 @@ class FaultPlan:
     """That a person stops a job."""
     owner_stop: float = 0.0
     """That the owner of a robot stops a job."""
+    hand_back: float = 0.0
+    """That a robot hands a job back."""
     lasts: float = 0.0
     """Seconds after which all faults stop, though people go on; zero: not before people are done, or time is up."""
 
@@ -105,6 +107,7 @@ WHIMS: Final[dict[str, tuple[float, ...]]] = {
     "retry": (0.0, 0.6),
     "stop": (0.0, 0.1, 0.4),
     "owner_stop": (0.0, 0.0, 0.3),
+    "hand_back": (0.0, 0.1, 0.3),
 }
 """What people and robots' owners do by themselves, and how often: in all histories that do not exclude it."""
 KINDS: Final = (*RANGES, *WHIMS)

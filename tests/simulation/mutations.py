@@ -288,6 +288,13 @@ MUTATIONS: Final = (
         "stop,owner_stop",
     ),
     Mutation(
+        "a waiting job that was handed back is done all the same",
+        "mesh.agent.jobs:Executor.stop",
+        "if stopped is None:",
+        "if stopped is None and (not code or job.phase is Phase.RUNNING):",
+        "hand_back",
+    ),
+    Mutation(
         "a job is ordered again before its cost has come back",
         "mesh.agent._attempts:Attempts._end_of",
         "ended = await contract.end(self._report)",
@@ -298,14 +305,14 @@ MUTATIONS: Final = (
         "        from mesh.agent.contracts import Outcome\n"
         "        early = Outcome(success=False, result='', robot=contract.robot, contract=contract.address)\n"
         "        ended = ends[0].result() if ends[0].done() else early",
-        "retry,owner_stop",
+        "retry,hand_back",
     ),
     Mutation(
         "a job is ordered again from the robot that has failed",
         "mesh.agent._attempts:Attempts._next",
         "{one.robot for one in earlier}",
         "()",
-        "retry,owner_stop",
+        "retry,hand_back",
     ),
     Mutation(
         "a job that its customer has stopped is ordered again",
@@ -319,7 +326,7 @@ MUTATIONS: Final = (
         "mesh.agent._attempts:Attempts.run",
         "if not (ended.success or is_customers or number > self._total):",
         "if False:",
-        "retry,owner_stop",
+        "retry,hand_back",
     ),
     Mutation(
         "a demand for one robot is shown to all",

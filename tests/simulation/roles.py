@@ -260,12 +260,21 @@ class RobotRole(Role):
     def _break_off(self, agent: Agent, address: str) -> None:
         """Perhaps hand a new job back soon, or let the robot's owner stop it."""
         whims, draw = self.market.whims, self.market.draw
+        if draw("job-handed-back", whims.hand_back):
+            self._tasks.add(asyncio.ensure_future(self._hand_back(agent, address)))
         if draw("robot-stopped", whims.owner_stop):
             self._tasks.add(asyncio.ensure_future(self._stop(agent, address)))
 
     async def _wait(self) -> None:
         chance = self.market.draw.random
         await asyncio.sleep(chance.uniform(0, chance.choice(BROKEN_OFF_WITHIN)))
+
+    async def _hand_back(self, agent: Agent, address: str) -> None:
+        await self._wait()
+        with suppress(AiraError):  # it has ended
+            await agent.hand_back(address, "lamp-broken", "the lamp is broken")
+            self.market.trace(self.name, "handed-back", liability=address)
+            self.market.steps.attempts.stopped(address, self.name)
 
     async def _stop(self, agent: Agent, address: str) -> None:
         await self._wait()

@@ -19,7 +19,7 @@ from tests.simulation.runs import numbers_in, ranges
 
 FAULTS = (
     "crash,crash_every,delay,drop,duplicate,late,leave_out,lost_after_sending,partition_every,preempt,"
-    "withdraw,revoke,short_lived,pair,retry,stop,owner_stop"
+    "withdraw,revoke,short_lived,pair,retry,stop,owner_stop,hand_back"
 )
 
 
@@ -28,7 +28,7 @@ HAPPEN = {
     *("answer-spoilt", "node-late", "node-unreachable", "reorganisation", "transaction-left-out"),
     *("clock-jump", "crash-planned", "disk-full", "kill", "partition", "power-failure", "write-refused"),
     *("allowance-revoked", "order-short-lived", "order-withdrawn", "order-paired", "order-retried"),
-    *("job-stopped", "robot-stopped"),
+    *("job-stopped", "robot-stopped", "job-handed-back"),
 }
 """Kinds of faults as they are counted."""
 

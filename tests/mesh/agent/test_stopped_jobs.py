@@ -213,6 +213,31 @@ async def test_a_job_that_has_not_begun_is_refunded_and_never_begins(place: Plac
     assert stopped == ["enough"]
 
 
+async def test_a_stop_is_obeyed_that_comes_before_the_robot_has_read_of_the_contract(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, asked = speaking(offering(place.agent("robot")), [], stuck_at="3"), asyncio.Event()
+    async with place.at_work(robot) as person:
+        take, read = robot.runtime.new_liability, robot.runtime.executor.read
+
+        async def take_late(*liability: Any, **orders: Any) -> None:
+            await asked.wait()
+            await take(*liability, **orders)
+
+        async def note(address: str) -> Any:
+            try:
+                return await read(address)
+            finally:
+                asked.set()
+
+        monkeypatch.setattr(robot.runtime, "new_liability", take_late)
+        monkeypatch.setattr(robot.runtime.executor, "read", note)
+        contract = await person.demand(words(place), cost=COST)
+        await contract.stop("too late for me")
+        outcome = await contract.outcome()
+    assert (outcome.success, outcome.code) == (False, "stopped")
+
+
 async def test_a_job_that_has_ended_can_not_be_stopped_and_stopping_twice_changes_nothing(place: Place) -> None:
     said: list[str] = []
     robot = speaking(offering(place.agent("robot")), said)
