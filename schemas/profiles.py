@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
-from msgspec import Meta
+from msgspec import Meta, field
 
 from schemas.address import parse_address
 from schemas.cid import is_cid
@@ -20,13 +20,19 @@ LONGEST_NAME: Final = 80
 """Characters of a robot's name, and of its place."""
 LONGEST_ABOUT: Final = 200
 """Characters of what a robot says of itself."""
-LARGEST_PROFILE: Final = 4096
+LARGEST_PROFILE: Final = 8192
 """Bytes of an encoded profile; receivers refuse more."""
 MOST_WAITING: Final = 1_000_000
 """Jobs in a queue, and seconds of a wait, that a profile can state."""
 
+MOST_READINGS: Final = 4
+"""Topics whose latest readings a profile has."""
+LONGEST_READING: Final = 80
+"""Characters of a reading in a profile, and of its topic."""
+
 _Waiting: TypeAlias = Annotated[int, Meta(ge=0, le=MOST_WAITING)]
 _Name: TypeAlias = Annotated[str, Meta(max_length=LONGEST_NAME)]
+_Reading: TypeAlias = Annotated[str, Meta(max_length=LONGEST_READING)]
 
 
 class Profile(SignedRecord, frozen=True, kw_only=True):
@@ -35,7 +41,8 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
     `agent` is the EIP-55 address of its account, `model` a CIDv0 or empty. `name`, `about` and `place` are plain text
     that the owner chose: two robots may have one name. `picture` is the CID of an image, `price` what a job usually
     costs (`5 XRT`); both may be empty. `queue` jobs wait, and a new one would begin in about `wait` seconds. `stopped`
-    says that somebody stopped the robot, `closed` that it takes no jobs now. `time` is the robot's time of day in Unix
+    says that somebody stopped the robot, `closed` that it takes no jobs now. `readings` are the latest ones that the
+    robot has published outside of jobs, as plain text by their topics. `time` is the robot's time of day in Unix
     seconds. Trust it only if it `is_signed`, and is on the agent's key.
     """
 
@@ -52,16 +59,19 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
     state: ProfileState = "idle"
     queue: _Waiting = 0
     wait: _Waiting = 0
+    readings: Annotated[dict[_Reading, _Reading], Meta(max_length=MOST_READINGS)] = field(default_factory=dict)
     time: int
 
     def __post_init__(self) -> None:
         Record.__post_init__(self)
-        for field in ("name", "about", "place"):
-            if why := text_fault(field, getattr(self, field)):
-                raise InvalidRecord("Profile", f"{field}: {why}")
-        for field in ("model", "picture"):
-            if (cid := getattr(self, field)) and not is_cid(cid):
-                raise InvalidRecord("Profile", f"{field}: expected a CIDv0")
+        for name in ("name", "about", "place"):
+            if why := text_fault(name, getattr(self, name)):
+                raise InvalidRecord("Profile", f"{name}: {why}")
+        if not all(text.isprintable() for reading in self.readings.items() for text in reading):
+            raise InvalidRecord("Profile", "readings: expected plain text")
+        for name in ("model", "picture"):
+            if (cid := getattr(self, name)) and not is_cid(cid):
+                raise InvalidRecord("Profile", f"{name}: expected a CIDv0")
         if self.price and not re.fullmatch(PRICE, self.price):
             raise InvalidRecord("Profile", "price: expected one like `5 XRT`")
         try:

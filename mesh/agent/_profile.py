@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import heapq
+import json
 import logging
 import math
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
 
 from mesh.agent.ledger import Phase
 from mesh.base.flood import Rate
@@ -22,7 +25,8 @@ from mesh.network.services import answering
 from mesh.role.database import LedgerUnusable
 from schemas import ProfileKey
 from schemas.cid import is_cid
-from schemas.profiles import MOST_WAITING, Profile, ProfileState, text_fault
+from schemas.payloads import plain_value
+from schemas.profiles import LONGEST_READING, MOST_READINGS, MOST_WAITING, Profile, ProfileState, text_fault
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,11 +38,14 @@ if TYPE_CHECKING:
     from mesh.agent.jobs import Executor
     from mesh.settings import ProfileSettings
     from schemas.model import ModelDescription
+    from schemas.payloads import PayloadType
 
 log = logging.getLogger(__name__)
 
 LARGEST_PICTURE: Final = 512 * 1024
 """Bytes of a robot's picture."""
+LARGEST_TEXT: Final = 4096
+"""Bytes of a reading that is shown as text."""
 ASKED: Final = Rate(per_second=20.0, burst=100)
 """Queries for the profile that are answered."""
 INTERVAL: Final = 1.0
@@ -64,6 +71,7 @@ class OwnProfile:
         self._price = "" if description is None else description.price
         self._seconds = float((None if description is None else description.seconds) or 0)
         self._changed = asyncio.Event()
+        self._readings: dict[str, tuple[bytes, PayloadType]] = {}
         self.is_stopped: Callable[[], bool] = lambda: False
         self.is_closed: Callable[[], bool] = lambda: False
 
@@ -99,6 +107,12 @@ class OwnProfile:
             raise _unusable(f"{settings.picture} is no picture that others can show")
         self._parts.store.release("picture")  # that of an earlier run
         return self._parts.store.put_bytes(data, pin="picture")
+
+    def read(self, topic: str, payload: bytes, kind: PayloadType) -> None:
+        """The robot has published a reading. The profile has those of the first `MOST_READINGS` topics."""
+        is_shown = topic in self._readings or len(self._readings) < MOST_READINGS
+        if is_shown and len(topic) <= LONGEST_READING:
+            self._readings[topic] = payload, kind
 
     def changed(self) -> None:
         """Something that the profile says may have changed."""
@@ -138,6 +152,7 @@ class OwnProfile:
             state=await self._state(),
             queue=min(waiting, MOST_WAITING),
             wait=min(seconds, MOST_WAITING),
+            readings={topic: _text(*reading) for topic, reading in [*self._readings.items()]},
             time=int(time.time()),
         )
         return profile.signed_by(signer)
@@ -175,6 +190,17 @@ class OwnProfile:
             await asyncio.sleep(INTERVAL)
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._changed.wait(), LOOK)
+
+
+def _text(payload: bytes, kind: PayloadType) -> str:
+    """A reading as a line of text."""
+    if len(payload) > LARGEST_TEXT:
+        return f"{len(payload):,} bytes"
+    value = plain_value(payload, kind)
+    if isinstance(value, bytes):
+        return f"{len(value):,} bytes"
+    text = value if isinstance(value, str) else json.dumps(msgspec.to_builtins(value), ensure_ascii=False)
+    return "".join(letter if letter.isprintable() else "\ufffd" for letter in text[:LONGEST_READING])
 
 
 def _unusable(why: str) -> ConfigurationError:

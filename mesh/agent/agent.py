@@ -810,14 +810,16 @@ class Agent(Program):
         return await self.parts.exchange.fetch(cid, size_limit=limit, timeout=timeout)
 
     def publish(self, topic: str, message: object) -> None:
-        """Publish a reading on a topic of the agent, outside any job. Those who listen now get it; nobody keeps it.
+        """Publish a reading on a topic of the agent, outside any job. Those who listen now get it.
 
-        `message` is anything that `Job.publish` accepts. Raises `InputError` for an invalid topic or message, or one
-        that is too large, `ClosedError`, and `ConfigurationError` if the agent has no account.
+        `message` is anything that `Job.publish` accepts. The latest ones of four topics are in the robot's profile.
+        Raises `InputError` for an invalid topic or message, or one that is too large, `ClosedError`, and
+        `ConfigurationError` if the agent has no account.
         """
         session, key = self.parts.network.session, str(ReadingKey(self.address, topic))
         payload, kind = _encoded(topic, message)
         sending.put(session, key, payload, encoding=kind.zenoh_encoding)
+        self.runtime.profile.read(topic, payload, kind)
 
     def readings(self, topic: str = "/**", *, agent: str = "*") -> ReadingSubscription:
         """What agents publish outside of jobs: `async with agent.readings("/battery") as readings`, then iterate.

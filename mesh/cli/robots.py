@@ -46,9 +46,10 @@ async def command(settings: Settings, model: str | None, timeout: float, as_json
         print_json({"lighthouse": channel.lighthouse, "robots": [msgspec.to_builtins(robot) for robot in robots]})
     elif robots:
         rows = [
-            (robot.name, robot.address, doing(robot), robot.price, record_of(robot), robot.place) for robot in robots
+            (robot.name, robot.address, doing(robot), robot.price, record_of(robot), robot.place, reads(robot))
+            for robot in robots
         ]
-        print_table(("name", "address", "doing", "price", "record", "place"), rows)
+        print_table(("name", "address", "doing", "price", "record", "place", "reads"), rows)
     else:
         print_line(f"no robots{' of this model' if named else ''} on {channel.lighthouse}")
 
@@ -80,6 +81,11 @@ def doing(robot: Robot) -> str:
     if robot.wait:
         words.append(f"about {format_duration(robot.wait * 10**9)}")
     return ", ".join(words)
+
+
+def reads(robot: Robot) -> str:
+    """What a robot reads just now, for people."""
+    return ", ".join(f"{topic} {text}" for topic, text in robot.readings.items())
 
 
 def record_of(robot: Robot) -> str:

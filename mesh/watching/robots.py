@@ -76,6 +76,8 @@ class Robot(msgspec.Struct, frozen=True, kw_only=True):
     """Jobs that wait."""
     wait: int
     """Seconds after which a new job would begin, estimated."""
+    readings: dict[str, str]
+    """What it reads just now: the latest text that it has published on each topic outside of jobs, four at most."""
     time: int
     """When it said this, by its clock: Unix seconds."""
     paid: int | None = None

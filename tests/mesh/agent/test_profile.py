@@ -61,6 +61,22 @@ async def test_a_robot_says_what_its_settings_and_its_model_say(place: Place) ->
         assert await person.robots(MODEL) == []
 
 
+async def test_a_robot_says_what_it_reads_just_now(place: Place) -> None:
+    async with offering(place.agent("robot")) as robot, place.agent("person") as person:
+        for volts in (11.5, 12.5):
+            robot.publish("/battery", volts)
+        for topic, value in (("/state", "\x1b[2Jdocked" + "x" * 100), ("/pose", {"x": 1}), ("/picture", b"x" * 9000)):
+            robot.publish(topic, value)
+        robot.publish("/one/too/many", 1)
+        (seen,) = [one for one in await person.robots() if one.address == robot.address]
+        assert seen.readings == {
+            "/battery": "12.5",
+            "/state": "\ufffd[2Jdocked" + "x" * 70,
+            "/pose": '{"x": 1}',
+            "/picture": "9,000 bytes",
+        }
+
+
 async def test_an_agent_that_only_orders_is_no_robot(place: Place) -> None:
     async with offering(place.agent("robot")) as robot, place.agent("person", name="Ann") as person:
         await profile_of(robot, person)

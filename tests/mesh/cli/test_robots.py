@@ -50,7 +50,7 @@ async def test_robots_are_listed_also_without_a_node(place: Place, capsys: pytes
         await coroutine(command)(settings, None, timeout=60.0, as_json=False)
         shown = capsys.readouterr()
         head, row = shown.out.splitlines()
-        assert cells(head) == ["name", "address", "doing", "price", "record", "place"]
+        assert cells(head) == ["name", "address", "doing", "price", "record", "place", "reads"]
         assert cells(row) == ["Lift 1", robot.address, "idle", "5 XRT", "unknown", "Hall 3"]
         assert shown.err.startswith("aira: no records: ")
         await coroutine(command)(settings, DRIVE.cid, timeout=60.0, as_json=True)
@@ -68,7 +68,7 @@ def cells(line: str) -> list[str]:
 
 def robot(**fields: object) -> Robot:
     texts = dict.fromkeys(("model", "name", "about", "picture", "place", "price"), "")
-    facts = {"address": ROBOT.address, "state": "idle", "queue": 0, "wait": 0, "time": 0} | texts
+    facts = {"address": ROBOT.address, "state": "idle", "queue": 0, "wait": 0, "readings": {}, "time": 0} | texts
     return Robot(**facts | fields)  # type: ignore[arg-type]
 
 
