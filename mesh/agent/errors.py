@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
-from mesh.errors import AiraError, InputError, RemoteError, public_text
+from mesh.errors import AiraError, ClosedError, InputError, RemoteError, public_text
 from schemas.signing import LONGEST_DETAIL, is_word
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from schemas.signing import Decline
+
+
+ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: demands stay open until their deadline")
+"""The error of those who wait for something when the agent ends."""
 
 
 class OrderClosed(AiraError, code="order-closed"):

@@ -16,7 +16,7 @@ import time
 import types
 import weakref
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -209,6 +209,17 @@ class Job:
 
     def __repr__(self) -> str:
         return f"Job({self.liability.address}, position={self.position}, topics={sorted(self.topics)})"
+
+    async def _handle_one(self, handle: Callable[[Job, Played], Awaitable[object]], message: Played) -> None:
+        """Await the handler of a played message. Raises what it raises, and for one that was cancelled `AiraError`."""
+        try:
+            await handle(self, message)
+        except asyncio.CancelledError:
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                raise
+            # A task group would take this task for one that it cancelled itself, and the job for done.
+            raise AiraError(f"the handler of {message.topic} was cancelled", code="handler-cancelled") from None
 
     def publish(self, topic: str, message: object) -> None:
         """Publish on a topic of the job, as a device does. The message becomes part of the recording.

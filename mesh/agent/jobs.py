@@ -210,18 +210,6 @@ def incomplete(liability: str, missing: int) -> AiraError:
     return AiraError(why, code="recording-incomplete")
 
 
-async def handle_one(handle: Handle, job: Job, message: Played) -> None:
-    """Await the handler of a played message. Raises what it raises, and for one that was cancelled `AiraError`."""
-    try:
-        await handle(job, message)
-    except asyncio.CancelledError:
-        task = asyncio.current_task()
-        if task is not None and task.cancelling():
-            raise
-        # A task group would take this task for one that it cancelled itself, and the job for done.
-        raise AiraError(f"the handler of {message.topic} was cancelled", code="handler-cancelled") from None
-
-
 class JobRun(Job):
     """A job while it is worked on: `open`, then `play` once, then `close` or `suspend`. After that it can't be used.
 
@@ -400,7 +388,7 @@ class JobRun(Job):
         while (message := await self._queue.get()) is not None and not self._closing:
             if handle is not None:
                 self.playing = message
-                await handle_one(handle, self, message)
+                await self._handle_one(handle, message)
             self.position += 1
 
     def _wait_for_devices(self) -> bool:

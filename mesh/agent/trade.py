@@ -28,7 +28,7 @@ from mesh.agent.contracts import (
     report,
     seen_offers,
 )
-from mesh.agent.errors import Declined, DemandDeclined, OtherRobot
+from mesh.agent.errors import ENDED, Declined, DemandDeclined, OtherRobot
 from mesh.agent.orders import (
     ALONE,
     EQUAL_DECLINED,
@@ -48,7 +48,7 @@ from mesh.base.flood import SENDERS, KnownSenders, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.chain import Allowances, OrderAlreadyUsed
-from mesh.errors import AiraError, ClosedError
+from mesh.errors import AiraError
 from mesh.network import PresentAgents
 from mesh.role.database import LedgerUnusable
 from schemas import Demand, Offer, Withdrawal, decode
@@ -199,7 +199,6 @@ class Order:
         return await self._trader.contract_unless_declined(self._traded, on_progress)
 
 
-ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: demands stay open until their deadline")
 STOP_SECONDS: Final = 3.0
 """For which an agent that ends waits until the providers have confirmed that they use none of its offers."""
 

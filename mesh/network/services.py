@@ -211,9 +211,13 @@ async def answering(
                 log.debug("a query of %s is not answered: %s", query.selector, error)
 
     async with Background() as tasks:
+        is_open = True
 
         def begin(query: zenoh.Query) -> None:
-            tasks.start(answer_one(query), f"answer {selector}")
+            if is_open:
+                tasks.start(answer_one(query), f"answer {selector}")
+            else:  # it came while this ended
+                query.drop()  # type: ignore[no-untyped-call]
 
         def receive(query: zenoh.Query) -> None:
             # Zenoh's thread drops what is too much, so that the event loop is not kept busy.
@@ -225,8 +229,11 @@ async def answering(
                 drops.count("recall")
                 query.drop()  # type: ignore[no-untyped-call]
 
-        with declared(session, session.declare_queryable(selector, receive, complete=True)):
-            yield
+        try:
+            with declared(session, session.declare_queryable(selector, receive, complete=True)):
+                yield
+        finally:
+            is_open = False
 
 
 async def call(

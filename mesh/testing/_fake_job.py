@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.agent import require_fit
 from mesh.agent.handlers import Job
-from mesh.agent.jobs import handle_one, note_of, reason_in
+from mesh.agent.jobs import note_of, reason_in
 from mesh.agent.objectives import ObjectiveUnfit
 from mesh.base.background import in_daemon_thread
 from mesh.base.log_context import log_event
@@ -162,10 +162,10 @@ class _Run:
             handler = self._handlers.find(message.topic)
             is_async = handler is None or inspect.iscoroutinefunction(inspect.unwrap(handler.handler))
             if is_async:
-                await handle_one(self._handlers.handle, run, message)
+                await run._handle_one(self._handlers.handle, message)
             else:
                 with loop.outside():
-                    await handle_one(self._handlers.handle, run, message)
+                    await run._handle_one(self._handlers.handle, message)
             run.position += 1
 
 

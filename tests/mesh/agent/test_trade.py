@@ -265,7 +265,7 @@ async def test_an_agent_can_wait_for_a_contract_of_others(place: Place) -> None:
         contract = await stranger.contract(address.lower())
         outcome = asyncio.create_task(contract.outcome())
         result = await robot.finish(address, success=True)
-        assert await outcome == Outcome(success=True, result=result, robot=robot.address)
+        assert await outcome == Outcome(success=True, result=result, robot=robot.address, contract=address)
 
 
 async def test_a_contract_that_has_ended_has_its_outcome_at_once(place: Place) -> None:

@@ -89,7 +89,8 @@ async def test_both_parties_see_how_the_validator_judges_and_that_the_work_count
         assert (contract.liability.validator, contract.liability.validator_fee) == (juror.signer.address, juror.fee)
         ending = asyncio.create_task(contract.outcome(on_progress=heard.append))
         report = await judge(place, juror, robot, contract, success=True)
-        expected = Outcome(success=True, result=report.result, reports=(report,), robot=robot.address)
+        facts: dict[str, Any] = {"robot": robot.address, "contract": contract.address}
+        expected = Outcome(success=True, result=report.result, reports=(report,), **facts)
         assert await ending == expected
         await until(lambda: told == [report])
     assert seen[0] is not None
