@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from schemas import ZERO_ADDRESS
+from tests.support.market import offering
 from tests.support.objectives import objective
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from mesh.agent.agent import Agent
@@ -38,6 +42,17 @@ def speaking(robot: Agent, said: list[str], *, stuck_at: str = "") -> Agent:
         job.publish("/said", message)
 
     return robot
+
+
+@asynccontextmanager
+async def half_way(place: Place, **settings: Any) -> AsyncIterator[tuple[Agent, Agent, Contract]]:
+    """A robot, with these settings, that has said three of six words and is stuck: it, the person, their contract."""
+    said: list[str] = []
+    robot = speaking(offering(place.agent("robot", **settings)), said, stuck_at="3")
+    async with place.at_work(robot) as person:
+        contract = await person.demand(words(place), cost=COST)
+        await until(lambda: len(said) == 3)
+        yield robot, person, contract
 
 
 class Paying:

@@ -13,7 +13,7 @@ from mesh.errors import InputError
 from mesh.network import ServiceFailed, call
 from schemas import Signer, String, cid_of_bytes
 from schemas.signing import LONGEST_WHY, StopRequest
-from tests.mesh.agent.restarts import COST, WORDS, speaking, words
+from tests.mesh.agent.restarts import COST, WORDS, half_way, speaking, words
 from tests.mesh.agent.test_stopped_jobs import recorded
 from tests.support.market import in_phase, offering, offering_unseen
 from tests.support.raising import raises_with
@@ -150,11 +150,7 @@ async def test_to_hand_a_job_back_twice_changes_nothing_and_after_its_end_it_fai
 
 
 async def test_a_job_that_its_customer_has_stopped_can_not_be_handed_back_any_more(place: Place) -> None:
-    said: list[str] = []
-    robot = speaking(offering(place.agent("robot")), said, stuck_at="3")
-    async with place.at_work(robot) as person:
-        contract = await person.demand(words(place), cost=COST)
-        await until(lambda: len(said) == 3)
+    async with half_way(place) as (robot, _, contract):
         await contract.stop("no need")
         await robot.hand_back(contract.address, "arm-broken")
         assert (await contract.outcome()).reason == "stopped by the customer: no need"
@@ -185,11 +181,7 @@ async def test_a_job_is_handed_back_by_a_robot_that_was_restarted(place: Place) 
 
 
 async def test_neither_a_stranger_nor_the_customer_can_hand_a_job_back(place: Place) -> None:
-    said: list[str] = []
-    robot = speaking(offering(place.agent("robot")), said, stuck_at="3")
-    async with place.at_work(robot) as person:
-        contract = await person.demand(words(place), cost=COST)
-        await until(lambda: len(said) == 3)
+    async with half_way(place) as (robot, person, contract):
         stranger, customer = Signer(b"\7" * 32), person.parts.signer
         fields: dict[str, Any] = {"liability": contract.address, "why": "no", "time": int(time.time())}
         forged = StopRequest(by=robot.address, code="no", **fields)
@@ -207,11 +199,7 @@ async def test_neither_a_stranger_nor_the_customer_can_hand_a_job_back(place: Pl
 
 @pytest.mark.parametrize("code", ["", "Two Words", "a/b", "x" * 65, "stopped", "robot-stopped"])
 async def test_a_job_is_not_handed_back_with_a_code_that_is_no_word_of_its_own(place: Place, code: str) -> None:
-    said: list[str] = []
-    robot = speaking(offering(place.agent("robot")), said, stuck_at="3")
-    async with place.at_work(robot) as person:
-        contract = await person.demand(words(place), cost=COST)
-        await until(lambda: len(said) == 3)
+    async with half_way(place) as (robot, _, contract):
         with raises_with(InputError, code="invalid-code"):
             await robot.hand_back(contract.address, code)
         with raises_with(InputError, code="why-too-long"):
@@ -221,11 +209,7 @@ async def test_a_job_is_not_handed_back_with_a_code_that_is_no_word_of_its_own(p
 
 async def test_a_job_can_not_be_handed_back_as_if_its_customer_had_stopped_it(place: Place) -> None:
     """Its own signature would else be worth the pay of a job that its customer stopped."""
-    said: list[str] = []
-    robot = speaking(offering(place.agent("robot")), said, stuck_at="3")
-    async with place.at_work(robot) as person:
-        contract = await person.demand(words(place), cost=COST)
-        await until(lambda: len(said) == 3)
+    async with half_way(place) as (robot, _, contract):
         request = StopRequest(liability=contract.address, by=robot.address, why="", time=0, code="stopped")
         with raises_with(ServiceFailed, code="service-failed", match="can't have the code stopped"):
             await call(robot.network.session, robot.address, "stop", request.signed_by(robot.parts.signer))
@@ -233,12 +217,8 @@ async def test_a_job_can_not_be_handed_back_as_if_its_customer_had_stopped_it(pl
 
 
 async def test_what_a_job_is_handed_back_for_shows_neither_paths_nor_keys(place: Place) -> None:
-    said: list[str] = []
-    robot = speaking(offering(place.agent("robot")), said, stuck_at="3")
     why = "/home/robot/arm.log says that https://node.example/v3/SECRETKEY refused"
-    async with place.at_work(robot) as person:
-        contract = await person.demand(words(place), cost=COST)
-        await until(lambda: len(said) == 3)
+    async with half_way(place) as (robot, _, contract):
         await robot.hand_back(contract.address, "arm-broken", why)
         outcome = await contract.outcome()
         found = await recorded(contract)

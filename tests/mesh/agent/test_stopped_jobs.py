@@ -18,7 +18,7 @@ from mesh.role.local_stop import release, stop_folder
 from schemas import Signer, String
 from schemas.payloads import decode_value
 from schemas.signing import LONGEST_WHY, StopRequest
-from tests.mesh.agent.restarts import COST, WORDS, speaking, words
+from tests.mesh.agent.restarts import COST, WORDS, half_way, speaking, words
 from tests.support.market import in_phase, offering
 from tests.support.raising import raises_with
 from tests.support.waiting import until
@@ -93,11 +93,7 @@ async def test_the_next_job_begins_when_the_robot_is_safe(place: Place) -> None:
 
 
 async def test_a_robot_that_its_customer_has_stopped_is_held_if_its_owner_said_so(place: Place) -> None:
-    said: list[str] = []
-    robot = speaking(offering(place.agent("robot", hold_when_stopped=True)), said, stuck_at="3")
-    async with place.at_work(robot) as person:
-        first = await person.demand(words(place), cost=COST)
-        await until(lambda: len(said) == 3)
+    async with half_way(place, hold_when_stopped=True) as (robot, person, first):
         second = await person.demand(words(place), cost=COST + 1)
         await in_phase(robot, second, Phase.READY)
         await first.stop("smoke")
@@ -112,11 +108,7 @@ async def test_a_robot_that_its_customer_has_stopped_is_held_if_its_owner_said_s
 
 
 async def test_a_stranger_can_not_stop_a_job(place: Place) -> None:
-    said: list[str] = []
-    robot = speaking(offering(place.agent("robot")), said, stuck_at="3")
-    async with place.at_work(robot) as person:
-        contract = await person.demand(words(place), cost=COST)
-        await until(lambda: len(said) == 3)
+    async with half_way(place) as (robot, person, contract):
         stranger, customer = Signer(b"\7" * 32), person.address
         fields: dict[str, Any] = {"liability": contract.address, "why": "no", "time": int(time.time())}
         forged = StopRequest(by=customer, **fields)
@@ -129,11 +121,7 @@ async def test_a_stranger_can_not_stop_a_job(place: Place) -> None:
 
 
 async def test_the_robot_itself_may_stop_its_job(place: Place) -> None:
-    said: list[str] = []
-    robot = speaking(offering(place.agent("robot")), said, stuck_at="3")
-    async with place.at_work(robot) as person:
-        contract = await person.demand(words(place), cost=COST)
-        await until(lambda: len(said) == 3)
+    async with half_way(place) as (robot, _, contract):
         await (await robot.contract(contract.address)).stop("a person is in the way")
         outcome = await contract.outcome()
         assert (outcome.reason, outcome.code) == (
