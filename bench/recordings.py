@@ -30,21 +30,9 @@ if TYPE_CHECKING:
 ROUNDS: Final = 3
 KEY: Final = "aira/bench/topic"
 HERTZ: Final = 1000
-LIABILITY: Final = Liability(
-    address=ZERO_ADDRESS,
+LIABILITY: Final = Liability.of_nobody(
     model=cid_of_bytes(b"model"),
     objective=cid_of_bytes(b"objective"),
-    result="",
-    promisee=ZERO_ADDRESS,
-    promisor=ZERO_ADDRESS,
-    lighthouse=ZERO_ADDRESS,
-    lighthouse_fee=0,
-    token=ZERO_ADDRESS,
-    cost=0,
-    validator=ZERO_ADDRESS,
-    validator_fee=0,
-    is_success=False,
-    is_finalized=False,
 )
 """The contract of the measured job; no chain knows it."""
 

@@ -38,10 +38,9 @@ from mesh.network import Endpoints, Network
 from mesh.recording import pack_values
 from mesh.role.running import fail
 from mesh.settings import Settings
-from schemas import ZERO_ADDRESS, Empty, Liability, LiabilityTopicKey, Signer, cid_of_bytes, event_selector
+from schemas import Empty, Liability, LiabilityTopicKey, Signer, cid_of_bytes, event_selector
 from schemas.address import checksum_address
 from schemas.keys import EventKey, parse_agent_key
-from schemas.records import UInt256
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -136,21 +135,11 @@ def expect(robot: Connection, word: str) -> None:
 
 def made_up(promisee: str, promisor: str) -> Liability:
     """A liability that exists nowhere else; its objective is the one that the robot has."""
-    return Liability(
+    return Liability.of_nobody(
         address=checksum_address(secrets.token_bytes(20)),
         model=cid_of_bytes(b"bench"),
-        objective="",
-        result="",
         promisee=promisee,
         promisor=promisor,
-        lighthouse=ZERO_ADDRESS,
-        lighthouse_fee=UInt256(0),
-        token=ZERO_ADDRESS,
-        cost=UInt256(0),
-        validator=ZERO_ADDRESS,
-        validator_fee=UInt256(0),
-        is_success=False,
-        is_finalized=False,
     )
 
 

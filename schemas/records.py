@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
 import msgspec
 from msgspec.structs import force_setattr
 
+from schemas.address import ZERO_ADDRESS
 from schemas.decoding import InvalidData, decode_json
 from schemas.errors import InvalidRecord
 
@@ -82,6 +83,14 @@ class Liability(Record, frozen=True, kw_only=True, rename="camel"):
     validator_fee: UInt256
     is_success: bool
     is_finalized: bool
+
+    @classmethod
+    def of_nobody(cls, **terms: Any) -> Self:
+        """An open liability that no chain knows; where `terms`, its fields, say nothing, it is for nothing."""
+        parties = dict.fromkeys(("address", "promisee", "promisor", "lighthouse", "token", "validator"), ZERO_ADDRESS)
+        files = dict.fromkeys(("model", "objective", "result"), "")
+        amounts = dict.fromkeys(("lighthouse_fee", "cost", "validator_fee"), 0)
+        return cls(**(parties | files | amounts | {"is_success": False, "is_finalized": False} | terms))
 
     @property
     def state(self) -> Literal["open", "paid", "failed", "called-off"]:

@@ -230,21 +230,11 @@ def _policies(settings: Settings, named: tuple[str, ...], program: Path | None) 
 
 def _liability_in(about: Mapping[str, str]) -> Liability:
     """The contract that a recording names, as far as it does."""
-    return Liability(
+    return Liability.of_nobody(
         address=_address(about.get("liability", "")),
-        model="",
         objective=about.get("objective", ""),
-        result="",
-        promisee=ZERO_ADDRESS,
         promisor=_address(about.get("agent", "")),
         lighthouse=_address(about.get("lighthouse", "")),
-        lighthouse_fee=0,
-        token=ZERO_ADDRESS,
-        cost=0,
-        validator=ZERO_ADDRESS,
-        validator_fee=0,
-        is_success=False,
-        is_finalized=False,
     )
 
 

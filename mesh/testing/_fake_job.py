@@ -24,7 +24,7 @@ from mesh.recording.objective import Played
 from mesh.role.models import description_in
 from mesh.testing._outcomes import JobRecording, RecordedOutcome
 from mesh.testing._simulated_time import SimulatedTimeLoop
-from schemas import ZERO_ADDRESS, Liability, cid_of_file
+from schemas import Liability, cid_of_file
 from schemas.keys import LiabilityTopicKey, parse_agent_key
 
 if TYPE_CHECKING:
@@ -198,19 +198,9 @@ class _FakeRun(Job):
 
 def _liability(model: str, objective: Path) -> Liability:
     """A contract that costs nothing, between addresses of nobody."""
-    return Liability(
+    return Liability.of_nobody(
         address=CONTRACT,
         model=model,
         objective=cid_of_file(objective),
-        result="",
-        promisee=ZERO_ADDRESS,
         promisor=ROBOT,
-        lighthouse=ZERO_ADDRESS,
-        lighthouse_fee=0,
-        token=ZERO_ADDRESS,
-        cost=0,
-        validator=ZERO_ADDRESS,
-        validator_fee=0,
-        is_success=False,
-        is_finalized=False,
     )

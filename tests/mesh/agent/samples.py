@@ -8,21 +8,12 @@ from schemas import ZERO_ADDRESS, Liability, checksum_address, cid_of_bytes, kec
 
 def liability(name: str = "one", *, promisor: str = ZERO_ADDRESS, objective: str | None = None) -> Liability:
     """A contract that no chain knows, another one for each name."""
-    return Liability(
+    return Liability.of_nobody(
         address=checksum_address(keccak256(name.encode())[:20]),
         model=cid_of_bytes(b"model"),
         objective=objective or cid_of_bytes(b"objective"),
-        result="",
-        promisee=ZERO_ADDRESS,
         promisor=promisor,
-        lighthouse=ZERO_ADDRESS,
-        lighthouse_fee=0,
-        token=ZERO_ADDRESS,
         cost=2**200,
-        validator=ZERO_ADDRESS,
-        validator_fee=0,
-        is_success=False,
-        is_finalized=False,
     )
 
 

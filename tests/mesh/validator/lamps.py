@@ -20,7 +20,6 @@ from mesh.recording import AtOnce, RecordedTimes, Recorders, open_objective
 from mesh.validator.judging import Case, Judgement, judge
 from mesh.validator.policies import own_policy, policy_of
 from schemas import (
-    ZERO_ADDRESS,
     Liability,
     Result,
     Signer,
@@ -102,21 +101,14 @@ def order(path: Path, levels: tuple[float, ...] = LEVELS, *, step_ns: int = 5 * 
 
 def contract(name: str, objective: Path, *, robot: Signer = ROBOT) -> Liability:
     """The contract of the job called `name`."""
-    return Liability(
+    return Liability.of_nobody(
         address=checksum_address(keccak256(name.encode())[:20]),
         model=MODEL.cid,
         objective=cid_of_file(objective),
-        result="",
-        promisee=ZERO_ADDRESS,
         promisor=robot.address,
         lighthouse=LIGHTHOUSE,
-        lighthouse_fee=0,
-        token=ZERO_ADDRESS,
         cost=1,
         validator=VALIDATOR,
-        validator_fee=0,
-        is_success=False,
-        is_finalized=False,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from mesh.validator.judging import Case, Judgement, judge
-from schemas import ZERO_ADDRESS, Liability, cid_of_bytes
+from schemas import Liability, cid_of_bytes
 from tests.mesh.validator.jobs import OTHER, SampleJob
 
 if TYPE_CHECKING:
@@ -19,21 +19,15 @@ ALWAYS = (0, 1 << 63)
 
 def liability_of(job: SampleJob) -> Liability:
     """The contract of a job, which has not ended."""
-    return Liability(
+    return Liability.of_nobody(
         address=job.claim.liability,
         model=cid_of_bytes(b"model"),
         objective=job.claim.objective,
-        result="",
         promisee=OTHER,
         promisor=job.claim.promisor,
         lighthouse=job.claim.lighthouse,
-        lighthouse_fee=0,
-        token=ZERO_ADDRESS,
         cost=1,
         validator=OTHER,
-        validator_fee=0,
-        is_success=False,
-        is_finalized=False,
     )
 
 
