@@ -461,10 +461,11 @@ class Trader(Lifecycle):
 
     async def contract_of(self, order: TradedOrder, on_progress: OnProgress) -> Contract:
         """See `Order.contract`."""
-        if order.state is OrderState.MATCHED and order.attempts is not None and order.created is not None:
-            contract = await asyncio.shield(order.created)
-        elif order.state is OrderState.MATCHED:
-            contract = await self.contracts.read(order.liability)
+        created = order.created
+        if order.state is OrderState.MATCHED and (created is None or (created.done() and created.exception())):
+            contract = await self.contracts.read(order.liability)  # perhaps it was withdrawn before
+        elif order.state is OrderState.MATCHED and created is not None:
+            contract = await asyncio.shield(created)
         elif not (order.is_open and self.is_open):
             raise ENDED() if order.is_open else order.why_closed
         else:
