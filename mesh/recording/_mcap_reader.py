@@ -92,8 +92,10 @@ def mcap_records(
     else:
         return
     file.seek(position)
-    if position + len(MAGIC) != size or file.read() != MAGIC:
+    if file.read(len(MAGIC)) != MAGIC:
         raise CorruptRecording("it does not end as an MCAP file does")
+    if rest := size - position - len(MAGIC):
+        raise CorruptRecording(f"it ends at byte {size - rest}, and {rest} bytes follow")
 
 
 def _check_magic(file: BinaryIO) -> int:

@@ -14,6 +14,7 @@ from mesh.base.private_files import atomic_file
 from mesh.recording._bag_reader import MAGIC as BAG_MAGIC
 from mesh.recording._bag_reader import BagOp, BagReader, bag_records, read_index
 from mesh.recording._mcap_reader import (
+    MAGIC,
     McapReader,
     McapRecordHeader,
     check_range_crc,
@@ -155,11 +156,17 @@ def _read_mcap(reader: McapReader, faults: _Faults) -> RecordingSource:
 
     def part(begin: int, end: int | None) -> Iterator[McapRecordHeader]:
         nonlocal checked
-        for header in mcap_records(file, size, begin=begin, end=end, cut=True):
+        records = mcap_records(file, size, begin=begin, end=end, cut=True)
+        for header in records:
             if header.opcode == Opcode.DATA_END:
                 checked = _check_data(file, header)
-                return
+                break
             yield header
+        with suppress(CorruptRecording):  # a summary that is cut lacks no message
+            for header in records:
+                rest = size - header.offset - header.length - len(MAGIC)
+                if header.opcode == Opcode.FOOTER and rest > 0:
+                    faults.missing.append(f"{rest} bytes that follow its end")
 
     edges: list[Any] = [0, *summary.chunk_positions(file), None]
     chunks = _read_parts(reader, starmap(part, pairwise(edges)), Opcode.CHUNK, faults)

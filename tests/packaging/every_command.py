@@ -73,8 +73,8 @@ def finish(running: tuple[int, int, tuple[str, ...], float]) -> bool:
     code: int | None = None
     if ended:
         code = os.waitstatus_to_exitcode(status)
-    elif time.monotonic() - began < SECONDS:
-        return False
+    elif time.monotonic() - began < (SECONDS if b"[package-missing]" not in os.pread(errors, 65_536, 0) else 30):
+        return False  # one that has said what it lacks is about to end
     else:
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)

@@ -10,7 +10,7 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, IndexType, Writer
 
-from mesh.recording import NotARecording, recover
+from mesh.recording import CorruptRecording, NotARecording, open_objective, recover
 from mesh.recording._bag_reader import BagOp, bag_records
 from mesh.recording._mcap_reader import mcap_records
 from mesh.recording._recovery import readable_part
@@ -188,3 +188,14 @@ def chunks_of(path: Path) -> list[tuple[int, int]]:
             elif one.opcode == Opcode.MESSAGE_INDEX:
                 found[-1] = found[-1][0], end
     return found
+
+
+def test_what_follows_the_end_of_a_file_is_named(tmp_path: Path) -> None:
+    content = write(tmp_path / "whole", "mcap-zstd")
+    assert recovered(tmp_path / "first", content) == (TEXTS, "")
+    for rest in (b"\n", bytes(4096), content[:-8], content):
+        found, why = recovered(tmp_path / "first", content + rest)
+        assert found == TEXTS
+        assert f"{len(rest)} bytes that follow its end" in why
+        with pytest.raises(CorruptRecording, match=f"ends at byte {len(content)}, and {len(rest)} bytes follow"):
+            open_objective(tmp_path / "first")
