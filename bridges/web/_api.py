@@ -17,6 +17,7 @@ import mesh
 from bridges.web._files import MOST_MESSAGES, Files, columns_of, empty_summary, image_of, messages_of, summary_of
 from bridges.web._jobs import Views
 from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms, liability_json
+from bridges.web._robots import Quotes
 from bridges.web._stream import Stream
 from bridges.web.access import (
     FOREVER,
@@ -110,6 +111,15 @@ class LocalOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename
     validator_fee: str | None = None
     token: str = ""
     lifetime: int | None = None
+    robot: str = ""
+    """The only robot (address) that it is for."""
+
+
+class QuotesWanted(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The job for which robots are asked what they want."""
+
+    model: str
+    objective: str
 
 
 class LocalWithdrawal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -145,6 +155,7 @@ class Api(Lifecycle):
         self._market = Market(components, self.stream, from_block=options.from_block)
         self._views = Views(components, self._market, self.files)
         self._publisher = OrderPublisher(components, self._market)
+        self._quotes = Quotes(components, self._market.labels)
         self._facts: dict[str, Any] = {}
         self._facts_at = float("-inf")
         self.chain_answers = True
@@ -164,6 +175,7 @@ class Api(Lifecycle):
             get("/api/v1/openapi.json", self.openapi),
             get("/api/v1/market", self.market),
             get("/api/v1/agents", self.agents),
+            post("/api/v1/quotes", self.quotes),
             get("/api/v1/orders", self.orders),
             post("/api/v1/orders", self.post_order),
             get("/api/v1/orders/{hash}", self.order),
@@ -256,6 +268,11 @@ class Api(Lifecycle):
     async def agents(self, request: web.Request) -> web.Response:
         return answer(await self._views.agents())
 
+    async def quotes(self, request: web.Request) -> web.Response:
+        wanted = await body_of(request, QuotesWanted)
+        model, objective = parse_text_cid(wanted.model), parse_text_cid(wanted.objective)
+        return answer({"quotes": await self._quotes.of(model, objective, sender=request[SENDER])})
+
     async def orders(self, request: web.Request) -> web.Response:
         query, head = request.query, self._market.head
         wanted = {name: query[name] for name in ("kind", "model", "signer") if query.get(name)}
@@ -263,7 +280,11 @@ class Api(Lifecycle):
         for order in sorted(self._market.orders(), key=lambda order: -order.at):
             message = order.message
             facts = {"kind": message.kind, "model": message.model, "signer": order.verified.signer}
-            if order.state(head) == "open" and all(facts[name] == value for name, value in wanted.items()):
+            if (
+                not order.robot
+                and order.state(head) == "open"
+                and all(facts[name] == value for name, value in wanted.items())
+            ):
                 found.append(order)
         listed = [order.json() for order in found[: number_in(request, "limit", 100, most=LISTED)]]
         return answer({"orders": listed, "dropped": self._market.dropped})
@@ -288,6 +309,7 @@ class Api(Lifecycle):
             validator_fee=None if wanted.validator_fee is None else amount(wanted.validator_fee),
             token=wanted.token,
             lifetime=wanted.lifetime,
+            robot=parse_address(wanted.robot) if wanted.robot else "",
         )
         return answer(self._market.posted_json(order), status=202)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from bridges.web._market import liability_json, result_json
+from bridges.web._robots import profile_json
 from mesh.agent.contracts import refusal
 from mesh.agent.jobs import read_reason
 from mesh.chain import NotOffered
@@ -247,21 +248,30 @@ class Views:
     async def _ask_agents(self) -> dict[str, Any]:
         parts, market = self._parts, self._market
         peers = await present(parts.channel)
-        found = await statuses(parts.network.session, parts.channel, peers[:AGENTS], timeout=2.0)
+        found, robots = await asyncio.gather(
+            statuses(parts.network.session, parts.channel, peers[:AGENTS], timeout=2.0),
+            parts.robots.present(timeout=2.0),
+        )
+        profiles = {robot.address: robot for robot in robots}
         records = records_of(list(market.jobs.values()), parts.token)
         offers, models = self._offers(), self._models()
-        listed = [
-            {
+        listed = []
+        for peer, status in found.items():
+            profile = profiles.get(peer.address) if peer.role == "agent" else None
+            own = models.get(peer.address, set()) | _own_model(status) if peer.role == "agent" else set()
+            if profile is not None and profile.model:
+                own = own | {profile.model}
+            facts = {
                 "role": peer.role,
                 "address": peer.address,
                 "health": _health(status),
                 "status": None if status is None else decode_json(status.encode()),
-                "models": sorted(models.get(peer.address, set()) | _own_model(status)) if peer.role == "agent" else [],
+                "profile": None if profile is None else profile_json(profile),
+                "models": sorted(own),
                 "offers": [order.json() for order in offers.get(peer.address, ())][:LISTED],
                 "record": records.get(peer.address, AccountRecord()).json(),
             }
-            for peer, status in found.items()
-        ]
+            listed.append(facts)
         alerts = alerts_of({peer.address: status for peer, status in found.items()}, market.head)
         return {"agents": listed, "unlisted": max(0, len(peers) - AGENTS), "alerts": alerts}
 

@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from bridges.web._stream import Stream
     from bridges.web.components import WebComponents
     from mesh.agent.agent import Agent
+    from mesh.agent.contracts import Progress
+    from mesh.agent.trade import Order
     from mesh.chain import Chain
     from schemas import SignedMessage
 
@@ -170,6 +172,8 @@ class SeenOrder:
     statements: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
     answers: list[dict[str, Any]] = field(default_factory=list)
     """Results without a contract, if the order pays nothing."""
+    robot: str = ""
+    """The only robot (address) that it is for: then it is private, and its signature stays here. Empty for any."""
 
     @property
     def hash(self) -> str:
@@ -185,7 +189,10 @@ class SeenOrder:
         fields: dict[str, Any] = msgspec.to_builtins(self.message)
         fields |= {name: str(fields[name]) for name in AMOUNTS if name in fields}
         fields |= {"nonce": str(fields["nonce"]), "sender": fields.get("sender")}
-        about = {"kind": self.message.kind, "generation": self.message.generation}
+        about: dict[str, Any] = {"kind": self.message.kind, "generation": self.message.generation}
+        if self.robot:
+            fields["signature"] = ""
+        about |= {"private": bool(self.robot), "robot": self.robot or None}
         return {"hash": self.hash, "signer": self.verified.signer, "at": self.at} | about | fields
 
     def state(self, head: int) -> str:
@@ -259,16 +266,17 @@ class Market(Lifecycle):
         """All orders that are remembered, oldest first."""
         return list({order.hash: order for order in (*self._seen.values(), *self._posted.values())}.values())
 
-    def add(self, verified: Verified[Any], *, posted: bool = False) -> SeenOrder:
-        """Remember an order, and publish it if it is new."""
+    def add(self, verified: Verified[Any], *, posted: bool = False, robot: str = "") -> SeenOrder:
+        """Remember an order, and publish it if it is new and not for one `robot` (address) alone."""
         order_hash = verified.hash.hex()
         known = self.order(order_hash)
         if known is not None and known.verified.signer != verified.signer and not posted:
             return known  # the same terms, signed by another account
         if known is None or known.verified.signer != verified.signer:
-            known = SeenOrder(verified, self._clock())
+            known = SeenOrder(verified, self._clock(), robot=robot)
             known.liability = self._matched.get((order_hash, verified.signer), "")
-            self._stream.publish("market", "order", known.json())
+            if not robot:
+                self._stream.publish("market", "order", known.json())
         if posted and isinstance(known.message, Demand) and not known.message.cost:
             self._questions[verified.signer] = known
         if posted:
@@ -339,9 +347,9 @@ class Market(Lifecycle):
                     self.add(event)
                 case Rejection(order=order_hash, provider=agent, reason=code):
                     if agent in await self.providers():
-                        self._state(order_hash, "rejected", agent, code, event.detail)
+                        self.take_statement(order_hash, "rejected", agent, code, event.detail)
                 case Decline(order=order_hash, agent=agent, code=code):
-                    self._state(order_hash, "declined", agent, code, event.detail)
+                    self.take_statement(order_hash, "declined", agent, code, event.detail)
                 case ValidatorReport():
                     await self._take_report(event)
                 case JobEvent(agent, "ready", liability):
@@ -359,10 +367,12 @@ class Market(Lifecycle):
             order.answers.append(answer)
             self.changed(order, "answered")
 
-    def _state(self, order_hash: str, kind: str, agent: str, code: str, detail: str) -> None:
+    def take_statement(self, order_hash: str, kind: str, agent: str, code: str, detail: str) -> None:
+        """What a provider (`rejected`) or a robot (`declined`) says of an order."""
         statement = {"kind": kind, "agent": agent, "code": code, "detail": detail[:500], "at": self._clock()}
-        self._stream.publish("market", kind, statement | {"order": order_hash})
         order = self.order(order_hash)
+        if order is None or not order.robot:
+            self._stream.publish("market", kind, statement | {"order": order_hash})
         if order is None:
             return
         order.withdrawn = order.withdrawn or code == Refusal.WITHDRAWN
@@ -561,8 +571,12 @@ class OrderPublisher(Lifecycle):
         self._sent: dict[str, Sent] = {}
 
     async def _open(self, stack: AsyncExitStack) -> None:
-        tasks = await stack.enter_async_context(Background())
+        self._tasks = tasks = await stack.enter_async_context(Background())
         tasks.start(self._send_again(), "page: orders")
+        if (agent := self._parts.agent) is not None:
+            for order in agent.orders(OrderState.OPEN, OrderState.WITHDRAWN):
+                if order.robot:
+                    self._follow(order).withdrawn = order.state is OrderState.WITHDRAWN
 
     async def post(self, payload: bytes) -> SeenOrder:
         """Check a signed message and publish it; returns the order that it is or withdraws.
@@ -591,15 +605,31 @@ class OrderPublisher(Lifecycle):
         return order
 
     async def order(self, *, objective: str, validator: str, validator_fee: int | None, **terms: Any) -> SeenOrder:
-        """The local account orders; its agent publishes.
+        """The local account orders; its agent publishes, or sends the order to the one `robot` alone.
 
         Raises `WebError`, `RemoteError`, and as `Agent.order`.
         """
         agent = self._local_agent("start it with --keyfile, or connect a wallet")
         fee = await require_judged(self._parts, validator, validator_fee) if validator else 0
         posted = await agent.order(objective, validator=validator, validator_fee=fee, **terms)
-        verified: Verified[Any] = verify_message(posted.message)
-        return self._market.add(verified, posted=True)
+        if posted.robot:
+            return self._follow(posted)
+        return self._market.add(verify_message(posted.message), posted=True)
+
+    def _follow(self, order: Order) -> SeenOrder:
+        """Show an order for one robot alone, and what that robot and the providers say of it to the local account."""
+        seen = self._market.add(verify_message(order.message), posted=True, robot=order.robot)
+        if order.state is OrderState.OPEN:
+            self._tasks.start(self._listen(order), f"order {order.hash}")
+        return seen
+
+    async def _listen(self, order: Order) -> None:
+        def told(progress: Progress) -> None:
+            if progress.kind in ("declined", "rejected"):
+                self._market.take_statement(order.hash, progress.kind, progress.agent, progress.code, progress.detail)
+
+        with suppress(AiraError):  # it is withdrawn, has expired, or another robot got the contract
+            await order.contract(on_progress=told)
 
     async def withdraw(self, order_hash: str) -> SeenOrder:
         """The local account withdraws its order. Raises `OrderClosed`, `WebError`."""

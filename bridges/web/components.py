@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING
 from mesh.agent.agent import Agent
 from mesh.agent.validators import ValidatorDirectory
 from mesh.base.flood import Drops
+from mesh.chain import Account, new_private_key
 from mesh.content import Exchange, Store
 from mesh.role.composition import chain_of, connected, open_store
 from mesh.role.following import ChainHead
+from mesh.watching import RobotDirectory
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.chain import Account, Chain
+    from mesh.chain import Chain
     from mesh.network import Channel, Network
     from mesh.settings import Settings
+    from schemas.signing import Signer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +38,10 @@ class WebComponents:
     exchange: Exchange
     drops: Drops
     validators: ValidatorDirectory
+    robots: RobotDirectory
     agent: Agent | None
+    asker: Signer
+    """Who asks robots for quotes: the local account, or a key that lives as long as the server."""
     lighthouse: str
     """The lighthouse's address."""
     token: str
@@ -78,7 +84,9 @@ async def opened(
             exchange=exchange,
             drops=drops,
             validators=ValidatorDirectory(network.session, channel, opened_chain),
+            robots=RobotDirectory(network.session, channel) if agent is None else agent.parts.robots,
             agent=agent,
+            asker=Account(new_private_key()).signer if agent is None else agent.parts.signer,
             lighthouse=await opened_chain.names.address(settings.lighthouse_contract),
             token=await opened_chain.names.address(settings.erc20_token),
         )

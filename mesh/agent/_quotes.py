@@ -1,14 +1,11 @@
-"""Quotes: what robots ask for a job, and when they would do it. They bind nobody, and cost nothing.
+"""The quotes of a robot: what it asks for a job, and when it would do it. They bind nobody, and cost nothing.
 
-A robot answers with what its handler says, or by default with the price in its model's description.
+It answers with what its handler says, or by default with the price in its model's description.
 """
 
 from __future__ import annotations
 
 import logging
-import secrets
-import time
-from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -20,56 +17,26 @@ from mesh.agent.orders import FEWEST_BLOCKS, HANDLED_FOR, robot_stopped
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.errors import AiraError, InvalidMessage, public_text
-from mesh.watching.market import query_all
-from schemas import InvalidRecord, RpcKey
 from schemas.cid import is_cid
-from schemas.rpc import Quote, QuoteRequest
+from schemas.rpc import Quote
 from schemas.signing import LONGEST_DETAIL
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Sequence
 
     from mesh.agent._owner_rules import OwnerRules
     from mesh.agent._profile import OwnProfile
     from mesh.agent.components import AgentComponents
     from mesh.agent.handlers import QuoteHandler
     from schemas.model import ModelDescription
+    from schemas.rpc import QuoteRequest
 
 log = logging.getLogger(__name__)
 
-QUOTE_TIMEOUT: Final = 2.0
-"""Seconds that robots have to answer by default."""
-ASKED: Final = 64
-"""Robots that are asked at once, at most."""
 PER_ASKER: Final = Rate(per_second=1.0, burst=32)
 """Quotes for one asker …"""
 TOTAL: Final = Rate(per_second=10.0, burst=200)
 """… and for all."""
-
-
-async def asked_quotes(
-    parts: AgentComponents, model: str, objective: str, robots: Collection[str], *, timeout: float
-) -> list[Quote]:
-    """The quotes of these robots (addresses) that arrive in `timeout` seconds: the cheapest first, refusals last."""
-    request = QuoteRequest(
-        model=model,
-        objective=objective,
-        lighthouse=parts.channel.lighthouse,
-        asker=parts.signer.address,
-        nonce=secrets.token_hex(16),
-        time=int(time.time()),
-    ).signed_by(parts.signer)
-    keys = {str(RpcKey(robot, "quote")): robot for robot in [*robots][:ASKED]}
-    found: dict[str, Quote] = {}
-    for reply in await query_all(parts.network.session, keys, payload=request.encode(), timeout=timeout):
-        if reply.ok is None:
-            continue
-        with suppress(InvalidRecord):
-            quote = Quote.decode(reply.ok.payload.to_bytes())
-            is_asked = keys.get(str(reply.ok.key_expr)) == quote.agent and quote.request == request.identity
-            if is_asked and quote.agent not in found and quote.is_signed:
-                found[quote.agent] = quote
-    return sorted(found.values(), key=lambda quote: (bool(quote.code), quote.cost, quote.start, quote.agent))
 
 
 class Quoting:

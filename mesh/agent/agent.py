@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypedDict, Typ
 
 from mesh.agent._answers import Answer, Question, Unanswered, metadata_of_answer
 from mesh.agent._attempts import Attempts, check_attempts
-from mesh.agent._quotes import QUOTE_TIMEOUT, asked_quotes
 from mesh.agent.components import working
 from mesh.agent.contracts import nothing
 from mesh.agent.demands import HANDLED
@@ -60,6 +59,7 @@ from mesh.role.models import Models, description_in
 from mesh.role.program import RESEND, OpenRole, Program
 from mesh.role.status import WatcherStatus
 from mesh.settings import load
+from mesh.watching.quotes import QUOTE_TIMEOUT, asked_quotes
 from mesh.watching.robots import RobotDirectory, labelled, robot_address
 from schemas import (
     ZERO_ADDRESS,
@@ -662,7 +662,15 @@ class Agent(Program):
         cid, named = await self._cid_of(objective), await self.parts.chain.names.model(model or self.model)
         await self.runtime.require_fit(cid, named)
         robots = await self.parts.robots.present(named, timeout=timeout)
-        return await asked_quotes(self.parts, named, cid, [one.address for one in robots], timeout=timeout)
+        return await asked_quotes(
+            self.network.session,
+            self.channel,
+            asker=self.parts.signer,
+            robots=[one.address for one in robots],
+            model=named,
+            objective=cid,
+            timeout=timeout,
+        )
 
     async def _order_by_quote(
         self,
