@@ -14,7 +14,7 @@ import math
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -29,7 +29,7 @@ from schemas.payloads import plain_value
 from schemas.profiles import LONGEST_READING, MOST_READINGS, MOST_WAITING, Profile, ProfileState, text_fault
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from contextlib import AbstractAsyncContextManager
 
     import zenoh
@@ -123,7 +123,10 @@ class OwnProfile:
 
         The estimate is by the `seconds` of the model's description; 0 without one.
         """
-        jobs, runs = await self._parts.ledger.jobs_by_phase(), self._executor.runs.values()
+        return self._queue_of(await self._parts.ledger.jobs_by_phase())
+
+    def _queue_of(self, jobs: Mapping[str, int]) -> tuple[int, int]:
+        runs = self._executor.runs.values()
         waiting, running = sum(jobs.get(phase, 0) for phase in (Phase.INCOMING, Phase.READY)), jobs.get("running", 0)
         played = [one.position / one.total for run in runs if (one := run.playback) is not None and one.total]
         # After which part of a job each of the `parallel` places is free.
@@ -139,8 +142,10 @@ class OwnProfile:
 
     async def present(self) -> Profile:
         """The signed profile of this moment."""
+        return self._signed(*await self._doing())
+
+    def _signed(self, state: ProfileState, queue: int, wait: int) -> Profile:
         settings, signer = self._parts.settings, self._parts.signer
-        waiting, seconds = await self.queue()
         profile = Profile(
             agent=signer.address,
             model=self._model,
@@ -149,20 +154,24 @@ class OwnProfile:
             picture=self._picture,
             place=settings.place,
             price=self._price,
-            state=await self._state(),
-            queue=min(waiting, MOST_WAITING),
-            wait=min(seconds, MOST_WAITING),
+            state=state,
+            queue=queue,
+            wait=wait,
             readings={topic: _text(*reading) for topic, reading in [*self._readings.items()]},
             time=int(time.time()),
         )
         return profile.signed_by(signer)
 
-    async def _state(self) -> ProfileState:
+    async def _doing(self) -> tuple[ProfileState, int, int]:
+        """What the robot is doing now: the state, `queue` and `wait` of its profile."""
+        jobs = await self._parts.ledger.jobs_by_phase()
+        waiting, seconds = self._queue_of(jobs)
+        state: ProfileState = "working" if jobs.get("running") else "idle"
         if self.is_stopped():
-            return "stopped"
-        if self.is_closed():
-            return "closed"
-        return "working" if (await self._parts.ledger.jobs_by_phase()).get("running") else "idle"
+            state = "stopped"
+        elif self.is_closed():
+            state = "closed"
+        return state, min(waiting, MOST_WAITING), min(seconds, MOST_WAITING)
 
     def serve(self) -> AbstractAsyncContextManager[None]:
         """Meanwhile answer queries for the profile."""
@@ -175,18 +184,18 @@ class OwnProfile:
 
     async def run(self) -> None:
         """Put the profile when it has changed, at most once in `INTERVAL` seconds, until cancelled."""
-        key, said = str(ProfileKey(self._parts.signer.address)), dict[str, Any]()
+        key = str(ProfileKey(self._parts.signer.address))
+        said: tuple[ProfileState, int, int] | None = None
         while True:
             self._changed.clear()
             try:
-                profile = await self.present()
+                doing = await self._doing()
             except LedgerUnusable as error:
                 log.debug("the profile is not known now: %s", error)
             else:
-                facts = {"state": profile.state, "queue": profile.queue, "wait": profile.wait}
-                if facts != said:
-                    said = facts
-                    self._parts.channel.put(key, profile.encode())
+                if doing != said:
+                    said = doing
+                    self._parts.channel.put(key, self._signed(*doing).encode())
             await asyncio.sleep(INTERVAL)
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._changed.wait(), LOOK)

@@ -93,14 +93,15 @@ class SimulatedDisk:
     def fsync(self, descriptor: int) -> None:
         """`os.fsync`."""
         found = os.fstat(descriptor)
-        path = Path(f"/proc/self/fd/{descriptor}")
+        path = f"/proc/self/fd/{descriptor}"
         if stat.S_ISDIR(found.st_mode):
             self._entries[found.st_ino] = {entry.name: entry.inode() for entry in os.scandir(path)}
-        else:
-            self.synced[found.st_ino] = path.read_bytes()
-            latest = LogState.of(os.readlink(path).removesuffix(LOG)) if found.st_ino in self.logs else None
+        elif found.st_ino in self.logs:
+            latest = LogState.of(os.readlink(path).removesuffix(LOG))
             if latest is not None:
                 self.logs[found.st_ino] = latest
+        else:
+            self.synced[found.st_ino] = Path(path).read_bytes()
         process = scheduler().process
         if process is not None:
             process.commit()

@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import wraps
 from typing import TYPE_CHECKING, Any, Final
 
+import mesh.chain._abi
 import mesh.chain._node
 import mesh.chain.answers
 import mesh.chain.following
@@ -18,7 +19,7 @@ import schemas.signing
 from mesh.chain.answers import decode_answer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
 MOST: Final = 50_000
 """Results of a function that are kept; then it starts again."""
@@ -34,6 +35,7 @@ class Answer(dict[str, Any]):
 def install() -> None:
     """Share the results of what follows, for the rest of this process."""
     for module, name, key_of in (
+        (mesh.chain._abi, "encode", _values),
         (mesh.chain._node, "decode", _words),
         (mesh.chain.answers, "checksum_address", bytes),
         (mesh.chain.following, "decode", _words),
@@ -46,6 +48,10 @@ def install() -> None:
 
 def _words(types: list[str], data: bytes) -> tuple[tuple[str, ...], bytes]:
     return tuple(types), data
+
+
+def _values(types: Sequence[str], values: Sequence[Any]) -> tuple[tuple[str, ...], str]:
+    return tuple(types), repr(values)
 
 
 def _pair(digest: bytes, signature: str | bytes) -> tuple[bytes, str | bytes]:

@@ -119,8 +119,9 @@ class Router:
     def publish(self, sample: Sample, sender: Session) -> None:
         """Bring a sample to all subscribers."""
         self.tap(sample, sender)
+        key = str(sample.key_expr)
         for session in self.sessions:
-            if any(matches(receiver.selector, str(sample.key_expr)) for receiver in session.subscribers):
+            if any(matches(receiver.selector, key) for receiver in session.subscribers):
                 if self.linked(sender, session):
                     self._transfer(sample, sender, session)
                 else:
@@ -155,8 +156,9 @@ class Router:
 
     def deliver(self, sample: Sample, sender: Session, session: Session) -> None:
         """Give a sample to the matching subscribers of a session."""
+        key = str(sample.key_expr)
         for receiver in list(session.subscribers):
-            if matches(receiver.selector, str(sample.key_expr)):
+            if matches(receiver.selector, key):
                 receiver.deliver(sample)
 
     def query(
