@@ -134,6 +134,9 @@ class AttemptAudit:
         for robot in self._market.robots:
             for path in sorted(robot.folder.rglob("ledger.sqlite")):
                 with closing(sqlite3.connect(path)) as database:
+                    # A robot that was killed for good before its first start has a file without tables.
+                    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'stops'").fetchone():
+                        continue
                     for (liability,) in database.execute("SELECT liability FROM stops").fetchall():
                         if self._steps.ended.get(liability):
                             self._violated_stop(liability, robot.name)
