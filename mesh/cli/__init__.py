@@ -23,6 +23,7 @@ COMMANDS: Final = {
     "lighthouse": ("mesh.cli.lighthouse:command", "list and create lighthouses; become a provider"),
     "logs": ("mesh.cli.logs:command", "show the log of an agent, provider, bridge or device"),
     "model": ("mesh.cli.model:command", "write, check and show descriptions of models"),
+    "new": ("mesh.cli.new:command", "write a project of a robot, a client or a validator"),
     "objective": ("mesh.cli.objective:command", "create, show, check and fetch objectives and recordings"),
     "order": ("mesh.cli.order:command", "list and withdraw open orders"),
     "peers": ("mesh.cli.status:peers", "list the peers on a lighthouse's channel"),

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from mesh.base.extras import PackageMissing
-from mesh.cli.options import BLOCK_TIME, PORT, with_json, with_settings
+from mesh.cli.files import require_readable
+from mesh.cli.options import BLOCK_TIME, PATH, PORT, with_json, with_settings
 from mesh.cli.output import announce, print_json
 from mesh.dev.page import PAGE_PORT, free_page_port, page_server
 from mesh.errors import ConfigurationError
@@ -78,6 +79,12 @@ log = logging.getLogger(__name__)
 @click.option("--web/--no-web", "has_page", default=True, show_default=True, help="serve the page of the market")
 @click.option("--web-port", type=PORT, help=f"port of the page [{PAGE_PORT}, or a free one if it is taken]")
 @click.option("--local-account", is_flag=True, help="let the page order for the person's account, without a wallet")
+@click.option(
+    "--run",
+    "program",
+    type=PATH,
+    help="robot (NAME.py) to run, too; it starts again when you change it, and the page orders as with --local-account",
+)
 @with_engine
 @with_json
 @with_settings("listen", "data_dir", "generation", "free_contracts", TelemetrySettings)
@@ -88,6 +95,7 @@ def command(
     has_page: bool,
     web_port: int | None,
     local_account: bool,
+    program: Path | None,
     as_json: bool,
     **engine: Any,
 ) -> None:
@@ -98,9 +106,10 @@ def command(
     another shell uses the market as the person. The markets of both generations run; --generation says which one these
     lines name.
     """
-    served_page = MarketPage(web_port, local_account) if has_page else None
+    robot = None if program is None else require_readable(program)
+    served_page = MarketPage(web_port, local_account or robot is not None) if has_page else None
     run_until_stopped(
-        lambda: serve_market(settings, port, block_time, page=served_page, as_json=as_json, **engine),
+        lambda: serve_market(settings, port, block_time, page=served_page, robot=robot, as_json=as_json, **engine),
         settings=settings,
         role="up",
     )
@@ -143,12 +152,14 @@ async def serve_market(
     block_time: float,
     *,
     page: MarketPage | None = None,
+    robot: Path | None = None,
     as_json: bool = False,
     engine: str = "auto",
     anvil: Path | None = None,
     state: Path | None = None,
 ) -> None:
     from mesh.dev.development import serve_chain
+    from mesh.dev.watched import run_watched
     from mesh.market.provider import Provider, ProviderOptions, ProviderProcess, provider_file
     from mesh.network import Endpoints, Network
     from mesh.network.endpoints import with_free_ports
@@ -195,6 +206,13 @@ async def serve_market(
             described = served.describe(settings.lighthouse_contract)
             words = f"router      {', '.join(settings.listen)}\n{described}{shown}\nprovider    {address}\n\n{lines}"
             announce(log, "market-started", words, **served.facts(), provider=address)
+        if robot is not None:
+            robots_own = variables | {
+                "AIRA_DATA_DIR": str(settings.state_directory.absolute()),
+                "AIRA_KEYFILE": str((served.keys / "robot.json").absolute()),
+                "AIRA_METRICS_LISTEN": "",
+            }
+            tasks.create_task(run_watched(robot, robots_own), name=f"running {robot.name}")
 
 
 def _variables(settings: Settings, served: DevelopmentChain) -> dict[str, str]:
