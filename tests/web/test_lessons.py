@@ -56,7 +56,7 @@ def choose(browser: Browser, example: str, objective: str) -> str:
 
 def recorded(browser: Browser) -> str:
     """The text of the recording's tables, all topics open."""
-    browser.until(lambda: browser.all(".topic"), "the recording")
+    browser.press("All messages")
     for topic in browser.all(".topic:not([open]) > summary"):
         topic.click()
     browser.until(lambda: browser.all(".topic td"), "the messages")

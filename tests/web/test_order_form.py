@@ -231,8 +231,6 @@ def test_the_form_and_the_dialog_can_be_read(form: Browser, pictures: Path, size
 def test_a_topic_with_one_number_has_no_blank_plot(form: Browser, site: Site) -> None:
     cid = put(site, objective(("/one", 5), ("/two", 1), ("/two", 2)))
     form.go(f"file/{cid}")
-    form.until(lambda: len(form.all(".topic")) == 2, "the topics")
-    for topic in form.all(".topic:not([open]) > summary"):
-        topic.click()
+    form.until(lambda: len(form.all(".track")) == 2, "the topics")
     form.until(lambda: form.all(".plot canvas"), "the plot of two numbers")
     assert len(form.all(".plot")) == 1

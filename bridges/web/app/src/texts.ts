@@ -268,17 +268,39 @@ export const texts = {
 
   // Recordings
   fileTitle: "File",
-  messages: "Messages",
-  duration: "Duration",
-  began: "Began",
   size: "Size",
   download: "Download",
   foxglove: "Open in Foxglove",
   playedTopic: "played",
   deviceTopic: "device",
   messagesOf: (topic: string) => `Messages on ${topic}`,
-  plotOf: (topic: string) => `Plot of the values on ${topic}; the table below has the same`,
   imageAt: (topic: string, time: string) => `Image on ${topic} at ${time}`,
+
+  // Live and recorded values
+  plotOf: (topic: string) => `Plot over time: ${topic}`,
+  pathOf: (topic: string) => `Path on a plane: ${topic}`,
+  onPlane: (x: string, y: string, unit: string) => `x ${x}${unit && ` ${unit}`}, y ${y}${unit && ` ${unit}`}`,
+  onEarth: (latitude: number, longitude: number) =>
+    `${Math.abs(latitude).toFixed(5)}° ${latitude < 0 ? "S" : "N"}, ${Math.abs(longitude).toFixed(5)}° ${longitude < 0 ? "W" : "E"}`,
+  north: "N ↑",
+  moreNumbers: (count: number) => `${plural(count, "more number")} not drawn.`,
+  moreTopics: (count: number) => `${plural(count, "more topic")} among all messages.`,
+  asked: "as ordered",
+  messageCount: (count: number) => plural(count, "message"),
+  bytes: (size: string) => `${size} of data`,
+  nothingLive: "Nothing has come yet. What the robot measures appears here at once.",
+  nothingRecorded: "No message is in this recording.",
+  nothingRead: "This robot has published no readings yet.",
+  allMessages: "All messages",
+  play: "Play",
+  playAgain: "Play again",
+  speed: "Speed",
+  position: "Time in the recording",
+  positionOf: (at: string, end: string) => `${at} of ${end}`,
+  replayKeys: "Space plays and pauses; the arrow keys move in time.",
+  lastMinute: "Last minute",
+  wholeTime: "All",
+  inView: "Time in view",
 
   // Market
   marketTitle: "Market",

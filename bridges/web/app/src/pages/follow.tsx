@@ -1,13 +1,13 @@
 import { useEffect, useState } from "preact/hooks";
 import { useApp, useData, useTopic } from "../app";
 import { amount, duration } from "../format";
+import { Replay } from "../live";
 import { withdraw } from "../ordering";
 import { texts } from "../texts";
 import { checkAnswer, checkOrder } from "../trust";
 import type { Answer, PostedOrder, Summary } from "../types";
 import { Action, Badge, Facts, Name, Problem, Show } from "../ui";
 import { StatementList } from "./account";
-import { Recording } from "./recording";
 
 /** An order from its publication to its contract; then the page of the job takes over. */
 export function FollowPage(props: { hash: string }) {
@@ -63,7 +63,7 @@ function AnswerView({ order, answer }: { order: PostedOrder["order"]; answer: An
       <p>
         {checked === true ? <Badge kind="good">{texts.holds}</Badge> : null} {texts.answeredBy} <Name text={answer.signer} href={`#/account/${answer.signer}`} />
       </p>
-      <Recording cid={answer.result} />
+      <Replay cid={answer.result} model={null} />
     </section>
   );
 }

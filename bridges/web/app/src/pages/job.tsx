@@ -4,13 +4,13 @@ import { post } from "../api";
 import { isCid } from "../cid";
 import { calls } from "../contracts";
 import { amount, clock, duration, short } from "../format";
+import { Replay } from "../live";
 import { texts } from "../texts";
 import { checkJob } from "../trust";
 import type { Finding, Job, Step } from "../types";
 import { Action, Badge, Facts, Money, Name, Show, Strange } from "../ui";
 import { JobState } from "./account";
 import { Steps } from "./follow";
-import { Recording } from "./recording";
 import { Operate } from "./robots";
 
 /** A job by its contract's address: terms, parties, files, timeline, and the checks. */
@@ -82,7 +82,7 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
       {liability.result ? (
         <section>
           <h2>{texts.recording}</h2>
-          <Recording cid={liability.result} />
+          <Replay cid={liability.result} model={null} />
         </section>
       ) : null}
       <Evidence job={job} />

@@ -3,10 +3,10 @@ import uPlot from "uplot";
 import { get } from "../api";
 import { useApp, useTopic } from "../app";
 import { amount, clock, plain, short } from "../format";
+import { plotColors } from "../plot";
 import { texts } from "../texts";
 import type { Order, StreamEvent } from "../types";
 import { Badge } from "../ui";
-import { plotColors } from "./recording";
 
 const SHOWN = 60;
 const FLUSH = 100;
