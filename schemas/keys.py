@@ -477,6 +477,11 @@ def presence_selector(lighthouse: str, role: str = "*", agent: str = "*") -> str
     return f"aira/{lighthouse_chunk(lighthouse)}/@agent/{_any_or(name_chunk, role)}/{_any_or(address_chunk, agent)}"
 
 
+def job_selector(agent: str, liability: str) -> str:
+    """All of one liability of an agent: its events, and the topics of its objective and its devices."""
+    return f"aira/agent/{address_chunk(agent)}/liability/{address_chunk(liability)}/**"
+
+
 def event_selector(agent: str = "*", liability: str = "*") -> str:
     """The events of an agent's liability and the progress of its playback; by default of all agents and liabilities."""
     return f"aira/agent/{_any_or(address_chunk, agent)}/liability/{_any_or(address_chunk, liability)}/*"

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 import mesh
 from bridges.web._files import MOST_MESSAGES, Files, columns_of, empty_summary, image_of, messages_of, summary_of
 from bridges.web._jobs import Views
+from bridges.web._live import Live
 from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms, liability_json
 from bridges.web._robots import Quotes
 from bridges.web._stream import Stream
@@ -155,6 +156,7 @@ class Api(Lifecycle):
         self._market = Market(components, self.stream, from_block=options.from_block)
         self._views = Views(components, self._market, self.files)
         self._publisher = OrderPublisher(components, self._market)
+        self._live = Live(components, self._market, self.stream)
         self._quotes = Quotes(components, self._market.labels)
         self._facts: dict[str, Any] = {}
         self._facts_at = float("-inf")
@@ -163,6 +165,7 @@ class Api(Lifecycle):
         self._chain_asked = float("-inf")
 
     async def _open(self, stack: AsyncExitStack) -> None:
+        await stack.enter_async_context(self._live)
         await stack.enter_async_context(self._market)
         await stack.enter_async_context(self._publisher)
         tasks = await stack.enter_async_context(Background())
@@ -196,7 +199,9 @@ class Api(Lifecycle):
             get("/api/v1/liabilities", self.liabilities),
             get("/api/v1/liabilities/{address}", self.job),
             get("/api/v1/liabilities/{address}/verification", self.verification),
+            get("/api/v1/liabilities/{address}/live", self.live),
             get("/api/v1/accounts/{address}", self.account),
+            get("/api/v1/agents/{address}/readings", self.readings),
             get("/api/v1/agents/{address}/logs", self.logs),
             post("/api/v1/agents/{address}/{action}", self.drive),
             get("/api/v1/lighthouse", self.lighthouse),
@@ -407,6 +412,12 @@ class Api(Lifecycle):
 
     async def verification(self, request: web.Request) -> web.Response:
         return answer(await self._views.verification(address_in(request)))
+
+    async def live(self, request: web.Request) -> web.Response:
+        return answer({"samples": await self._live.samples(address_in(request))})
+
+    async def readings(self, request: web.Request) -> web.Response:
+        return answer({"readings": await self._live.readings(address_in(request))})
 
     async def account(self, request: web.Request) -> web.Response:
         return answer(await self._views.account(address_in(request)))

@@ -120,7 +120,7 @@ def columns_of(path: Path, topic: str) -> dict[str, Any]:
 def image_of(path: Path, number: int) -> tuple[bytes, str] | None:
     """The image in the message of that number, and its media type."""
     message = next(open_objective(path, GENEROUS).messages(from_index=number), None)
-    return None if message is None else _image(message)
+    return None if message is None else picture_in(message)
 
 
 def _of_topic(recording: Objective, topic: str, first: int) -> Iterator[tuple[int, Played]]:
@@ -129,13 +129,19 @@ def _of_topic(recording: Objective, topic: str, first: int) -> Iterator[tuple[in
     return ((number, message) for number, message in numbered if not topic or message.topic == topic)
 
 
-def _facts(message: Played, number: int, start_ns: int, cid: str) -> dict[str, Any]:
+def shown_value(message: Played) -> tuple[Any, bool]:
+    """A message's value for JSON, at most `LONGEST_VALUE` bytes of it, and whether it was cut. Bytes are in base 64."""
     value, is_cut = message.value, False
     if isinstance(value, bytes):
         is_cut = len(value) > LONGEST_VALUE
         value = base64.b64encode(value[:LONGEST_VALUE]).decode()
     elif len(encoded := msgspec.json.encode(value)) > LONGEST_VALUE:
         value, is_cut = encoded[:LONGEST_VALUE].decode(errors="ignore"), True
+    return value, is_cut
+
+
+def _facts(message: Played, number: int, start_ns: int, cid: str) -> dict[str, Any]:
+    value, is_cut = shown_value(message)
     return {
         "number": number,
         "topic": message.topic,
@@ -145,7 +151,7 @@ def _facts(message: Played, number: int, start_ns: int, cid: str) -> dict[str, A
         "size": len(message.payload),
         "value": value,
         "cut": is_cut,
-        "image": f"/api/v1/files/{cid}/images/{number}" if _image(message) else None,
+        "image": f"/api/v1/files/{cid}/images/{number}" if picture_in(message) else None,
     }
 
 
@@ -155,7 +161,7 @@ def _role(message: Played) -> str:
 
 def _how_shown(message: Played) -> str:
     """How the messages of a topic are shown: `values`, `image`, `text`, `bytes` or `none`."""
-    if _image(message):
+    if picture_in(message):
         return "image"
     value = message.value
     if value is None:
@@ -165,7 +171,7 @@ def _how_shown(message: Played) -> str:
     return "values" if next(numbers_of(message), None) else "text"
 
 
-def _image(message: Played) -> tuple[bytes, str] | None:
+def picture_in(message: Played) -> tuple[bytes, str] | None:
     """The image in a message: its payload, or that of a ROS 1 compressed image. Never SVG, which may hold scripts."""
     data = message.payload
     if message.type.encoding == "ros1" and message.type.schema_name == "sensor_msgs/CompressedImage":

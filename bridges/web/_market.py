@@ -241,6 +241,8 @@ class Market(Lifecycle):
         self._times: BoundedDict[int, float] = BoundedDict(JOBS)
         self._limiter = RateLimiter(per_sender=REPORTED)
         self._asking = asyncio.Semaphore(8)  # promisors that are asked for the phase of a job at a time
+        self.on_contract: Callable[[SeenJob], object] = lambda _job: None
+        """Called with a contract that is not finalized, when it is first read."""
         self._providers: frozenset[str] = frozenset()
         self._providers_at = float("-inf")
 
@@ -516,6 +518,7 @@ class Market(Lifecycle):
             for agent, kind, detail in self._said.pop(liability.address, ()):
                 self._say(liability.address, agent, kind, detail)
             if not liability.is_finalized:
+                self.on_contract(job)
                 self._tasks.start(self._recall(job), f"phase of {liability.address}")
         if "ended" in news and liability.is_finalized:
             block, tx = news["ended"]

@@ -1,8 +1,8 @@
 """The stream: events with sequence numbers, to the WebSockets that subscribed to their topics.
 
-The last events are kept, so that a browser whose connection broke goes on where it was. A connection that reads more
-slowly than events come loses its oldest market events, and then gets one event `lost` with their number; its memory is
-bounded.
+The last events are kept, so that a browser whose connection broke goes on where it was; live values are not, and who
+resumes with their topics gets a `gap`. A connection that reads more slowly than events come loses its oldest live
+values and market events, and then gets one event `lost` with their number; its memory is bounded.
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ KEPT: Final = 8192
 """Events that are kept for connections that resume."""
 WAITING: Final = 1024
 """Events that wait for one connection."""
+WAITING_BYTES: Final = 4 << 20
+"""Bytes of them."""
 MARKET: Final = "market"
+LIVE: Final = ("live/", "readings/")
+"""How the topics of live values begin. They are not kept."""
 
 
 class StreamEvent(NamedTuple):
@@ -56,14 +60,17 @@ class Stream:
         self._connections: set[StreamConnection] = set()
         self.seq = 0
         self._closed = False
+        self.on_subscribe: Callable[[frozenset[str]], object] = lambda _topics: None
+        """Called with the topics that a connection has subscribed to."""
 
     def publish(self, topic: str, kind: str, data: Any) -> None:
         """Send an event to those who subscribed to its topic."""
         self.seq += 1
         body = {"seq": self.seq, "topic": topic, "kind": kind, "data": data, "at": self._clock()}
         event = StreamEvent(self.seq, topic, msgspec.json.encode(body))
-        self._kept.append(event)
-        self._bytes += len(event.text)
+        if not topic.startswith(LIVE):
+            self._kept.append(event)
+            self._bytes += len(event.text)
         while len(self._kept) > KEPT or self._bytes > 16 << 20:
             self._bytes -= len(self._kept.popleft().text)
         for connection in self._connections:
@@ -123,6 +130,7 @@ class StreamConnection:
         self.socket = socket
         self.topics: frozenset[str] = frozenset()
         self._waiting: deque[StreamEvent] = deque()
+        self._bytes = 0
         self._first: deque[bytes] = deque()
         self._lost = 0
         self._ready = asyncio.Event()
@@ -139,23 +147,29 @@ class StreamConnection:
         self._first.append(self._stream.event("hello", {"stream": self._stream.id, "seq": self._stream.seq}))
         if wanted.after is not None:
             missed = self._stream.since(wanted.after) if wanted.stream == self._stream.id else None
-            if missed is None:
+            if missed is None or any(topic.startswith(LIVE) for topic in self.topics):
                 self._first.append(self._stream.event("gap", {}))
             self._waiting.clear()
+            self._bytes = 0
             for event in missed or ():
                 self.offer(event)
         self._ready.set()
+        self._stream.on_subscribe(self.topics)
         return True
 
     def offer(self, event: StreamEvent) -> None:
-        """Queue an event, if its topic is wanted. Of too many, the oldest market event is dropped, else the oldest."""
+        """Queue an event, if its topic is wanted. Of too many, the oldest of the market or of live values is dropped,
+        else the oldest."""
         if event.topic not in self.topics:
             return
-        if len(self._waiting) >= WAITING:
-            oldest = next((waiting for waiting in self._waiting if waiting.topic == MARKET), self._waiting[0])
+        while self._waiting and (len(self._waiting) >= WAITING or self._bytes + len(event.text) > WAITING_BYTES):
+            streamed = (waiting for waiting in self._waiting if waiting.topic.startswith((MARKET, *LIVE)))
+            oldest = next(streamed, self._waiting[0])
             self._waiting.remove(oldest)
+            self._bytes -= len(oldest.text)
             self._lost += 1
         self._waiting.append(event)
+        self._bytes += len(event.text)
         self._ready.set()
 
     async def send(self) -> None:
@@ -170,7 +184,9 @@ class StreamConnection:
                     texts.append(self._stream.event("lost", {"count": self._lost}))
                     self._lost = 0
                 # Events in one frame.
-                texts += [self._waiting.popleft().text for _ in range(min(128, len(self._waiting)))]
+                some = [self._waiting.popleft().text for _ in range(min(128, len(self._waiting)))]
+                self._bytes -= sum(map(len, some))
+                texts += some
                 if self._waiting:
                     self._ready.set()
                 if texts:
