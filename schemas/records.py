@@ -7,7 +7,7 @@ numbers beyond 2^53. In Python it is an `int`.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias
 
 import msgspec
 from msgspec.structs import force_setattr
@@ -60,6 +60,36 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if not _has_usual_numbers(record):
             raise InvalidRecord(cls.__name__, "a number is beyond 2^64")
         return record
+
+
+class ControlRobot(Record, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
+    """What the owner of a robot changes while it runs; what is left out stays as it is.
+
+    `price` (`6 XRT`) is what its profile and its quotes say; empty for the price of its model's description. While it
+    is `paused` it takes no new jobs. `refuse` are the customers (addresses) that it never works for, `least_price` is
+    the least cost of a job; empty for any. `stop` says why it is stopped: it takes and begins no job until `release`.
+    """
+
+    price: Annotated[str, msgspec.Meta(max_length=60)] | None = None
+    paused: bool | None = None
+    refuse: Annotated[tuple[str, ...], msgspec.Meta(max_length=1000)] | None = None
+    least_price: Annotated[str, msgspec.Meta(max_length=60)] | None = None
+    stop: str | None = None
+    release: bool = False
+
+
+class RobotControl(Record, frozen=True, kw_only=True, rename="camel"):
+    """What is in effect on a robot: as in `ControlRobot`. While it is `held`, it takes and begins no job.
+
+    `stopped` says, for people, what a stop has done.
+    """
+
+    price: str
+    paused: bool
+    refuse: tuple[str, ...]
+    least_price: str
+    held: bool
+    stopped: str = ""
 
 
 class Liability(Record, frozen=True, kw_only=True, rename="camel"):

@@ -20,9 +20,11 @@ from schemas.errors import InvalidMessage
 from schemas.messages import Demand, Offer, Result
 from schemas.records import (
     MAX_UINT256,
+    ControlRobot,
     DeviceStop,
     Liability,  # msgspec reads the annotations
     Record,
+    RobotControl,
     UInt256,
 )
 from schemas.signing import Decline, SignedRecord, StopRequest  # msgspec reads the annotations
@@ -350,6 +352,7 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "resume": Service(LiabilityRequest, Done),
         "read": Service(LiabilityRequest, LiabilityRead),
         "stop": Service(StopRequest, Stopped),
+        "control": Service(ControlRobot, RobotControl),
         "status": Service(Nothing, Status),
         "logs": Service(ReadLogs, LogsRead),
         "accept": Service(AcceptDemand, Accepted),
@@ -380,6 +383,7 @@ SPENDING: Final = frozenset({"eth/transfer", "eth/transfer_from", "eth/approve"}
 """The services that send a transaction, and wait until it is mined."""
 
 GUARDED: Final = SPENDING | {
+    "control",
     "sign/demand",
     "sign/offer",
     "sign/result",
@@ -387,4 +391,5 @@ GUARDED: Final = SPENDING | {
     "send/offer",
     "send/result",
 }
-"""The services that sign, spend or publish in the agent's name: offered only if its settings allow it."""
+"""The services of the agent's owner: they sign, spend or publish in its name, or control it. Offered only if its
+settings allow it."""

@@ -57,7 +57,7 @@ from mesh.cli.output import announce
 from mesh.errors import InvalidKey, public_text
 from mesh.network import sending
 from mesh.network.connecting import SessionOpening
-from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, listening, stop_folder
+from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, LocalRequest, listening, stop_folder
 from mesh.role.running import INTERRUPTED, file_delays
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.metrics import STARTING, Health, MetricFamily, by_label, counter, gauge, health_metrics
@@ -395,10 +395,10 @@ class Edge:
         if (job := self._jobs.current) and (name := self._name_of.get(topic, "")):
             self._put(self._job_key(job, name), payload, topic.type)
 
-    def stop_from_thread(self, why: str) -> LocalAnswer:
+    def stop_from_thread(self, asked: LocalRequest) -> LocalAnswer:
         """The same from any thread; returns when the board has heard it, can't hear it, or takes too long."""
         outcome: Future[DeviceStop] = Future()
-        self._line.call_soon(partial(self.stop_board, why, outcome.set_result))
+        self._line.call_soon(partial(self.stop_board, asked.why, outcome.set_result))
         try:
             ended = outcome.result(ANSWER_SECONDS - 1)
         except TimeoutError:

@@ -40,11 +40,13 @@ from mesh.chain import RequestRefused, Reverted
 from mesh.errors import AiraError, ChainError, public_text
 from mesh.network import call
 from mesh.recording import NotARecording
+from mesh.role.local_stop import control_here, stop_folder
 from mesh.watching.presence import LogReader
 from schemas import parse_address, parse_cid
 from schemas.decoding import InvalidData, decode_json
 from schemas.keys import RpcKey
-from schemas.rpc import FinishLiability, LiabilityRequest
+from schemas.records import ControlRobot
+from schemas.rpc import FinishLiability, LiabilityRequest, Nothing
 from schemas.status import LEVELS
 
 if TYPE_CHECKING:
@@ -142,6 +144,12 @@ class AgentAction(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     success: bool = True
 
 
+class RobotStop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Why a robot is stopped."""
+
+    why: str = ""
+
+
 class Api(Lifecycle):
     """The handlers of the interface, and what they show: the market, files, the stream."""
 
@@ -203,6 +211,10 @@ class Api(Lifecycle):
             get("/api/v1/accounts/{address}", self.account),
             get("/api/v1/agents/{address}/readings", self.readings),
             get("/api/v1/agents/{address}/logs", self.logs),
+            get("/api/v1/agents/{address}/settings", self.control),
+            post("/api/v1/agents/{address}/settings", self.change_settings),
+            post("/api/v1/agents/{address}/stop", self.stop_robot),
+            post("/api/v1/agents/{address}/release", self.release_robot),
             post("/api/v1/agents/{address}/{action}", self.drive),
             get("/api/v1/lighthouse", self.lighthouse),
             get("/api/v1/stream", self.open_stream),
@@ -426,9 +438,8 @@ class Api(Lifecycle):
         return answer(await self._views.lighthouse())
 
     async def logs(self, request: web.Request) -> web.Response:
-        options = self._options
-        if options.has_login and self._logins.role_of(request) != "operator":
-            raise WebError("only operators read logs", hint="log in as an operator", code="operators-only")
+        if self._options.has_login:
+            self._logins.require_operator(request, "read logs")
         level = request.query.get("level", "info")
         if level not in LEVELS:
             raise WebError(f"a level is one of {', '.join(LEVELS)}")
@@ -439,10 +450,7 @@ class Api(Lifecycle):
         return answer({"events": events, "answered": update.answered})
 
     async def drive(self, request: web.Request) -> web.Response:
-        if self._logins.role_of(request) != "operator":
-            raise WebError(
-                "only operators start, finish and restart jobs", hint="log in as an operator", code="operators-only"
-            )
+        self._logins.require_operator(request, "start, finish and restart jobs")
         wanted, action = await body_of(request, AgentAction), request.match_info["action"]
         liability = parse_address(wanted.liability)
         if action == "finish":
@@ -453,6 +461,25 @@ class Api(Lifecycle):
             raise WebError(f"agents have no action {action[:40]}", code="page-not-found")
         done = await call(self._parts.network.session, address_in(request), action, command)
         return answer(msgspec.to_builtins(done))
+
+    async def control(self, request: web.Request, asked: ControlRobot | None = None) -> web.Response:
+        """Let a robot do what its owner wants: by the data folder if it is the server's own, else by its service."""
+        self._logins.require_operator(request, "control robots")
+        agent, asked, parts = address_in(request), asked or ControlRobot(), self._parts
+        done = await asyncio.to_thread(control_here, stop_folder(parts.settings), agent, asked)
+        is_here = done is not None
+        done = done or await call(parts.network.session, agent, "control", asked)
+        return answer(msgspec.to_builtins(done) | {"here": is_here})
+
+    async def change_settings(self, request: web.Request) -> web.Response:
+        return await self.control(request, await body_of(request, ControlRobot))
+
+    async def stop_robot(self, request: web.Request) -> web.Response:
+        return await self.control(request, ControlRobot(stop=(await body_of(request, RobotStop)).why))
+
+    async def release_robot(self, request: web.Request) -> web.Response:
+        await body_of(request, Nothing)
+        return await self.control(request, ControlRobot(release=True))
 
     async def open_stream(self, request: web.Request) -> web.StreamResponse:
         return await self.stream.serve(request)

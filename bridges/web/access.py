@@ -48,6 +48,9 @@ def unusable(reason: str, why: str, *, hint: str = "") -> WebError:
 
 STATUSES: Final = {
     "content-unavailable": 404,
+    "held-on-machine": 409,
+    "invalid-address": 400,
+    "invalid-amount": 400,
     "login-required": 401,
     "no-local-account": 409,
     "not-a-liability": 404,
@@ -57,6 +60,7 @@ STATUSES: Final = {
     "unknown-name": 404,
     "upload-too-large": 413,
     "uploads-busy": 503,
+    "why-too-long": 400,
     "wrong-host": 421,
     "wrong-origin": 403,
 }
@@ -225,11 +229,13 @@ class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Logins:
     """The sessions of one server, and the members of its roster, which may change at any time.
 
-    Raises `ConfigurationError` for a roster that can't be read at the start.
+    Without a login, and `has_account`, all are operators: they can spend that account's money already. Raises
+    `ConfigurationError` for a roster that can't be read at the start.
     """
 
-    def __init__(self, options: WebOptions) -> None:
+    def __init__(self, options: WebOptions, *, has_account: bool = False) -> None:
         self._options = options
+        self._all_are_operators = has_account and not options.has_login
         self._sessions: BoundedDict[str, tuple[str, float]] = BoundedDict(1024)
         self._roster: FreshFile[Roster] | None = None
         if options.roster:
@@ -243,7 +249,14 @@ class Logins:
     def role_of(self, request: web.Request) -> str:
         """`operator` or `anybody`: what the session of a request may do."""
         login = self.login_of(request)
+        if self._all_are_operators:
+            return "operator"
         return "anybody" if login is None else login.role
+
+    def require_operator(self, request: web.Request, what: str) -> None:
+        """Raise `WebError` for who may not do `what`."""
+        if self.role_of(request) != "operator":
+            raise WebError(f"only operators {what}", hint="log in as an operator", code="operators-only")
 
     def login_of(self, request: web.Request) -> Login | None:
         """Whose request it is; None without a login."""

@@ -75,7 +75,7 @@ class PageServer(Lifecycle):
         self.components = components
         self.options = options
         self.url = ""
-        self._logins = Logins(options)
+        self._logins = Logins(options, has_account=components.agent is not None)
         self.api = Api(components, options, self._logins)
         self._status = WatcherStatus(components.network, components.channel, components.drops)
         self._hosts: frozenset[str] = frozenset()

@@ -1,11 +1,13 @@
 """What a robot works for, by the settings of its owner: `queue_limit`, `least_price`, `accept`, `refuse`, `hours`.
 
+Some of them, its price, and whether it is paused, the owner may change while it runs; that is kept in the ledger.
 Demands are checked before the handlers see them, and a demand that is refused is declined, like one that a handler
 declines. An offer that answers no demand is open to everybody, and so is not checked.
 """
 
 from __future__ import annotations
 
+import asyncio
 import re
 import time
 from dataclasses import dataclass
@@ -14,20 +16,28 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
+from msgspec.structs import replace
+
 from mesh.agent.errors import Declined
+from mesh.agent.orders import ROBOT_STOPPED, robot_stopped
+from mesh.amounts import InvalidAmount
 from mesh.errors import ConfigurationError, InputError
 from mesh.settings import MEANING
 from schemas import parse_address
+from schemas.model import PRICE
+from schemas.records import ControlRobot, RobotControl
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from mesh.agent.components import AgentComponents
+    from mesh.role.local_stop import Hold
 
+PAUSED: Final = "paused"
 QUEUE_FULL: Final = "queue-full"
 OUTSIDE_HOURS: Final = "outside-hours"
-FOR_NOW: Final = frozenset({QUEUE_FULL, OUTSIDE_HOURS})
-"""The codes of refusals that end by themselves: the demand is looked at again when it is sent again."""
+FOR_NOW: Final = frozenset({QUEUE_FULL, OUTSIDE_HOURS, PAUSED, ROBOT_STOPPED})
+"""The codes of refusals that end without a new demand: it is looked at again when it is sent again."""
 
 DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _HOURS: Final = re.compile(
@@ -81,25 +91,81 @@ class Hours:
 
 
 class OwnerRules:
-    """Whether an agent takes a job, by its settings: `await rules.refusal(…)`.
+    """Whether an agent takes a job: `await rules.open()` once, then `rules.refusal(…)`.
 
-    `jobs` counts the jobs that it has now: those that wait and run, and its offers that may become one. Raises
-    `ConfigurationError` for settings that can't be read.
+    `jobs` counts the jobs that it has now: those that wait and run, and its offers that may become one. `price` is that
+    of its model's description. Raises `ConfigurationError` for settings that can't be read.
     """
 
     def __init__(
-        self, parts: AgentComponents, jobs: Callable[[], int], *, clock: Callable[[], float] = time.time
+        self,
+        parts: AgentComponents,
+        jobs: Callable[[], int],
+        hold: Hold,
+        *,
+        price: str = "",
+        clock: Callable[[], float] = time.time,
     ) -> None:
         settings = parts.settings
         self._parts = parts
         self._jobs = jobs
+        self._hold = hold
+        self._described = price
         self._clock = clock
         self._limit = settings.queue_limit
         self._accepted = _addresses("accept", settings.accept)
         self._refused = _addresses("refuse", settings.refuse)
         self._hours = [_hours(text) for text in settings.hours]
+        self._changed = ControlRobot()
+        self._changing = asyncio.Lock()
         self._least: tuple[str, int, str] | None = None
-        """The token (address) of `least_price`, that price in its smallest unit, and for people."""
+        """The token (address) of the least price, that price in its smallest unit, and for people."""
+
+    async def open(self) -> None:
+        """Read what the owner has changed before. Raises `InvalidAmount` for a `least_price` that is none."""
+        changed = await self._parts.ledger.control()
+        self._use(changed, await self._least_of(changed))
+
+    async def change(self, asked: ControlRobot) -> None:
+        """Change what is given, for this run and later ones. Raises `InvalidAmount`, `InvalidAddress`."""
+        async with self._changing:
+            new = self._changed
+            if asked.price is not None:
+                new = replace(new, price=await self._price_of(asked.price) if asked.price else "")
+            if asked.least_price is not None:
+                least = await self._price_of(asked.least_price) if asked.least_price else ""
+                new = replace(new, least_price=least)
+            if asked.refuse is not None:
+                new = replace(new, refuse=tuple(dict.fromkeys(map(parse_address, asked.refuse))))
+            if asked.paused is not None:
+                new = replace(new, paused=asked.paused)
+            if new != self._changed:
+                least_price = await self._least_of(new)
+                await self._parts.ledger.keep_control(new)
+                self._use(new, least_price)
+
+    def _use(self, changed: ControlRobot, least: tuple[str, int, str] | None) -> None:
+        self._changed, self._least = changed, least
+        if changed.refuse is not None:
+            self._refused = frozenset(changed.refuse)
+
+    @property
+    def price(self) -> str:
+        """What a job usually costs (`5 XRT`); empty if nothing says so."""
+        return self._changed.price or self._described
+
+    @property
+    def control(self) -> RobotControl:
+        """What is in effect of that which the owner may change."""
+        changed = self._changed
+        least = self._parts.settings.least_price if changed.least_price is None else changed.least_price
+        return RobotControl(
+            price=self.price,
+            paused=bool(changed.paused),
+            refuse=tuple(sorted(self._refused)),
+            least_price=least,
+            held=self._hold.is_held,
+        )
 
     async def refusal(self, customer: str, *, cost: int, token: str) -> Declined | None:
         """Why the agent does not work for a customer (address) for `cost` of a token (address), if it doesn't."""
@@ -107,34 +173,50 @@ class OwnerRules:
             return Declined("refused", "its owner does not work for this customer")
         if self._accepted and customer not in self._accepted:
             return Declined("not-accepted", "it works for certain customers only")
-        await self.open()
         if self._least is not None:
             wanted, price, shown = self._least
             if token != wanted or cost < price:
                 return Declined("price-too-low", f"it works for at least {shown}")
-        if not self.is_open:
+        return self.closed() or self.full()
+
+    def closed(self) -> Declined | None:
+        """Why the agent takes no jobs of anybody now, if it doesn't."""
+        if (stopped := self.stopped()) is not None:
+            return stopped
+        if self._hours and not any(hours.contain(self._clock()) for hours in self._hours):
             return Declined(OUTSIDE_HOURS, f"it works at {', '.join(self._parts.settings.hours)}")
-        return self.full()
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it is one of the hours at which the agent takes jobs."""
-        return not self._hours or any(hours.contain(self._clock()) for hours in self._hours)
-
-    def full(self) -> Declined | None:
-        """The refusal of one more job, if there is no place for it."""
-        if self._limit and self._jobs() >= self._limit:
-            return Declined(QUEUE_FULL, f"it has {self._limit} jobs, the most that it takes at a time")
         return None
 
-    async def open(self) -> None:
-        """Read `least_price`. Raises `InvalidAmount` if it is not an amount of the token."""
+    def stopped(self) -> Declined | None:
+        """The refusal of each job until its owner releases the agent, or lets it take jobs again, if it is so."""
+        if self._hold.is_held:
+            return robot_stopped()
+        return Declined(PAUSED, "its owner has paused it") if self._changed.paused else None
+
+    def full(self) -> Declined | None:
+        """The refusal of one more job now, if the agent was stopped or paused, or there is no place for it."""
+        if self._limit and self._jobs() >= self._limit:
+            return Declined(QUEUE_FULL, f"it has {self._limit} jobs, the most that it takes at a time")
+        return self.stopped()
+
+    async def _least_of(self, changed: ControlRobot) -> tuple[str, int, str] | None:
         chain, settings, outages = self._parts.chain, self._parts.settings, self._parts.outages
-        if settings.least_price and self._least is None:
-            token = await chain.retrying(partial(chain.names.address, settings.erc20_token), outages=outages)
-            unit = await chain.retrying(partial(chain.tokens.unit, token), outages=outages)
-            price = unit.parse(settings.least_price)
-            self._least = token, price, unit.show(price)
+        text = settings.least_price if changed.least_price is None else changed.least_price
+        if not text:
+            return None
+        token = await chain.retrying(partial(chain.names.address, settings.erc20_token), outages=outages)
+        unit = await chain.retrying(partial(chain.tokens.unit, token), outages=outages)
+        price = unit.parse(text)
+        return token, price, unit.show(price)
+
+    async def _price_of(self, text: str) -> str:
+        """A price that an owner has written, as profiles say it. Raises `InvalidAmount`, `ChainError`."""
+        unit = await self._parts.chain.tokens.unit(self._parts.settings.erc20_token)
+        amount = unit.parse(text)
+        price = f"{unit.decimal(amount)} XRT" if unit.symbol == "XRT" else f"{amount} units"
+        if not re.fullmatch(PRICE, price):
+            raise InvalidAmount(f"{text[:40]!r} is more than a price can be", hint=unit.hint())
+        return price
 
 
 def _minutes(text: str) -> int:

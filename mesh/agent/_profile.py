@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from mesh.agent.ledger import Phase
+from mesh.agent.orders import ROBOT_STOPPED
 from mesh.base.flood import Rate
 from mesh.errors import ChainError, ConfigurationError
 from mesh.network.services import answering
@@ -29,11 +30,12 @@ from schemas.payloads import plain_value
 from schemas.profiles import LONGEST_READING, MOST_READINGS, MOST_WAITING, Profile, ProfileState, text_fault
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
     from contextlib import AbstractAsyncContextManager
 
     import zenoh
 
+    from mesh.agent._owner_rules import OwnerRules
     from mesh.agent.components import AgentComponents
     from mesh.agent.jobs import Executor
     from mesh.settings import ProfileSettings
@@ -56,24 +58,25 @@ LOOK: Final = 2.0
 
 
 class OwnProfile:
-    """The profile of one robot. Call `prepare` once, then `serve` and `run`, and `changed` at any time.
-
-    `is_stopped` and `is_closed` say whether somebody has stopped the robot, and whether it takes no jobs now.
-    """
+    """The profile of one robot. Call `prepare` once, then `serve` and `run`, and `changed` at any time."""
 
     def __init__(
-        self, parts: AgentComponents, executor: Executor, description: ModelDescription | None, *, model: str
+        self,
+        parts: AgentComponents,
+        executor: Executor,
+        rules: OwnerRules,
+        description: ModelDescription | None,
+        *,
+        model: str,
     ) -> None:
         self._parts = parts
         self._executor = executor
+        self._rules = rules
         self._model = model
         self._picture = ""
-        self._price = "" if description is None else description.price
         self._seconds = float((None if description is None else description.seconds) or 0)
         self._changed = asyncio.Event()
         self._readings: dict[str, tuple[bytes, PayloadType]] = {}
-        self.is_stopped: Callable[[], bool] = lambda: False
-        self.is_closed: Callable[[], bool] = lambda: False
 
     async def prepare(self) -> None:
         """Check the settings, put the picture into the store, and find the model's CID.
@@ -144,7 +147,7 @@ class OwnProfile:
         """The signed profile of this moment."""
         return self._signed(*await self._doing())
 
-    def _signed(self, state: ProfileState, queue: int, wait: int) -> Profile:
+    def _signed(self, price: str, state: ProfileState, queue: int, wait: int) -> Profile:
         settings, signer = self._parts.settings, self._parts.signer
         profile = Profile(
             agent=signer.address,
@@ -153,7 +156,7 @@ class OwnProfile:
             about=settings.about,
             picture=self._picture,
             place=settings.place,
-            price=self._price,
+            price=price,
             state=state,
             queue=queue,
             wait=wait,
@@ -162,16 +165,14 @@ class OwnProfile:
         )
         return profile.signed_by(signer)
 
-    async def _doing(self) -> tuple[ProfileState, int, int]:
-        """What the robot is doing now: the state, `queue` and `wait` of its profile."""
+    async def _doing(self) -> tuple[str, ProfileState, int, int]:
+        """What changes of the profile: `price`, `state`, `queue` and `wait`."""
         jobs = await self._parts.ledger.jobs_by_phase()
         waiting, seconds = self._queue_of(jobs)
         state: ProfileState = "working" if jobs.get("running") else "idle"
-        if self.is_stopped():
-            state = "stopped"
-        elif self.is_closed():
-            state = "closed"
-        return state, min(waiting, MOST_WAITING), min(seconds, MOST_WAITING)
+        if (closed := self._rules.closed()) is not None:
+            state = "stopped" if closed.reason == ROBOT_STOPPED else "closed"
+        return self._rules.price, state, min(waiting, MOST_WAITING), min(seconds, MOST_WAITING)
 
     def serve(self) -> AbstractAsyncContextManager[None]:
         """Meanwhile answer queries for the profile."""
@@ -185,7 +186,7 @@ class OwnProfile:
     async def run(self) -> None:
         """Put the profile when it has changed, at most once in `INTERVAL` seconds, until cancelled."""
         key = str(ProfileKey(self._parts.signer.address))
-        said: tuple[ProfileState, int, int] | None = None
+        said: tuple[str, ProfileState, int, int] | None = None
         while True:
             self._changed.clear()
             try:

@@ -1,6 +1,7 @@
 """The quotes of a robot: what it asks for a job, and when it would do it. They bind nobody, and cost nothing.
 
-It answers with what its handler says, or by default with the price in its model's description.
+It answers with what its handler says, or by default with its price: the one that its owner has set, or that of its
+model's description.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from mesh.agent.demands import grounds_of
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call_handler
 from mesh.agent.objectives import Buyer
-from mesh.agent.orders import FEWEST_BLOCKS, HANDLED_FOR, robot_stopped
+from mesh.agent.orders import FEWEST_BLOCKS, HANDLED_FOR
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.errors import AiraError, InvalidMessage, public_text
@@ -40,7 +41,7 @@ TOTAL: Final = Rate(per_second=10.0, burst=200)
 
 
 class Quoting:
-    """The service `quote` of a robot: what its handler asks for a job, or the price of its `description`.
+    """The service `quote` of a robot: what its handler asks for a job, or its usual price.
 
     What its owner's `rules` exclude is declined.
     """
@@ -59,7 +60,6 @@ class Quoting:
         self._profile = profile
         self._rules = rules
         self._handlers = handlers
-        self._price = "" if description is None else description.price
         self._seconds = float((None if description is None else description.seconds) or 0)
         self._model = model
         self._limiter = RateLimiter(per_sender=PER_ASKER, total=TOTAL)
@@ -86,11 +86,11 @@ class Quoting:
         parts = self._parts
         if not self._limiter.allow(request.asker):
             raise Declined("busy", "too many ask")
-        if self._profile.is_stopped():
-            raise robot_stopped()
+        if (closed := self._rules.closed()) is not None:
+            raise closed
         if is_cid(self._model) and request.model != self._model:
             raise Declined("other-model", f"it works for the model {self._model}")
-        price: int | str | None = self._price or None
+        price: int | str | None = self._rules.price or None
         HANDLED_FOR.set(Buyer(request.asker, pays=False))
         for handler in self._handlers:
             price = await call_handler(handler, request)

@@ -26,7 +26,7 @@ from mesh.agent._status import AgentStatus
 from mesh.agent.contracts import ContractReports, Outcome
 from mesh.agent.demands import Acceptance, DemandDispatcher
 from mesh.agent.handlers import call
-from mesh.agent.jobs import Executor, reason_in, stop_devices
+from mesh.agent.jobs import Executor, check_stop, reason_in, stop_devices
 from mesh.agent.ledger import TO_BE_DONE, UNFINISHED, Phase, advance
 from mesh.agent.objectives import Objectives
 from mesh.agent.trade import Trader
@@ -47,10 +47,10 @@ from mesh.chain import (
     Reverted,
     Transfer,
 )
-from mesh.errors import ChainError
+from mesh.errors import AiraError, ChainError, ConfigurationError
 from mesh.network.services import answering, declared
 from mesh.role.following import follow_chain
-from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, listening, stop_folder
+from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, LocalRequest, listening, stop_folder
 from mesh.telemetry.logs import LogService
 from schemas import ZERO_ADDRESS, Demand, Result, Withdrawal, decode, event_selector, message_hash, parse_address
 from schemas.cid import is_cid
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from mesh.role.models import Models
     from schemas import Liability, Offer, Record
     from schemas.model import ModelDescription
-    from schemas.records import DeviceStop
+    from schemas.records import ControlRobot, DeviceStop, RobotControl
     from schemas.verdicts import ValidatorReport
 
 
@@ -252,15 +252,16 @@ class AgentRuntime(Lifecycle):
             parallel=parallel,
             is_paid_when_stopped=description is not None and description.on_stop == "paid",
         )
-        self.rules = OwnerRules(parts, lambda: len(self.executor.at_hand) + len(self.trader.answers))
+        price = "" if description is None else description.price
+        self.rules = OwnerRules(
+            parts, lambda: len(self.executor.at_hand) + len(self.trader.answers), self.executor.hold, price=price
+        )
         self.trader.full = self.rules.full
         self.notifier = Notifier(parts.settings, parts.signer.address)
         self.trader.on_offer = self._on_offer
         self.token_events = TokenEvents(parts.channel.put, parts.signer.address)
         self.status = AgentStatus(parts, self.executor, model=model)
-        self.profile = OwnProfile(parts, self.executor, description, model=model)
-        self.profile.is_stopped = lambda: self.executor.hold.is_held
-        self.profile.is_closed = lambda: not self.rules.is_open
+        self.profile = OwnProfile(parts, self.executor, self.rules, description, model=model)
         self._handlers = handlers
         self._description = description
         # Else it may run beside the account's robot, as the commands of a person do.
@@ -273,13 +274,16 @@ class AgentRuntime(Lifecycle):
         await stack.enter_async_context(self.notifier)
         await stack.enter_async_context(self.reports)
         await stack.enter_async_context(self.trader)
+        if self._is_robot or self.parts.settings.enable_executor:
+            await self.rules.open()
         if self._is_robot:
             await self.trader.withdraw_earlier_offers()
             await self.profile.prepare()
             await stack.enter_async_context(self.profile.serve())
         await stack.enter_async_context(answering_phases(self.parts, self.executor))
         services = self.parts.services
-        offer_services(self.parts, self.executor, self.stop, has_handlers=bool(self._handlers.topics))
+        has_handlers = bool(self._handlers.topics)
+        offer_services(self.parts, self.executor, self.stop, self.control, has_handlers=has_handlers)
         if decide := self._handlers.market.get(Demand):
             quoting = Quoting(
                 self.parts, self.profile, self.rules, self._handlers.quotes, self._description, model=self._model
@@ -287,9 +291,9 @@ class AgentRuntime(Lifecycle):
             services.offer("quote", quoting.quote)
             services.offer("accept", Acceptance(self.parts, self.trader, self.rules, decide, model=self._model).accept)
         if self.parts.settings.enable_executor:
-            stop = partial(self._stop_from_thread, asyncio.get_running_loop())
+            ask = partial(self._ask_from_thread, asyncio.get_running_loop())
             folder = stop_folder(self.parts.settings)
-            stack.enter_context(listening(folder, f"agent-{self._account}", stop))
+            stack.enter_context(listening(folder, f"agent-{self._account}", ask))
         services.offer("logs", LogService("agent", self.parts.signer.address).logs)
         services.offer("status", self.status.status)
 
@@ -487,7 +491,6 @@ class AgentRuntime(Lifecycle):
         """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
         parts, names = self.parts, self.parts.chain.names
         token = await parts.chain.retrying(partial(names.address, parts.settings.erc20_token), outages=parts.outages)
-        await self.rules.open()
         dispatcher = DemandDispatcher(subscription, handlers, parts, self.trader, self.rules, token=token)
         async with parts.channel.subscribe(Withdrawal) as withdrawals, asyncio.TaskGroup() as tasks:
             tasks.create_task(dispatcher.run(), name="demands")
@@ -544,11 +547,46 @@ class AgentRuntime(Lifecycle):
         detail = "; ".join((f"stopped {len(jobs)} job{'' if len(jobs) == 1 else 's'}", *told))
         return LocalAnswer(who=f"agent {self._account}", heard=True, detail=detail)
 
-    def _stop_from_thread(self, loop: asyncio.AbstractEventLoop, why: str) -> LocalAnswer:
+    async def control(self, asked: ControlRobot) -> RobotControl:
+        """Do what the owner of this agent wants; returns what is in effect then.
+
+        Raises `InvalidAmount`, `InvalidAddress`, `InputError`, and an `AiraError` if it can't be held or released.
+        """
+        stopped, hold = "", self.executor.hold
         try:
-            return asyncio.run_coroutine_threadsafe(self.stop_all(why), loop).result(ANSWER_SECONDS)
+            if asked.stop is not None:
+                check_stop(asked.stop)
+                try:
+                    await asyncio.to_thread(hold.hold, asked.stop)
+                finally:
+                    stopped = (await self.stop_all(asked.stop)).detail
+            elif asked.release:
+                await asyncio.to_thread(hold.release)
+        except OSError as error:
+            raise ConfigurationError(f"the data folder can't be written to: {error.strerror}") from None
+        await self.rules.change(asked)
+        if asked.release and hold.is_held:
+            why, hint = "all robots of its machine were stopped there", "`aira stop --release` there releases them"
+            raise AiraError(why, hint=hint, code="held-on-machine")
+        if asked.paused:
+            await self.trader.take_back_offers("its owner has paused it")
+        self.profile.changed()
+        return replace(self.rules.control, stopped=stopped)
+
+    async def _ask(self, asked: LocalRequest) -> LocalAnswer:
+        if asked.control is None:
+            return await self.stop_all(asked.why)
+        who = f"agent {self._account}"
+        try:
+            return LocalAnswer(who=who, heard=True, control=await self.control(asked.control))
+        except AiraError as error:
+            return LocalAnswer(who=who, heard=False, detail=str(error), hint=error.hint, code=error.code)
+
+    def _ask_from_thread(self, loop: asyncio.AbstractEventLoop, asked: LocalRequest) -> LocalAnswer:
+        try:
+            return asyncio.run_coroutine_threadsafe(self._ask(asked), loop).result(ANSWER_SECONDS)
         except TimeoutError:
-            return LocalAnswer(who=f"agent {self._account}", heard=False, detail="it is busy and has not stopped yet")
+            return LocalAnswer(who=f"agent {self._account}", heard=False, detail="it is busy and has not done it yet")
 
     async def require_fit(self, objective: str, model: str) -> None:
         """Raise `ObjectiveUnfit` if an objective does not fit the model's description, as far as both are available."""

@@ -1,9 +1,9 @@
 """The services of an agent: its jobs, its account on the chain, and messages that it signs or publishes for others.
 
-Anybody on the router can call them. Reading is open to all. What signs, spends or publishes in the agent's name
-(`schemas.rpc.GUARDED`) is refused unless the setting `open_services` allows it. Services that drive jobs are refused
-in the same way if the agent has handlers, which do its jobs; without handlers they are the only way to do them, as in
-the legacy stack. A router with access control can keep strangers away from all of them.
+Anybody on the router can call them. Reading is open to all. What signs, spends or publishes in the agent's name,
+or is its owner's (`schemas.rpc.GUARDED`), is refused unless the setting `open_services` allows it. Services that drive
+jobs are refused in the same way if the agent has handlers, which do its jobs; without handlers they are the only way to
+do them, as in the legacy stack. A router with access control can keep strangers away from all of them.
 """
 
 from __future__ import annotations
@@ -83,11 +83,17 @@ DRIVING = frozenset({"start", "restart", "resume", "finish"})
 """The services that drive jobs."""
 
 
-def offer_services(parts: AgentComponents, executor: Executor, stop: Stopping, *, has_handlers: bool) -> None:
-    """Offer all services of an agent; `has_handlers` if its own code does the jobs, `stop` stops one of them."""
+def offer_services(
+    parts: AgentComponents, executor: Executor, stop: Stopping, control: Service, *, has_handlers: bool
+) -> None:
+    """Offer all services of an agent; `has_handlers` if its own code does the jobs, `stop` stops one of them.
+
+    `control` does what its owner wants.
+    """
     services = {
         **job_services(executor),
         "stop": stop_service(parts, executor, stop),
+        "control": control,
         **account_services(parts),
         **MessageServices(parts).services(),
     }
@@ -97,7 +103,7 @@ def offer_services(parts: AgentComponents, executor: Executor, stop: Stopping, *
         facts = log_event("services-opened", address=parts.signer.address)
         log.warning("open_services: anyone on the router may sign and spend with %s", parts.signer.address, extra=facts)
     for name, service in services.items():
-        if name in {*DRIVING, "stop"} and not parts.settings.enable_executor:
+        if name in {*DRIVING, "stop", "control"} and not parts.settings.enable_executor:
             continue
         parts.services.offer(name, _refusal(name) if name in refused else service)
 

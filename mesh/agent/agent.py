@@ -45,7 +45,7 @@ from mesh.agent.handlers import (
 from mesh.agent.jobs import check_stop
 from mesh.agent.ledger import WrongPhase
 from mesh.agent.objectives import ObjectiveUnfit
-from mesh.agent.orders import HANDLED_FOR, OrderState, robot_stopped
+from mesh.agent.orders import HANDLED_FOR, OrderState
 from mesh.agent.statement import period, read_statement
 from mesh.agent.validators import ValidatorSilent, check_named
 from mesh.amounts import XRT
@@ -76,6 +76,7 @@ from schemas.cid import is_cid
 from schemas.errors import InvalidKey
 from schemas.keys import ReadingKey
 from schemas.model import ModelDescription, topic_gap, topic_of
+from schemas.records import ControlRobot
 from schemas.rpc import Stopped
 
 if TYPE_CHECKING:
@@ -100,6 +101,7 @@ if TYPE_CHECKING:
     from mesh.watching import Robot
     from schemas.model import ModelLimits
     from schemas.payloads import PayloadType
+    from schemas.records import RobotControl
     from schemas.rpc import Quote, QuoteRequest
     from schemas.signing import Decline
 
@@ -229,6 +231,17 @@ MOST_EXAMINED: Final = 10_000
 """Messages that `Agent.examine` gives of a demand."""
 ASK_SECONDS: Final = 60.0
 """How long `Agent.ask` waits for an answer by default."""
+
+
+class Changes(TypedDict, total=False):
+    """The arguments of `Agent.control`."""
+
+    price: str
+    paused: bool
+    refuse: tuple[str, ...]
+    least_price: str
+    stop: str
+    release: bool
 
 
 class DescriptionFields(TypedDict, total=False):
@@ -469,11 +482,11 @@ class Agent(Program):
         Raises `InsufficientTokens`, `InvalidAmount`, for an objective that can't be played `ObjectiveUnfit` or a
         `ContentError`, an `AiraError` for a demand that is a contract, and `Declined` for one whose validator wants a
         higher fee or is not one of the setting `accepted_validators`, while an equal one is open that was declined, or
-        while a stopped robot is held.
+        while the robot was stopped or paused.
         """
         trader, fee = self.runtime.trader, XRT.amount(lighthouse_fee)
-        if self.runtime.executor.hold.is_held:
-            raise robot_stopped()
+        if (stopped := self.runtime.rules.stopped()) is not None:
+            raise stopped
         if demand is None:
             terms = await trader.writer.terms(
                 model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
@@ -749,6 +762,19 @@ class Agent(Program):
         """
         since, until = period(first, last)
         return await read_statement(self.chain, self.address, since=since, until=until)
+
+    async def control(self, **changes: Unpack[Changes]) -> RobotControl:
+        """Change what the owner may change while the robot runs; returns what is in effect: also without a change.
+
+        `price` (`"6 XRT"`) is what the profile and quotes say; empty for that of the model's description. While the
+        robot is `paused` it takes no new jobs. `refuse` are the customers (addresses) that it never works for,
+        `least_price` is the least cost of a job; empty for any. These stay as they are when the agent is restarted, and
+        override its settings. `stop="why"` stops all jobs, and lets none begin until `release=True`.
+
+        Raises `InvalidAmount`, `InvalidAddress`, `InputError` for a reason that is too long, and an `AiraError` with
+        the code `held-on-machine` if `aira stop` on its machine holds the robot.
+        """
+        return await self.runtime.control(ControlRobot(**changes))
 
     async def hand_back(self, address: str, code: str, why: str = "") -> Stopped:
         """Give back the job of the liability at `address`, because the robot can't do it: its customer is refunded.

@@ -18,7 +18,7 @@ from mesh.agent._owner_rules import FOR_NOW
 from mesh.agent.errors import Declined
 from mesh.agent.handlers import call
 from mesh.agent.objectives import Buyer, ObjectiveNotFetched, ObjectiveUnfit
-from mesh.agent.orders import ALONE, DEMAND_TAKEN, EQUAL_DECLINED, HANDLED_FOR, ROBOT_STOPPED, TooManyOffers
+from mesh.agent.orders import ALONE, DEMAND_TAKEN, EQUAL_DECLINED, HANDLED_FOR, TooManyOffers
 from mesh.base.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.content import ContentTooLarge, ContentUnavailable
@@ -263,7 +263,7 @@ class DemandDispatcher:
                 self._drop(demand, f"objective-{error.reason}")
             elif isinstance(error, ContentUnavailable):
                 self._drop(demand, "objective-missing")
-            elif isinstance(error, Declined) and error.reason in (EQUAL_DECLINED, ROBOT_STOPPED):
+            elif isinstance(error, Declined) and error.reason == EQUAL_DECLINED:
                 self._drop(demand, error.reason, after=self._pause)
             elif error is not None and _may_pass(error):
                 self._drop(demand, error.code)
@@ -273,7 +273,7 @@ class DemandDispatcher:
             self._declines.decline(demand, grounds[0])
             if grounds[0].code in FOR_NOW:
                 self._drop(demand, grounds[0].code, after=self._pause)
-            elif not answered.is_over and grounds[0].code not in (BUSY.code, EQUAL_DECLINED, ROBOT_STOPPED):
+            elif not answered.is_over and grounds[0].code not in (BUSY.code, EQUAL_DECLINED):
                 await self._trader.decline(answered)
         if not answered.is_answered:
             self._trader.answered.forget(answered)

@@ -17,6 +17,7 @@ from msgspec.structs import astuple
 from mesh.errors import AiraError
 from mesh.role.database import RoleLedger
 from schemas import Liability
+from schemas.records import ControlRobot
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -91,6 +92,10 @@ CREATE TABLE IF NOT EXISTS stops (
     liability TEXT PRIMARY KEY,
     why TEXT NOT NULL,
     code TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS control (
+    one INTEGER PRIMARY KEY CHECK (one = 1),
+    record BLOB NOT NULL
 );
 CREATE INDEX IF NOT EXISTS jobs_by_phase ON jobs (phase, changed) WHERE NOT aside;
 CREATE TABLE IF NOT EXISTS outbox (
@@ -233,6 +238,15 @@ class Ledger(RoleLedger):
         """How the job at `liability` (address) was stopped; None if it was not."""
         rows = await self._database.rows("SELECT why, code FROM stops WHERE liability = ?", (liability,))
         return Stop(*rows[0]) if rows else None
+
+    async def keep_control(self, changed: ControlRobot) -> None:
+        """Keep what the owner has changed while the agent ran."""
+        await self._database.run("INSERT OR REPLACE INTO control VALUES (1, ?)", (changed.encode(),))
+
+    async def control(self) -> ControlRobot:
+        """What the owner has changed, also in earlier runs."""
+        rows = await self._database.rows("SELECT record FROM control")
+        return ControlRobot.decode(rows[0][0]) if rows else ControlRobot()
 
     async def job(self, liability: str) -> JobRecord | None:
         """The job at `liability` (EIP-55 address), if there is one."""

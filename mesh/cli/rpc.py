@@ -59,8 +59,8 @@ async def command(
     aira rpc 0x… start address=0x…
 
     Amounts are in the smallest unit of the agent's token, by default XRT (wn). With --json, amounts of ETH are in wei.
-    Agents refuse services that sign, send or spend (marked with * in --list) unless open_services is set; an agent with
-    an executor also refuses start, restart, resume and finish.
+    Agents refuse services that sign, send, spend or control them (marked with * in --list) unless open_services is set;
+    an agent with an executor also refuses start, restart, resume and finish.
     """
     if as_list:
         _list_services(as_json=as_json)

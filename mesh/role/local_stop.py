@@ -1,8 +1,8 @@
-"""A stop on the robot's own machine, which needs neither a router nor a chain: `aira stop`.
+"""The owner's way to the robots of this machine, which needs no router: `aira stop`, `aira robot`.
 
 Each agent that does jobs, and each edge agent, listens on a Unix socket in the folder `stop` of the data folder. Its
-user, who alone may write there, may stop it. `Hold` is a file there: while it exists, no job begins, also after a
-restart.
+user, who alone may write there, may stop it, and change the settings of an agent. `Hold` is a file there: while it
+exists, no job begins, also after a restart.
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ import msgspec
 
 from mesh.base.log_context import log_event
 from mesh.base.private_files import make_private_folder, open_private, sync_directory
+from mesh.errors import AiraError
 from schemas.decoding import InvalidData, decode_json
+from schemas.records import ControlRobot, RobotControl  # msgspec reads the annotations
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from mesh.settings.groups import StorageSettings
@@ -37,18 +39,22 @@ LONGEST: Final = 65_536
 HELD: Final = "held"
 
 
-class LocalStop(msgspec.Struct, frozen=True):
-    """A request to stop; `why` is for people."""
+class LocalRequest(msgspec.Struct, frozen=True):
+    """A request to stop, and `why`, for people; or, to an agent, to do what its owner wants."""
 
-    why: str
+    why: str = ""
+    control: ControlRobot | None = None
 
 
 class LocalAnswer(msgspec.Struct, frozen=True, kw_only=True):
-    """What an agent or a device did: it `heard` the stop, or `detail` says why it could not stop."""
+    """What an agent or a device did: it `heard` the request, or `detail` says why it could not do it."""
 
     who: str
     heard: bool
     detail: str = ""
+    hint: str = ""
+    code: str = ""
+    control: RobotControl | None = None
 
 
 def stop_folder(settings: StorageSettings) -> Path:
@@ -70,6 +76,10 @@ class Hold:
     def hold(self, why: str) -> None:
         """Let this agent begin no job until `release`. Raises `OSError`."""
         _write_hold(self._own, why)
+
+    def release(self) -> None:
+        """Undo `hold`; if all agents of the folder are held, this one stays so. Raises `OSError`."""
+        self._own.unlink(missing_ok=True)
 
 
 def hold_all(folder: Path, why: str) -> None:
@@ -95,8 +105,8 @@ def _write_hold(path: Path, why: str) -> None:
 
 
 @contextmanager
-def listening(folder: Path, name: str, stop: Callable[[str], LocalAnswer]) -> Iterator[None]:
-    """Meanwhile call `stop` with the reason, on a thread of its own, when somebody stops this process's robot.
+def listening(folder: Path, name: str, answer: Callable[[LocalRequest], LocalAnswer]) -> Iterator[None]:
+    """Meanwhile answer the requests to this process's robot, on a thread of its own.
 
     Without a usable folder it only warns: the robot works, but can't be stopped like this.
     """
@@ -122,8 +132,8 @@ def listening(folder: Path, name: str, stop: Callable[[str], LocalAnswer]) -> It
                 return
             with connection, contextlib.suppress(OSError, InvalidData):
                 connection.settimeout(ANSWER_SECONDS)
-                asked = decode_json(_read(connection), LocalStop)
-                connection.sendall(msgspec.json.encode(stop(asked.why)))
+                asked = decode_json(_read(connection), LocalRequest)
+                connection.sendall(msgspec.json.encode(answer(asked)))
 
     thread = threading.Thread(target=serve, name="aira stop", daemon=True)
     thread.start()
@@ -136,11 +146,31 @@ def listening(folder: Path, name: str, stop: Callable[[str], LocalAnswer]) -> It
 
 
 def stop_here(folder: Path, why: str) -> list[LocalAnswer]:
-    """Stop all that listen in a folder, at once; returns their answers. Removes the sockets that nobody listens on."""
+    """Stop all that listen in a folder, at once; returns their answers. Blocks."""
+    return _ask(folder.glob("*.sock"), LocalRequest(why))
+
+
+def control_here(folder: Path, agent: str, asked: ControlRobot) -> RobotControl | None:
+    """Let an agent (address) that listens in a folder do what its owner wants; None if it does not run there. Blocks.
+
+    Raises what the agent answers, an `AiraError`.
+    """
+    answers = _ask(folder.glob(f"agent-{agent}.*.sock"), LocalRequest(control=asked))
+    for answer in answers:
+        if answer.control is None:
+            raise AiraError(answer.detail, hint=answer.hint, code=answer.code)
+    return answers[-1].control if answers else None
+
+
+def agents_here(folder: Path) -> list[str]:
+    """The agents (addresses) that listen in a folder, or were killed."""
+    return sorted({path.name.split(".", 1)[0].removeprefix("agent-") for path in folder.glob("agent-*.sock")})
+
+
+def _ask(sockets: Iterable[Path], asked: LocalRequest) -> list[LocalAnswer]:
+    """The answers of all that listen, by name. Removes the sockets that nobody listens on."""
     answers: dict[str, LocalAnswer] = {}
-    asking = [
-        threading.Thread(target=_stop_one, args=(path, why, answers), daemon=True) for path in folder.glob("*.sock")
-    ]
+    asking = [threading.Thread(target=_ask_one, args=(path, asked, answers), daemon=True) for path in sockets]
     for thread in asking:
         thread.start()
     for thread in asking:
@@ -148,21 +178,21 @@ def stop_here(folder: Path, why: str) -> list[LocalAnswer]:
     return [answers[name] for name in sorted(answers)]
 
 
-def _stop_one(path: Path, why: str, answers: dict[str, LocalAnswer]) -> None:
+def _ask_one(path: Path, asked: LocalRequest, answers: dict[str, LocalAnswer]) -> None:
     name = path.name.split(".", 1)[0]
     with socket.socket(socket.AF_UNIX) as client:
         client.settimeout(ANSWER_SECONDS)
         try:
             with _short(path) as address:
                 client.connect(address)
-            client.sendall(msgspec.json.encode(LocalStop(why)))
+            client.sendall(msgspec.json.encode(asked))
             client.shutdown(socket.SHUT_WR)
             answers[path.name] = decode_json(_read(client), LocalAnswer)
         except (ConnectionRefusedError, FileNotFoundError):  # its process was killed
             path.unlink(missing_ok=True)
         except (OSError, InvalidData):
             detail = f"no answer within {ANSWER_SECONDS:g} s"
-            answers[path.name] = LocalAnswer(who=name.replace("-", " "), heard=False, detail=detail)
+            answers[path.name] = LocalAnswer(who=name.replace("-", " "), heard=False, detail=detail, code="busy")
 
 
 def _read(connection: socket.socket) -> bytes:

@@ -233,13 +233,13 @@ class ExecutionSettings(ContentSettings):
         " validators accept no bags unless they are set to",
     )
     hold_when_stopped: bool = option(
-        False, "after a job was stopped, take and begin no other one until `aira stop --release` on this machine"
+        False, "after a job was stopped, take and begin no other one until it is released (`aira stop --release`)"
     )
     open_services: bool = option(
         False,
         "let anyone on the router make this agent sign, send messages and spend (rpc/sign, rpc/send,"
-        " rpc/eth/transfer, transfer_from, approve), and drive the jobs of its handlers (rpc/start, finish, restart,"
-        " resume)",
+        " rpc/eth/transfer, transfer_from, approve), control it as its owner (rpc/control), and drive the jobs"
+        " of its handlers (rpc/start, finish, restart, resume)",
     )
 
 

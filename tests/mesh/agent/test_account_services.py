@@ -11,6 +11,7 @@ from mesh.agent.agent import Agent
 from mesh.chain import Account, Chain, new_private_key
 from mesh.chain.errors import InsufficientFunds, Reverted, UnknownName
 from schemas import ZERO_ADDRESS, cid_of_bytes
+from schemas.records import ControlRobot
 from schemas.rpc import (
     GUARDED,
     AccountBalance,
@@ -96,6 +97,7 @@ async def test_the_token_is_that_of_the_settings(place: Place) -> None:
 
 
 REQUESTS: dict[str, Record] = {
+    "control": ControlRobot(),
     "eth/transfer": TransferRequest(ZERO_ADDRESS, 1),
     "eth/transfer_from": TransferFromRequest(ZERO_ADDRESS, ZERO_ADDRESS, 1),
     "eth/approve": Approve(ZERO_ADDRESS, 1),
@@ -107,7 +109,7 @@ REQUESTS: dict[str, Record] = {
 
 
 @pytest.mark.parametrize("service", sorted(REQUESTS))
-async def test_spending_and_signing_services_are_closed_by_default(closed: Asker, service: str) -> None:
+async def test_the_services_of_the_owner_are_closed_by_default(closed: Asker, service: str) -> None:
     line = await closed.refused(service, REQUESTS[service])
     assert line.startswith(f"this agent does not offer {service} to others / set open_services")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -192,12 +191,11 @@ async def test_a_robot_that_does_several_jobs_at_once_says_when_its_first_place_
 
 async def test_a_robot_that_is_stopped_or_closed_says_so(place: Place) -> None:
     async with offering(place.agent("robot")) as robot, place.agent("person") as person:
-        own = robot.runtime.profile
-        own.is_stopped = own.is_closed = lambda: True
+        await robot.control(paused=True, stop="it smokes")
         assert (await profile_of(robot, person)).state == "stopped"
-        own.is_stopped = lambda: False
+        await robot.control(release=True)
         assert (await profile_of(robot, person)).state == "closed"
-        own.is_closed = lambda: False
+        await robot.control(paused=False)
         assert (await profile_of(robot, person)).state == "idle"
 
 
@@ -213,12 +211,10 @@ async def test_a_change_is_put_once_a_second_at_most(place: Place) -> None:
         subscriber = network.session.declare_subscriber(key, hear)
         async with robot:
             await until_heard(robot.network.session, key)
-            own = robot.runtime.profile
             for number in range(50):
-                own.is_stopped = partial(bool, number % 2)
-                own.changed()
+                await robot.control(paused=bool(number % 2))
                 await asyncio.sleep(0.02)
-            await until(lambda: bool(heard) and heard[-1][1].state == "stopped", what="the last state")
+            await until(lambda: bool(heard) and heard[-1][1].state == "closed", what="the last state")
         subscriber.undeclare()  # type: ignore[no-untyped-call]
     assert all(profile.is_signed for _, profile in heard)
     assert all(later - earlier > INTERVAL / 2 for (earlier, _), (later, _) in pairwise(heard))
