@@ -14,7 +14,16 @@ from aiohttp import web
 from msgspec.structs import replace
 
 import mesh
-from bridges.web._files import MOST_MESSAGES, Files, columns_of, empty_summary, image_of, messages_of, summary_of
+from bridges.web._files import (
+    MOST_MESSAGES,
+    Files,
+    columns_of,
+    empty_summary,
+    image_of,
+    messages_of,
+    picture_of,
+    summary_of,
+)
 from bridges.web._jobs import Views
 from bridges.web._live import Live
 from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms, liability_json
@@ -203,6 +212,7 @@ class Api(Lifecycle):
             get(f"{file}/messages", self.messages),
             get(f"{file}/values", self.values),
             get(f"{file}/images/{{number}}", self.image),
+            get(f"{file}/picture", self.picture),
             get("/api/v1/validators/{validator}", self.validator),
             get("/api/v1/liabilities", self.liabilities),
             get("/api/v1/liabilities/{address}", self.job),
@@ -391,6 +401,13 @@ class Api(Lifecycle):
         found = await self.files.read(cid_in(request), image_of, int(number))
         if found is None:
             raise WebError("there is no image in this message", code="page-not-found")
+        data, kind = found
+        return web.Response(body=data, content_type=kind, headers=SANDBOX | FOREVER)
+
+    async def picture(self, request: web.Request) -> web.Response:
+        found = await self.files.read(cid_in(request), picture_of)
+        if found is None:
+            raise WebError("this file is no picture", code="page-not-found")
         data, kind = found
         return web.Response(body=data, content_type=kind, headers=SANDBOX | FOREVER)
 

@@ -43,6 +43,8 @@ LONGEST_VALUE: Final = 4096
 """Bytes of a message's JSON that are returned."""
 MOST_NUMBERS: Final = 1_000_000
 """Messages of a topic that are read for a plot."""
+LARGEST_PICTURE: Final = 512 * 1024
+"""Bytes of a file that is shown as a picture."""
 _MAGIC: Final = (
     (b"\x89PNG\r\n\x1a\n", "image/png"),
     (b"\xff\xd8\xff", "image/jpeg"),
@@ -123,6 +125,15 @@ def image_of(path: Path, number: int) -> tuple[bytes, str] | None:
     return None if message is None else picture_in(message)
 
 
+def picture_of(path: Path) -> tuple[bytes, str] | None:
+    """The picture that a file is, and its media type: none larger than a robot's may be."""
+    if path.stat().st_size > LARGEST_PICTURE:
+        return None
+    data = path.read_bytes()
+    kind = _kind_of(data)
+    return None if kind is None else (data, kind)
+
+
 def _of_topic(recording: Objective, topic: str, first: int) -> Iterator[tuple[int, Played]]:
     """The messages from a number on, those of a topic or all."""
     numbered = enumerate(recording.messages(from_index=first), first)
@@ -178,9 +189,15 @@ def picture_in(message: Played) -> tuple[bytes, str] | None:
         data = _third_field(data)
     elif message.type.encoding in ("json", "ros1", "cdr", "protobuf"):
         return None
+    kind = _kind_of(data)
+    return None if kind is None else (data, kind)
+
+
+def _kind_of(data: bytes) -> str | None:
+    """The media type of an image, by its first bytes."""
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        return data, "image/webp"
-    return next(((data, kind) for magic, kind in _MAGIC if data.startswith(magic)), None)
+        return "image/webp"
+    return next((kind for magic, kind in _MAGIC if data.startswith(magic)), None)
 
 
 def _third_field(payload: bytes) -> bytes:

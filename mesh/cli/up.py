@@ -78,13 +78,13 @@ log = logging.getLogger(__name__)
 )
 @click.option("--web/--no-web", "has_page", default=True, show_default=True, help="serve the page of the market")
 @click.option("--web-port", type=PORT, help=f"port of the page [{PAGE_PORT}, or a free one if it is taken]")
-@click.option("--local-account", is_flag=True, help="let the page order for the person's account, without a wallet")
 @click.option(
-    "--run",
-    "program",
-    type=PATH,
-    help="robot (NAME.py) to run, too; it starts again when you change it, and the page orders as with --local-account",
+    "--local-account/--no-local-account",
+    default=True,
+    show_default="local account",
+    help="let the page order for the person's account, without a wallet",
 )
+@click.option("--run", "program", type=PATH, help="robot (NAME.py) to run, too; it starts again when you change it")
 @with_engine
 @with_json
 @with_settings("listen", "data_dir", "generation", "free_contracts", TelemetrySettings)
@@ -107,7 +107,7 @@ def command(
     lines name.
     """
     robot = None if program is None else require_readable(program)
-    served_page = MarketPage(web_port, local_account or robot is not None) if has_page else None
+    served_page = MarketPage(web_port, local_account) if has_page else None
     run_until_stopped(
         lambda: serve_market(settings, port, block_time, page=served_page, robot=robot, as_json=as_json, **engine),
         settings=settings,

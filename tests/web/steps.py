@@ -26,6 +26,11 @@ def fill_in(browser: Browser, site: Site, *, direction: str = "left", seconds: f
     browser.type("Duration", str(seconds))
 
 
+def anybody(browser: Browser) -> None:
+    """Let whoever takes the order first do it: such an order is public."""
+    browser.click("#anybody")
+
+
 def review(browser: Browser) -> str:
     """From the price to the terms that are signed; gives the hash that is shown."""
     browser.until(lambda: browser.all("#allow") or browser.all("#order:not([disabled])"), "a way to go on")

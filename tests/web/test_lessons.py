@@ -13,7 +13,7 @@ from tests.support.commands import Serving
 from tests.support.lessons import EXAMPLES, as_role, at_work, market
 from tests.web.browser import Browser, Wallet
 from tests.web.conftest import Site
-from tests.web.steps import sign
+from tests.web.steps import anybody, sign
 
 __all__ = ["market"]
 
@@ -45,6 +45,7 @@ def choose(browser: Browser, example: str, objective: str) -> str:
     browser.go("order")
     browser.press("Another model")
     browser.type("CID of the model", model)
+    browser.press("Go on")
     if objective:
         browser.click("#way-file")
         browser.find("input[type=file]").send_keys(str(EXAMPLES / example / objective))
@@ -95,6 +96,7 @@ def test_hello_blink_colours_and_sensor(lesson: Browser, market: dict[str, str])
         for channel, volts in enumerate(VOLTS):
             uno.set_voltage(channel, volts)
         choose(lesson, "air_pollution", "")
+        anybody(lesson)
         lesson.type("You pay", "0")
         lesson.click("#order:not([disabled])")
         lesson.click("#sign")

@@ -12,7 +12,7 @@ import pytest
 from tests.support.objectives import objective
 from tests.web.browser import Browser
 from tests.web.conftest import HOSTILE
-from tests.web.steps import facts, fill_in, review
+from tests.web.steps import anybody, facts, fill_in, review
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,6 +59,7 @@ def test_a_lie_about_an_order_is_caught(browser: Browser, site: Site, path: str,
     browser.go()
     browser.connect()
     fill_in(browser, site, seconds=20)
+    anybody(browser)
     review(browser)
     # No contract takes the order from the page before it is looked at.
     browser.lie(r"orders\/\w{64}$", "body.liability = null; body.state = 'open'")

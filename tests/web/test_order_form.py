@@ -42,7 +42,7 @@ def field(browser: Browser, label: str) -> WebElement:
 
 def signed_values(browser: Browser, site: Site) -> list[object]:
     """The values in the objective of the order that the dialog shows."""
-    found = browser.find("#in-words .name").get_attribute("title")
+    found = browser.find("#objective .name").get_attribute("title")
     return objective_values(site, str(found))
 
 
@@ -157,7 +157,7 @@ def test_times_of_messages_are_typed_key_by_key(form: Browser, site: Site) -> No
         for one in key:
             entered.send_keys(one)
     review(form)
-    found = str(form.find("#in-words .name").get_attribute("title"))
+    found = str(form.find("#objective .name").get_attribute("title"))
     messages = facts(site, f"files/{found}/messages")["messages"]
     assert messages[1]["at"] - messages[0]["at"] == pytest.approx(1.25)
 
@@ -165,7 +165,7 @@ def test_times_of_messages_are_typed_key_by_key(form: Browser, site: Site) -> No
 def test_turns_of_a_lighthouse_are_typed_key_by_key(browser: Browser) -> None:
     browser.go()
     browser.connect()
-    browser.go("provider")
+    browser.go("site/lighthouse")
     browser.press("Create a lighthouse")
     length = field(browser, "Length of a turn")
     length.send_keys("2", "5")

@@ -13,7 +13,7 @@ from selenium.webdriver.common.keys import Keys
 from tests.support.commands import Serving
 from tests.support.ports import free_port
 from tests.web.browser import DESKTOP, PHONE, Browser
-from tests.web.steps import check, fill_in, order, review, sign
+from tests.web.steps import anybody, check, facts, fill_in, order, review, sign
 
 UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
@@ -101,7 +101,7 @@ def order_of_nobodys_model(browser: Browser, site: Site) -> None:
     """An order that stays open."""
     fill_in(browser, site)
     review(browser)
-    objective = browser.find("#in-words .name").get_attribute("title")
+    objective = browser.find("#objective .name").get_attribute("title")
     browser.go(f"order/model/{NOBODYS_MODEL}")
     browser.click("#way-cid")
     browser.type("CID of the objective", objective or "")
@@ -142,6 +142,7 @@ def test_an_order_shows_in_the_market_of_another_tab(browser: Browser, site: Sit
         browser.go()
         browser.connect()
         fill_in(browser, site)
+        anybody(browser)
         review(browser)
         browser.click("#sign")
         browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
@@ -189,7 +190,7 @@ def test_an_order_needs_no_mouse(browser: Browser, site: Site) -> None:
     browser.find("#order:not([disabled])")
     browser.tab_to("#order")
     browser.keys(Keys.ENTER)
-    browser.sees("Fits the model")
+    browser.sees("This is what you sign")
     browser.tab_to("#sign")
     browser.keys(Keys.ENTER)
     browser.sees("the robot was paid")
@@ -198,11 +199,9 @@ def test_an_order_needs_no_mouse(browser: Browser, site: Site) -> None:
 def test_the_local_account_orders_and_is_labelled(site: Site) -> None:
     with site.page(keyfile=True) as url, Browser(url) as browser:
         browser.go()
-        browser.click("#connect")
-        browser.click("#use-local")
         browser.sees("Local account")
         fill_in(browser, site)
-        browser.sees("It signs without asking again")
+        browser.sees("You order with the local account of this server")
         browser.click("#order:not([disabled])")
         browser.click("#sign")
         browser.sees("the robot was paid")
@@ -245,12 +244,14 @@ def test_each_page_is_accessible(site: Site, paid_job: str, pictures: Path, size
         browser.go()
         browser.connect()
         assert browser.wallet
-        routes = {name: name for name in ("order", "market", "jobs", "robots", "provider")}
-        routes |= {"account": f"account/{browser.wallet.address}", "job": f"job/{paid_job}"}
+        robot = facts(site, f"liabilities/{paid_job}")["liability"]["promisor"]
+        routes = {"robots": "", "robot": f"robot/{robot}", "market": "market", "jobs": "jobs", "site": "site"}
+        routes |= {"lighthouse": "site/lighthouse", "account": f"account/{browser.wallet.address}"}
+        routes |= {"job": f"job/{paid_job}"}
         for name, route in routes.items():
             browser.go(route)
             browser.until(lambda: not browser.all("[aria-busy=true]") and browser.all("h1"), name)
-            if name == "robots":
+            if name == "site":
                 browser.press("Details")
                 browser.click("#log summary")
                 browser.until(lambda: not browser.all("[aria-busy=true]"), "the log")

@@ -52,7 +52,7 @@ def test_a_validator_says_how_it_judges_before_it_is_named(browser: Browser, sit
         sign(browser)
         browser.sees("the robot was paid")
         browser.sees("the work counts")
-        browser.go("robots")
+        browser.go("site")
         browser.click(f"tr:has([title='{validator}']):has([data-role='validator']) button[aria-expanded]")
         browser.sees("complete, acknowledged")
         check(browser, pictures / "validator-robots.png")

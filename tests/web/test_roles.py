@@ -72,8 +72,8 @@ def test_an_owner_sees_health_money_jobs_and_logs(browser: Browser, site: Site) 
     browser.go("jobs")
     browser.until(lambda: "ended (0)" not in browser.find("main select").text, "jobs that have ended")
     browser.find("main select").send_keys("ended")
-    browser.until(lambda: browser.all(f"td [title='{address}']"), "the job among those")
-    browser.go("robots")
+    browser.until(lambda: browser.all(f"li[title='{address}']"), "the job among those")
+    browser.go("site")
     robot = facts(site, f"liabilities/{address}")["liability"]["promisor"]
     row = f"//tr[.//*[@title='{robot}']]"
     browser.until(lambda: "done" in browser.driver.find_element("xpath", row).text, "the robot's record")
@@ -123,7 +123,7 @@ def test_an_allowance_that_the_wallet_refuses_can_be_given_later(site: Site) -> 
 def test_a_provider_creates_a_lighthouse_stakes_and_withdraws(browser: Browser, site: Site) -> None:
     browser.go()
     browser.connect()
-    browser.go("provider")
+    browser.go("site/lighthouse")
     browser.sees("Your stake")
     browser.press("Create a lighthouse")
     name = f"tower{secrets.token_hex(3)}"

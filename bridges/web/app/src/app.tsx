@@ -8,7 +8,7 @@ import type { Address, Hex } from "viem";
 import { ApiError, get } from "./api";
 import { stream } from "./stream";
 import { texts } from "./texts";
-import type { Market, StreamEvent } from "./types";
+import type { Agent, Agents, Market, Model, StreamEvent } from "./types";
 import { WalletError, announcedWallets, ask, switchChain, transact, watchWallets } from "./wallet";
 import type { Announced } from "./wallet";
 
@@ -19,6 +19,10 @@ export type Account =
 interface App {
   market: Market;
   block: number;
+  /** Who is present; null until it is known. */
+  agents: Agents | null;
+  /** The robot at an address, if it is present. */
+  robotAt: (address: string) => Agent | undefined;
   account: Account | null;
   connect: (wallet: Announced) => Promise<void>;
   useLocal: () => void;
@@ -46,6 +50,10 @@ export function AppProvider(props: { market: Market; reloadMarket: () => void; c
 
   useEffect(() => setBlock((known) => Math.max(known, market.block)), [market.block]);
   useTopic("chain", (event) => event.kind === "block" && setBlock(event.data.number));
+  const listed = useData<Agents>("agents");
+  const [live, setLive] = useState<Agents | null>(null);
+  useTopic("agents", (event) => (event.kind === "agents" ? setLive(event.data) : listed.reload()));
+  const agents = live ?? listed.data;
 
   const notify = useCallback((text: string, kind: "good" | "bad" = "good") => {
     const id = ++lastNote.current;
@@ -68,13 +76,13 @@ export function AppProvider(props: { market: Market; reloadMarket: () => void; c
   }, [market.account]);
   const disconnect = useCallback(() => {
     setAccount(null);
-    localStorage.removeItem(REMEMBERED);
+    localStorage.setItem(REMEMBERED, "nobody");
   }, []);
 
   // The account of the last visit, if its wallet still gives it without asking.
   useEffect(() => {
     const remembered = localStorage.getItem(REMEMBERED);
-    if (remembered === "local" && market.account) useLocal();
+    if (market.account && (remembered === "local" || remembered === null)) setAccount({ kind: "local", address: market.account });
     const resume = () => {
       const wallet = announcedWallets().find((one) => one.info.rdns === remembered);
       if (wallet) adopt(wallet, "eth_accounts").catch(() => {});
@@ -108,6 +116,8 @@ export function AppProvider(props: { market: Market; reloadMarket: () => void; c
     return {
       market,
       block,
+      agents,
+      robotAt: (address) => agents?.agents.find((agent) => agent.role === "agent" && agent.address === address),
       account,
       connect,
       useLocal,
@@ -126,7 +136,7 @@ export function AppProvider(props: { market: Market; reloadMarket: () => void; c
         return transact(wallet.provider, address, to, data);
       },
     };
-  }, [market, block, account]);
+  }, [market, block, agents, account]);
 
   return (
     <Context.Provider value={app}>
@@ -155,6 +165,24 @@ export function useLive(): boolean {
   const [live, setLive] = useState(stream.live);
   useEffect(() => stream.watch(setLive), []);
   return live;
+}
+
+const models = new Map<string, Promise<Model>>();
+
+/** The model with a CID, read once; null until it is known. */
+export function useModel(cid: string): Model | null {
+  const [found, setFound] = useState<Model | null>(null);
+  useEffect(() => {
+    let current = true;
+    setFound(null);
+    if (!cid) return;
+    if (!models.has(cid)) models.set(cid, get<Model>(`models/${cid}`));
+    models.get(cid)!.then((model) => current && setFound(model), () => models.delete(cid));
+    return () => {
+      current = false;
+    };
+  }, [cid]);
+  return found;
 }
 
 export interface Loaded<T> {

@@ -70,6 +70,19 @@ export function announcementHash(text: string): Hex {
   return keccak256(toBytes(`aira validator\0${text}`));
 }
 
+/** A record that its author signs: the hash covers a prefix of its kind, and its JSON without the signature. */
+export function recordHash(domain: "aira accept" | "aira pair" | "aira stop", fields: Record<string, unknown>): Hex {
+  return keccak256(toBytes(`${domain}\0${JSON.stringify(fields)}`));
+}
+
+/** An order as services take it: amounts as texts, and only the fields that it has. */
+export function orderFields(order: Demand | Offer, signature: string): Record<string, unknown> {
+  const { model, objective, token, cost, lighthouse, validator, deadline, nonce, sender } = order;
+  const fee = "validatorFee" in order ? { validatorFee: String(order.validatorFee) } : { lighthouseFee: String(order.lighthouseFee) };
+  const terms = { model, objective, token, cost: String(cost), lighthouse, validator, deadline: String(deadline), ...fee, nonce: String(nonce) };
+  return sender === undefined ? { ...terms, signature } : { ...terms, sender, signature };
+}
+
 /** Who signed a hash as a personal message. Throws for a signature in any form but the one that the market takes. */
 export async function signerOf(hash: Hex, signature: string): Promise<Address> {
   const digits = signature.replace(/^0x/, "");

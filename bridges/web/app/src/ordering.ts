@@ -4,10 +4,11 @@ import { zeroAddress } from "viem";
 import type { Address, Hex } from "viem";
 import { ApiError, get, getExact, post, postText, query } from "./api";
 import type { Account } from "./app";
-import { canonicalSignature, encodeWire, orderHash, randomNonce, signerOf, withdrawalHash } from "./messages";
+import { canonicalSignature, encodeWire, orderFields, orderHash, randomNonce, recordHash, signerOf, withdrawalHash } from "./messages";
 import type { Demand } from "./messages";
 import { texts } from "./texts";
 import { ServerLies, checkAsked, checkOrder, ownOrders, rememberOrder } from "./trust";
+import { plain } from "./format";
 import type { AccountState, Market, Message, Model, Objective, Order, PostedOrder } from "./types";
 import { personalSign } from "./wallet";
 
@@ -15,6 +16,8 @@ import { personalSign } from "./wallet";
 export interface Wish {
   model: Model;
   objective: () => Promise<Objective>;
+  /** The robot that is to do it; empty for whoever takes it first. */
+  robot: Address | "";
   cost: bigint;
   validator: Address;
   validatorFee: bigint;
@@ -62,9 +65,9 @@ export async function prepare(wish: Wish, account: Account, shown: Market): Prom
   if (contractsOf(market) !== contractsOf(shown)) throw new Error(texts.changedLookAgain);
   const isFile = objective.cid !== wish.model.cid && objective.summary.messages > 0;
   const { messages } = isFile ? await getExact<{ messages: Message[] }>(`files/${objective.cid}/messages${query({ limit: SHOWN })}`) : { messages: [] };
-  const { cost, validator, validatorFee } = wish;
+  const { robot, cost, validator, validatorFee } = wish;
   const lifetime = blocksOf(wish.minutes, market);
-  const draft = { model: wish.model.cid, objective: objective.cid, cost, validator, validatorFee, lifetime };
+  const draft = { model: wish.model.cid, objective: objective.cid, robot, cost, validator, validatorFee, lifetime };
   const prepared = { wish, account, market: shown, objective, messages, draft };
   if (account.kind === "local") return prepared;
   const demand: Demand = {
@@ -82,29 +85,71 @@ export async function prepare(wish: Wish, account: Account, shown: Market): Prom
   return { ...prepared, demand, hash: orderHash(demand) };
 }
 
-/** Signs the hash of exactly these fields, and publishes the demand if it is still wanted then. Returns its hash. */
-export async function signAndPost(demand: Demand, shown: Hex, account: Account, isWanted: () => boolean): Promise<string> {
+/** A robot does not want the order. */
+export class RobotDeclined extends Error {
+  constructor(
+    readonly code: string,
+    detail: string,
+  ) {
+    super(texts.robotDeclined(plain(detail, 200), plain(code, 60)));
+  }
+}
+
+/** Signs the hash of exactly these fields, and sends the demand if it is still wanted then. Returns its hash. */
+export async function signAndPost(demand: Demand, shown: Hex, robot: Address | "", account: Account, isWanted: () => boolean): Promise<string> {
   if (account.kind !== "wallet") throw new Error(texts.needsWallet);
   const hash = orderHash(demand);
   if (hash !== shown) throw new ServerLies(texts.lieHash);
-  const signature = canonicalSignature(await personalSign(account.wallet.provider, hash, account.address));
+  const offer = robot ? await offerOf(demand, robot, account) : null;
+  const signature = await signed(hash, account);
   if (!isWanted()) throw new Error(texts.changedLookAgain);
   if ((await signerOf(hash, signature)) !== account.address) throw new Error(texts.otherAccountSigned);
   const wire = encodeWire({ ...demand, signature });
   const own = hash.slice(2);
-  // Before it is posted: what is signed may become a job, whatever the server answers.
-  rememberOrder({ hash: own, deadline: Number(demand.deadline), wire });
-  const posted = await postText<PostedOrder>("orders", wire);
+  // Before it is sent: what is signed may become a job, whatever the server answers. One for a robot is never published.
+  rememberOrder({ hash: own, deadline: Number(demand.deadline), wire: robot ? "" : wire });
+  const posted = robot
+    ? await signedRecord("pairs", "aira pair", account, { signature: "", demand: orderFields(demand, signature), offer, maker: account.address })
+    : await postText<PostedOrder>("orders", wire);
   if (posted.order.hash !== own) throw new ServerLies(texts.lieHash);
   return own;
 }
 
+/** A robot's offer for a demand that is for it alone, of which it gets no signature. */
+async function offerOf(demand: Demand, robot: Address, account: Account): Promise<unknown> {
+  const wanted = { signature: "", demand: orderFields(demand, ""), robot, maker: account.address };
+  const { offer, decline } = await signedRecord<{ offer?: unknown; decline?: { code: string; detail: string } }>("pairs/offers", "aira accept", account, wanted);
+  if (offer) return offer;
+  throw new RobotDeclined(decline?.code ?? "", decline?.detail ?? "");
+}
+
+async function signed(hash: Hex, account: Account): Promise<string> {
+  if (account.kind !== "wallet") throw new Error(texts.needsWallet);
+  return canonicalSignature(await personalSign(account.wallet.provider, hash, account.address));
+}
+
+/** Posts a record with the account's signature. */
+async function signedRecord<T = PostedOrder>(path: string, domain: Parameters<typeof recordHash>[0], account: Account, fields: Record<string, unknown>): Promise<T> {
+  return postText<T>(path, JSON.stringify({ ...fields, signature: await signed(recordHash(domain, fields), account) }));
+}
+
+/** Stops the account's job. */
+export async function stopJob(liability: Address, why: string, account: Account): Promise<void> {
+  if (account.kind === "local") {
+    await post("local/stops", { liability, why });
+    return;
+  }
+  const fields = { liability, by: account.address, why, time: Math.floor(Date.now() / 1000) };
+  const signature = await signed(recordHash("aira stop", fields), account);
+  await postText("stops", JSON.stringify({ signature, ...fields }));
+}
+
 /** Lets the server's local account order. Returns the order's hash. */
 export async function orderLocally(draft: Draft, account: Address, market: Market): Promise<string> {
-  const { model, objective, lifetime } = draft;
+  const { model, objective, lifetime, robot } = draft;
   const [cost, validatorFee] = [String(draft.cost), String(draft.validatorFee)];
   const named = draft.validator === zeroAddress ? "" : draft.validator;
-  const fields = { model, objective, cost, validator: named, validatorFee, token: "", lifetime };
+  const fields = { model, objective, cost, validator: named, validatorFee, token: "", lifetime, robot };
   const { order } = await post<PostedOrder>("local/orders", fields);
   checkAsked(order, { model, objective, cost, validator: draft.validator, validatorFee, account, market });
   await checkOrder(order);

@@ -65,6 +65,8 @@ export interface Order {
   signature: string;
   generation: number;
   at: number;
+  /** For one robot alone: nobody else gets its signature. */
+  private?: boolean;
 }
 
 export interface Statement {
@@ -122,6 +124,74 @@ export interface AgentStatus {
   dropped?: Record<string, number>;
 }
 
+/** How a robot presents itself: its owner's words. */
+export interface Profile {
+  name: string;
+  about: string;
+  picture: string;
+  place: string;
+  price: string;
+  state: "idle" | "working" | "stopped" | "closed";
+  queue: number;
+  wait: number;
+  readings: Record<string, string>;
+  time: number;
+}
+
+/** What a robot wants for an objective; with a `code`, why it does not want it. */
+export interface Quote {
+  agent: Address;
+  name: string;
+  cost: string;
+  token: Token;
+  validator: string;
+  start: number;
+  seconds: number;
+  until: number;
+  code: string;
+  detail: string;
+}
+
+/** What an owner may change while the robot works. */
+export interface OwnerRules {
+  price: string;
+  paused: boolean;
+  refuse: Address[];
+  leastPrice: string;
+  held: boolean;
+  here: boolean;
+}
+
+/** A contract in the account's statement: amounts in the smallest unit. */
+export interface Entry {
+  time: string;
+  month: string;
+  liability: Address;
+  state: Liability["state"];
+  promisee: Address;
+  promisor: Address;
+  model: string;
+  token: Address;
+  symbol: string;
+  decimals: number;
+  cost: string;
+  earned: string;
+  spent: string;
+}
+
+/** A contract in the history of the market. */
+export interface PastJob {
+  address: Address;
+  model: string;
+  cost: string;
+  token: Token;
+  state: Liability["state"];
+  promisor: Address;
+  promisee: Address;
+  block: number;
+  at: number | null;
+}
+
 export interface Agent {
   role: string;
   address: Address;
@@ -130,6 +200,7 @@ export interface Agent {
   models: string[];
   offers: Order[];
   record: JobRecord;
+  profile: Profile | null;
 }
 
 export interface Agents {
@@ -177,6 +248,8 @@ export interface Description {
   success?: string;
   price?: string;
   seconds?: number | null;
+  /** What becomes of the price when the customer stops a job. */
+  onStop?: "refund" | "paid";
   limits?: { messages?: number; seconds?: number; size?: number } | null;
 }
 
@@ -272,6 +345,9 @@ export interface Job {
   timeline: Step[];
   resultMessage: { liability: Address; result: string; success: boolean; signature: string; signer: Address } | null;
   reason: { code: string; text: string } | null;
+  /** Whether a stopped job is paid, as its model says; empty if it does not say. */
+  onStop: "refund" | "paid" | "";
+  stopped: { by: Address; why: string } | null;
 }
 
 export interface Finding {

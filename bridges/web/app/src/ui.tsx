@@ -10,12 +10,14 @@ import { decimalText, parseDecimal } from "./numbers";
 import { texts } from "./texts";
 import type { Token } from "./types";
 
-/** An address, hash or CID: short, whole in its title, with a button that copies it. */
+/** An address by the name of its robot, a hash or a CID: short, whole in its title, with a button that copies it. */
 export function Name(props: { text: string; href?: string; label?: string }) {
-  const { account } = useApp();
+  const { account, robotAt, market } = useApp();
   const own = account?.address === props.text;
   const [copied, setCopied] = useState(false);
-  const visible = props.label ?? (own ? texts.you : short(props.text));
+  const named = plain(robotAt(props.text)?.profile?.name ?? "", 80);
+  const visible = props.label ?? (own ? texts.you : named || short(props.text));
+  const isAddress = /^0x[0-9a-fA-F]{40}$/.test(props.text);
   const copy = async () => {
     await navigator.clipboard.writeText(props.text);
     setCopied(true);
@@ -29,7 +31,27 @@ export function Name(props: { text: string; href?: string; label?: string }) {
           {copied ? <path d="M3 8.500 6.500 12 13 4.500" /> : <path d="M5.500 5.500h8v8h-8zM10.500 5.500v-3h-8v8h3" />}
         </svg>
       </button>
+      {isAddress && market.explorer ? <a class="copy" href={`${market.explorer}/address/${props.text}`} rel="noreferrer" target="_blank" aria-label={texts.inExplorer(props.text)}>↗</a> : null}
     </span>
+  );
+}
+
+/** A robot's picture, or a pattern of its address. */
+export function Picture(props: { address: string; cid?: string; size?: "small" | "large" }) {
+  const [broken, setBroken] = useState(false);
+  const kind = `portrait ${props.size ?? ""}`;
+  if (props.cid && !broken) return <img class={kind} src={`/api/v1/files/${props.cid}/picture`} alt="" loading="lazy" onError={() => setBroken(true)} />;
+  const digits = [...props.address.slice(2).toLowerCase()].map((digit) => parseInt(digit, 16));
+  const hue = (digits[0] * 16 + digits[1]) * 360 / 256;
+  const cells = Array.from({ length: 15 }, (_, place) => place).filter((place) => digits[place + 2] % 2);
+  return (
+    <svg class={kind} viewBox="-1.500 -1.500 8 8" aria-hidden="true" preserveAspectRatio="xMidYMid meet">
+      <rect x="-30" y="-30" width="66" height="66" fill={`oklch(0.42 0.07 ${hue})`} />
+      {cells.flatMap((place) => {
+        const [x, y] = [place % 3, Math.floor(place / 3)];
+        return [...new Set([x, 4 - x])].map((column) => <rect key={`${place}${column}`} x={column} y={y} width="1.02" height="1.02" fill={`oklch(0.82 0.11 ${hue})`} />);
+      })}
+    </svg>
   );
 }
 

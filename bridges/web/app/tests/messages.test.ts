@@ -2,7 +2,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import test from "node:test";
 import { privateKeyToAccount } from "viem/accounts";
-import { canonicalSignature, encodeWire, orderHash, resultHash, signerOf, withdrawalHash } from "../src/messages";
+import { canonicalSignature, encodeWire, orderFields, orderHash, recordHash, resultHash, signerOf, withdrawalHash } from "../src/messages";
 import type { Hex } from "viem";
 
 interface Vector {
@@ -54,6 +54,17 @@ test("a withdrawal has the hash that Python gives it", () => {
   const order = `0x${"ab".repeat(32)}` as Hex;
   const lighthouse = "0x19437Cb65760805A0e55339186F03B2d980eBBf9";
   assert.equal(withdrawalHash({ order, lighthouse, deadline: 44058n }), "0x5a45a464a1cf31ba3688daf919f348cc51b27df59b7e424a32d6f9dca9697100");
+});
+
+test("records that a wallet signs have the hashes that Python gives them", () => {
+  const address = "0x19437Cb65760805A0e55339186F03B2d980eBBf9";
+  const cid = "QmS9JArPwa55ePgDnyg6TzX24mYTS1b1vLqWNebyVotKxQ";
+  const terms = { model: cid, objective: cid, token: address, cost: 5n * 10n ** 18n, lighthouse: address, validator: address, deadline: 100n, validatorFee: 1n } as const;
+  const accept = (order: Parameters<typeof orderFields>[0]) => recordHash("aira accept", { signature: "", demand: orderFields(order, ""), robot: address, maker: address });
+  assert.equal(accept({ ...terms, nonce: 7n, sender: address }), "0x0e0fab30fb002b19863c549487eb2947843e463e3b079d91552f44324f4d7c94");
+  assert.equal(accept({ ...terms, nonce: "ab".repeat(32) }), "0x713364bc16340f8a66e6b3e540a2c62c2cd6a0aca2a437ce56bef54978c69e4e");
+  const stop = { liability: address, by: address, why: 'so "ä" \u2028 </x>', time: 7 };
+  assert.equal(recordHash("aira stop", stop), "0x658a82bb35e1f102c8ad5e31fb2e26a2d2aff76e267df54d42ec8dc7749cb190");
 });
 
 test("a signature in another form is refused", async () => {

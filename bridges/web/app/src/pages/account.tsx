@@ -1,11 +1,12 @@
 import { useState, useEffect } from "preact/hooks";
-import { useApp, useData, useTopic } from "../app";
-import { clock, ether, short } from "../format";
+import { useApp, useData, useModel, useTopic } from "../app";
+import { clock, ether, plain, short } from "../format";
 import { withdraw } from "../ordering";
 import { texts } from "../texts";
 import type { AccountState, Liability, PostedOrder } from "../types";
-import { Action, Badge, Dialog, Facts, Money, Name, Show, Table } from "../ui";
+import { Action, Badge, Dialog, Facts, Money, Name, Picture, Show, Table } from "../ui";
 import { announcedWallets, watchWallets } from "../wallet";
+import { nameOf } from "./robots";
 
 /** The account in the page's head: which one orders, and how to change it. */
 export function AccountControl() {
@@ -20,21 +21,13 @@ export function AccountControl() {
       {account ? (
         <button type="button" id="account" class="button small quietly" onClick={() => setOpen(true)}>
           <span class={`dot ${wrongChain ? "bad" : "good"}`} aria-hidden="true" />
-          {account.kind === "local" ? texts.localAccount : account.wallet.info.name} · {account.address.slice(0, 6)}…{account.address.slice(-4)}
+          {account.kind === "local" ? texts.localAccount : plain(account.wallet.info.name, 30)}
         </button>
       ) : (
         <button type="button" id="connect" class="button small" onClick={() => setOpen(true)}>{texts.connect}</button>
       )}
       <Dialog title={texts.whoOrders} open={open} onClose={() => setOpen(false)}>
         <ul class="choices">
-          {wallets.map((wallet) => (
-            <li key={wallet.info.uuid}>
-              <Action class="choice" run={async () => { await connect(wallet); setOpen(false); }}>
-                <strong>{wallet.info.name.slice(0, 60)}</strong>
-                <span class="quiet">{wallet.info.rdns.slice(0, 60)}</span>
-              </Action>
-            </li>
-          ))}
           {market.account ? (
             <li>
               <Action class="choice" run={() => { useLocal(); setOpen(false); }} id="use-local">
@@ -43,8 +36,16 @@ export function AccountControl() {
               </Action>
             </li>
           ) : null}
+          {wallets.map((wallet) => (
+            <li key={wallet.info.uuid}>
+              <Action class="choice" run={async () => { await connect(wallet); setOpen(false); }}>
+                <strong>{wallet.info.name.slice(0, 60)}</strong>
+                <span class="quiet">{wallet.info.rdns.slice(0, 60)}</span>
+              </Action>
+            </li>
+          ))}
         </ul>
-        {!wallets.length ? <p class="quiet">{texts.noWallet}</p> : null}
+        {!wallets.length && !market.account ? <p class="quiet">{texts.noWallet}</p> : null}
         {account ? (
           <p class="row">
             <a class="button small quietly" href={`#/account/${account.address}`} onClick={() => setOpen(false)}>{texts.myAccount}</a>
@@ -109,20 +110,26 @@ export function OrderTable(props: { orders: PostedOrder[]; changed: () => void }
   );
 }
 
+/** Jobs as rows: what, who, for how much, how it ended. */
 export function JobTable(props: { liabilities: Liability[] }) {
+  if (!props.liabilities.length) return <p class="quiet">{texts.noJobs}</p>;
+  return <ul class="jobs" aria-label={texts.jobs}>{props.liabilities.map((liability) => <JobRow key={liability.address} liability={liability} />)}</ul>;
+}
+
+function JobRow({ liability }: { liability: Liability }) {
+  const { robotAt, account } = useApp();
+  const title = useModel(liability.model)?.description?.title;
+  const robot = robotAt(liability.promisor);
+  const mine = account?.address === liability.promisee;
   return (
-    <Table label={texts.jobs} head={[texts.job, texts.state, texts.price, texts.person, texts.robot, texts.model]} numbers={[2]} empty={texts.noJobs}>
-      {props.liabilities.map((liability) => (
-        <tr key={liability.address}>
-          <td><Name text={liability.address} href={`#/job/${liability.address}`} /></td>
-          <td><JobState state={liability.state} /></td>
-          <td class="right"><Money units={liability.cost} token={liability.token} /></td>
-          <td><Name text={liability.promisee} href={`#/account/${liability.promisee}`} /></td>
-          <td><Name text={liability.promisor} href={`#/account/${liability.promisor}`} /></td>
-          <td><Name text={liability.model} /></td>
-        </tr>
-      ))}
-    </Table>
+    <li title={liability.address}>
+      <a href={`#/job/${liability.address}`} class="job-row">
+        <Picture address={liability.promisor} cid={robot?.profile?.picture} size="small" />
+        <span class="who"><strong>{title ? plain(title, 60) : texts.job}</strong><span class="quiet">{robot ? nameOf(robot) : short(liability.promisor)}{mine ? "" : ` · ${texts.for} ${short(liability.promisee)}`}</span></span>
+        <JobState state={liability.state} />
+        <span class="price-tag"><Money units={liability.cost} token={liability.token} /></span>
+      </a>
+    </li>
   );
 }
 

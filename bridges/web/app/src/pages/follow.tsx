@@ -1,11 +1,12 @@
 import { useEffect, useState } from "preact/hooks";
+import { post } from "../api";
 import { useApp, useData, useTopic } from "../app";
-import { amount, duration } from "../format";
+import { amount, duration, plain, short } from "../format";
 import { Replay } from "../live";
 import { withdraw } from "../ordering";
 import { texts } from "../texts";
 import { checkAnswer, checkOrder } from "../trust";
-import type { Answer, PostedOrder, Summary } from "../types";
+import type { Answer, PostedOrder, Quote, Summary } from "../types";
 import { Action, Badge, Facts, Name, Problem, Show } from "../ui";
 import { StatementList } from "./account";
 
@@ -34,6 +35,7 @@ export function FollowPage(props: { hash: string }) {
             <p class="lead" aria-live="polite">{answers.length ? texts.answered : texts.orderStateLong[state]}</p>
             {answers.map((answer) => <AnswerView key={answer.signature} order={order} answer={answer} />)}
             <StatementList statements={statements} />
+            {state === "open" && statements.some((one) => one.kind === "declined") ? <WhatWouldWork order={order} changed={posted.reload} /> : null}
             <OrderFacts order={order} />
             {state === "open" && account?.address === order.signer ? (
               <p class="row">
@@ -41,11 +43,31 @@ export function FollowPage(props: { hash: string }) {
                 <span class="hint">{texts.withdrawHint}</span>
               </p>
             ) : null}
-            {state !== "open" ? <a class="button" href={`#/order/model/${order.model}`}>{texts.orderAgain}</a> : null}
+            {state !== "open" ? <a class="button" href={`#/order/model/${order.model}//${order.objective}`}>{texts.orderAgain}</a> : null}
           </>
         )}
       </Show>
     </>
+  );
+}
+
+/** What the robots want for an order that was declined: each with a button that orders it, and withdraws this one. */
+function WhatWouldWork({ order, changed }: { order: PostedOrder["order"]; changed: () => void }) {
+  const { account, market } = useApp();
+  const [quotes, setQuotes] = useState<Quote[] | null>(null);
+  useEffect(() => void post<{ quotes: Quote[] }>("quotes", { model: order.model, objective: order.objective }).then((found) => setQuotes(found.quotes), () => setQuotes([])), [order.hash]);
+  const usable = (quotes ?? []).filter((quote) => !quote.code && quote.token.address === market.token.address);
+  if (account?.address !== order.signer || !usable.length) return null;
+  const take = async (quote: Quote) => {
+    await withdraw(order, account);
+    changed();
+    location.hash = `#/order/model/${order.model}/${quote.agent}/${order.objective}`;
+  };
+  return (
+    <div class="callout">
+      <p>{texts.whatWouldWork}</p>
+      <p class="row">{usable.slice(0, 4).map((quote) => <Action key={quote.agent} class="button small" run={() => take(quote)}>{texts.orderFor(plain(quote.name, 60) || short(quote.agent), amount(quote.cost, quote.token))}</Action>)}</p>
+    </div>
   );
 }
 

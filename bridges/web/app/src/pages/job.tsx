@@ -1,19 +1,21 @@
 import { useEffect, useState } from "preact/hooks";
-import { useApp, useData, useTopic, wordsOf } from "../app";
 import { post } from "../api";
+import { useApp, useData, useModel, useTopic, wordsOf } from "../app";
 import { isCid } from "../cid";
 import { calls } from "../contracts";
-import { amount, clock, duration, short } from "../format";
-import { Replay } from "../live";
+import { amount, clock, duration, plain, short } from "../format";
+import { LiveJob, Replay } from "../live";
+import { stopJob } from "../ordering";
 import { texts } from "../texts";
 import { checkJob } from "../trust";
 import type { Finding, Job, Step } from "../types";
-import { Action, Badge, Facts, Money, Name, Show, Strange } from "../ui";
+import { Action, Badge, Dialog, Facts, Money, Name, Picture, Show, Strange } from "../ui";
 import { JobState } from "./account";
 import { Steps } from "./follow";
-import { Operate } from "./robots";
+import { nameOf } from "./robots";
+import { Operate } from "./services";
 
-/** A job by its contract's address: terms, parties, files, timeline, and the checks. */
+/** A job by its contract's address: what happens in it, what happened, and whether that is true. */
 export function JobPage(props: { address: string }) {
   const job = useData<Job>(`liabilities/${props.address}`);
   const [playback, setPlayback] = useState<Job["playback"]>(null);
@@ -24,15 +26,7 @@ export function JobPage(props: { address: string }) {
   // A failed job's recording, which says why, may come after the contract's end.
   const unexplained = job.data?.liability.state === "failed" && job.data.liability.result !== "" && (job.data.reason?.code ?? UNAVAILABLE) === UNAVAILABLE;
   useTopic("chain", () => job.data && (!job.data.liability.isFinalized || unexplained) && job.reload());
-  return (
-    <>
-      <div class="row between">
-        <h1>{texts.job} <Name text={props.address} /></h1>
-        <CopyLink />
-      </div>
-      <Show of={job}>{(known) => <JobView job={known} playback={playback ?? known.playback} changed={job.reload} />}</Show>
-    </>
-  );
+  return <Show of={job}>{(known) => <JobView job={known} playback={playback ?? known.playback} changed={job.reload} />}</Show>;
 }
 
 const UNAVAILABLE = "recording-unavailable";
@@ -40,52 +34,89 @@ const PHASES = { incoming: 2, ready: 2, running: 3, complete: 4, finalized: 5 };
 
 export function JobView(props: { job: Job; playback: Job["playback"]; changed: () => void }) {
   const { job, playback } = props;
+  const { robotAt } = useApp();
   const { liability } = job;
+  const description = useModel(liability.model)?.description ?? null;
+  const robot = robotAt(liability.promisor);
   const ended = liability.isFinalized;
   const failed = ended && liability.state !== "paid";
   const owed = job.owed !== "0";
   const done = ended ? (failed ? 5 : 6) : PHASES[job.phase];
   const share = playback && playback.total ? playback.position / playback.total : undefined;
+  const code = job.reason?.code ?? "";
+  const title = description?.title ? plain(description.title, 80) : texts.job;
   return (
     <>
+      <section class="hero small">
+        <a href={`#/robot/${liability.promisor}`} tabIndex={-1} aria-hidden="true"><Picture address={liability.promisor} cid={robot?.profile?.picture} /></a>
+        <div>
+          <h1>{title}</h1>
+          <p class="quiet">{texts.doneBy} {robot ? <a href={`#/robot/${liability.promisor}`}>{nameOf(robot)}</a> : <Name text={liability.promisor} href={`#/robot/${liability.promisor}`} />} · <Money units={liability.cost} token={liability.token} /></p>
+        </div>
+        <Stop job={job} changed={props.changed} />
+      </section>
       <Steps done={done} active={!ended} failed={failed} share={job.phase === "running" || playback ? share : undefined} />
       <p class="lead" aria-live="polite">
-        <JobState state={liability.state} /> {owed ? texts.owedNow(amount(job.owed, liability.token), !failed) : texts.jobStateLong[liability.state]}
-        {playback && !ended ? ` ${texts.played(playback.position, playback.total)}` : ""}
+        <JobState state={liability.state} /> {owed ? texts.owedNow(amount(job.owed, liability.token), !failed) : code === "stopped" ? texts.stoppedLong : texts.jobStateLong[liability.state]}
+        {playback && !ended && playback.total > 1 ? ` ${texts.played(playback.position, playback.total)}` : ""}
       </p>
-      {job.reason ? <p class="problem"><Strange text={job.reason.text || texts.reason[job.reason.code] || ""} /> <code>{job.reason.code}</code></p> : null}
+      {job.reason ? <p class={code === "stopped" ? "callout" : "problem"}><Strange text={job.reason.text || texts.reason[code] || ""} /> <code>{code}</code></p> : null}
       {owed ? <p class="hint">{texts.owedHow} <code>aira liability claim {liability.address}</code></p> : null}
       <Refund job={job} changed={props.changed} />
-      {ended ? <p><a class="button quietly" href={`#/order/model/${liability.model}`}>{texts.orderAgain}</a></p> : <Operate robot={liability.promisor} job={liability.address} />}
+      {ended ? <p class="row"><a class="button quietly" href={`#/order/model/${liability.model}/${liability.promisor}/${liability.objective}`}>{texts.orderAgain}</a><CopyLink /></p> : null}
+      {liability.result ? <Replay cid={liability.result} model={description} /> : <LiveJob address={liability.address} model={description} />}
       <div class="columns">
-        <section>
-          <h2>{texts.terms}</h2>
-          <Facts
-            of={[
-              [texts.price, <Money units={liability.cost} token={liability.token} />],
-              [texts.person, <Name text={liability.promisee} href={`#/account/${liability.promisee}`} />],
-              [texts.robot, <Name text={liability.promisor} href={`#/account/${liability.promisor}`} />],
-              [texts.model, <Name text={liability.model} href={`#/order/model/${liability.model}`} />],
-              [texts.objective, <Name text={liability.objective} href={`#/file/${liability.objective}`} />],
-              [texts.result, liability.result ? <Name text={liability.result} href={`#/file/${liability.result}`} /> : texts.notYet],
-              [texts.validator, /^0x0+$/.test(liability.validator) ? "" : <Name text={liability.validator} />],
-              [texts.demand, job.demandHash ? <Name text={job.demandHash} href={`#/order/${job.demandHash}`} /> : ""],
-              [texts.offer, job.offerHash ? <Name text={job.offerHash} href={`#/order/${job.offerHash}`} /> : ""],
-            ]}
-          />
-        </section>
         <section>
           <h2>{texts.timeline}</h2>
           <Timeline steps={job.timeline} owed={owed} />
         </section>
+        <Evidence job={job} />
       </div>
-      {liability.result ? (
-        <section>
-          <h2>{texts.recording}</h2>
-          <Replay cid={liability.result} model={null} />
-        </section>
-      ) : null}
-      <Evidence job={job} />
+      {ended ? null : <Operate robot={liability.promisor} job={liability.address} />}
+      <details class="more" id="terms">
+        <summary>{texts.terms}</summary>
+        <Facts
+          of={[
+            [texts.contract, <Name text={liability.address} label={liability.address} />],
+            [texts.price, <Money units={liability.cost} token={liability.token} />],
+            [texts.person, <Name text={liability.promisee} href={`#/account/${liability.promisee}`} />],
+            [texts.robot, <Name text={liability.promisor} href={`#/robot/${liability.promisor}`} />],
+            [texts.model, <Name text={liability.model} href={`#/order/model/${liability.model}`} />],
+            [texts.objective, <Name text={liability.objective} href={`#/file/${liability.objective}`} />],
+            [texts.result, liability.result ? <Name text={liability.result} href={`#/file/${liability.result}`} /> : texts.notYet],
+            [texts.validator, /^0x0+$/.test(liability.validator) ? "" : <Name text={liability.validator} />],
+            [texts.demand, job.demandHash ? <Name text={job.demandHash} href={`#/order/${job.demandHash}`} /> : ""],
+            [texts.offer, job.offerHash ? <Name text={job.offerHash} href={`#/order/${job.offerHash}`} /> : ""],
+          ]}
+        />
+      </details>
+    </>
+  );
+}
+
+/** Stops a job that this account ordered, and says what that costs. */
+function Stop({ job, changed }: { job: Job; changed: () => void }) {
+  const { account, notify } = useApp();
+  const [open, setOpen] = useState(false);
+  const { liability } = job;
+  if (liability.isFinalized || account?.address !== liability.promisee || job.phase === "complete") return null;
+  const stop = async () => {
+    await stopJob(liability.address, texts.stoppedByPerson, account);
+    setOpen(false);
+    notify(texts.stopSent);
+    changed();
+  };
+  return (
+    <>
+      <button type="button" id="stop" class="button danger huge" onClick={() => setOpen(true)}>{texts.stop}</button>
+      <Dialog title={texts.stopTitle} open={open} onClose={() => setOpen(false)}>
+        <p>{texts.stopHint}</p>
+        <p><strong>{texts.stopCosts[job.onStop] ?? texts.stopCosts[""]}</strong></p>
+        <p class="row">
+          <Action id="stop-now" class="button danger" run={stop}>{texts.stopNow}</Action>
+          <button type="button" class="button quietly" onClick={() => setOpen(false)}>{texts.goOnWorking}</button>
+        </p>
+      </Dialog>
     </>
   );
 }
@@ -97,21 +128,22 @@ function CopyLink() {
     await navigator.clipboard.writeText(location.href);
     notify(texts.copied);
   };
-  return <Action class="button small quietly" run={copy}>{texts.copyLink}</Action>;
+  return <Action class="button quietly" run={copy}>{texts.copyLink}</Action>;
 }
 
 function Timeline(props: { steps: Step[]; owed: boolean }) {
   const { market } = useApp();
+  const first = props.steps.find((step) => step.at !== null)?.at ?? null;
   return (
     <ol class="timeline">
       {props.steps.map((step) => (
         <li key={`${step.kind}${step.at}${step.block}`}>
           <strong>{texts.stepName[props.owed && (step.kind === "paid" || step.kind === "refunded") ? "owed" : step.kind] ?? step.kind}</strong>
           <span class="quiet">
-            {step.at !== null ? clock(step.at) : ""} {step.block !== null ? texts.block(step.block) : ""}{" "}
+            {step.at !== null ? clock(step.at) : ""} {step.at !== null && first !== null && step.at > first ? `+${duration(step.at - first)}` : ""}{" "}
             {step.tx ? (market.explorer ? <a href={`${market.explorer}/tx/${step.tx}`} rel="noreferrer">{short(step.tx)}</a> : <Name text={step.tx} />) : null}
           </span>
-          {isCid(step.detail) ? <Name text={step.detail} href={`#/file/${step.detail}`} /> : <Strange text={step.detail} />}
+          {isCid(step.detail) ? null : <Strange text={step.detail} />}
         </li>
       ))}
     </ol>
@@ -123,7 +155,7 @@ function Refund(props: { job: Job; changed: () => void }) {
   const { liability, refundableFrom } = props.job;
   if (liability.isFinalized || refundableFrom === null || account?.address !== liability.promisee) return null;
   const left = refundableFrom - block;
-  if (left > 0) return <p class="hint">{texts.refundLater(amount(liability.cost, liability.token), refundableFrom, duration(left * market.blockTime))}</p>;
+  if (left > 0) return <p class="hint">{texts.refundLater(amount(liability.cost, liability.token), duration(left * market.blockTime))}</p>;
   const refund = async () => {
     if (account.kind === "local") await post("local/refunds", { liability: liability.address });
     else await send(market.factory, calls.refund(liability.address));
@@ -138,7 +170,7 @@ function Refund(props: { job: Job; changed: () => void }) {
   );
 }
 
-/** What this browser checked itself, and beside it the checklist that the server made. */
+/** Whether what is shown is true, in one line; what this browser and the server checked is opened on demand. */
 function Evidence({ job }: { job: Job }) {
   const { account, market } = useApp();
   const [own, setOwn] = useState<Finding[]>([]);
@@ -155,22 +187,22 @@ function Evidence({ job }: { job: Job }) {
       current = false;
     };
   }, [liability.address, liability.isFinalized, liability.result, job.resultMessage?.signature, account?.address]);
+  const all = [...own, ...(verification.data?.findings ?? [])];
   const lies = own.filter((finding) => finding.holds === false);
+  const wrong = all.filter((finding) => finding.holds === false).length;
+  const hold = all.filter((finding) => finding.holds).length;
   return (
     <section>
       <h2>{texts.checks}</h2>
       {lies.length ? <p class="problem" role="alert" id="lie">{texts.serverLies}</p> : null}
       {error ? <p class="problem">{error}</p> : null}
-      <div class="columns">
-        <div>
-          <h3>{texts.byBrowser}</h3>
-          <Findings of={own} names={texts.ownCheck} />
-        </div>
-        <div>
-          <h3>{texts.byServer}</h3>
-          {liability.isFinalized ? <Show of={verification}>{({ findings }) => <Findings of={findings} names={texts.check} />}</Show> : <p class="quiet">{texts.checksLater}</p>}
-        </div>
-      </div>
+      <details class="more" id="checks" open={wrong > 0}>
+        <summary>{!liability.isFinalized ? texts.checksLater : wrong ? <Badge kind="bad">{texts.checksFail(wrong, all.length)}</Badge> : <Badge kind="good">{texts.checksHold(hold, all.length - hold)}</Badge>}</summary>
+        <h3>{texts.byBrowser}</h3>
+        <Findings of={own} names={texts.ownCheck} />
+        <h3>{texts.byServer}</h3>
+        {liability.isFinalized ? <Show of={verification}>{({ findings }) => <Findings of={findings} names={texts.check} />}</Show> : null}
+      </details>
     </section>
   );
 }

@@ -10,7 +10,7 @@ import { JobTable } from "./account";
 export function JobsPage() {
   const { account } = useApp();
   const [phase, setPhase] = useState("");
-  const [mine, setMine] = useState(false);
+  const [mine, setMine] = useState(true);
   const [wanted, setWanted] = useState("");
   const party = mine ? account?.address : undefined;
   const jobs = useData<{ liabilities: Liability[]; more: boolean; phases: Record<string, number> }>(`liabilities${query({ phase, party, limit: 100 })}`);

@@ -1,12 +1,14 @@
 import { useEffect, useRef, useState } from "preact/hooks";
 import uPlot from "uplot";
-import { get } from "../api";
-import { useApp, useTopic } from "../app";
+import { formatUnits } from "viem";
+import { get, query } from "../api";
+import { useApp, useData, useTopic } from "../app";
 import { amount, clock, plain, short } from "../format";
-import { plotColors } from "../plot";
 import { texts } from "../texts";
-import type { Order, StreamEvent } from "../types";
-import { Badge } from "../ui";
+import type { Order, PastJob, StreamEvent, Token } from "../types";
+import { Badge, Show } from "../ui";
+import { plotColors } from "../plot";
+import { ModelChip, robotsOf } from "./robots";
 
 const SHOWN = 60;
 const FLUSH = 100;
@@ -22,8 +24,94 @@ interface Row {
   href: string;
 }
 
-/** The market as it moves: what comes is collected, and drawn ten times a second at most. */
+/** The market: what was paid before, who is here, and what happens now. */
 export function MarketPage() {
+  return (
+    <>
+      <h1>{texts.marketTitle}</h1>
+      <History />
+      <Ticker />
+    </>
+  );
+}
+
+/** What jobs have cost over time, by model, and how many there were. */
+function History() {
+  const { agents, market } = useApp();
+  const [model, setModel] = useState("");
+  const history = useData<{ jobs: PastJob[]; truncated: boolean }>(`market/history${query({ model })}`);
+  const all = useData<{ jobs: PastJob[] }>("market/history");
+  const refresh = useRef(0);
+  useTopic("chain", () => {
+    if (Date.now() - refresh.current < 5_000) return;
+    refresh.current = Date.now();
+    history.reload();
+    all.reload();
+  });
+  const models = [...new Set([...(all.data?.jobs ?? []).map((job) => job.model), ...robotsOf(agents?.agents).flatMap((robot) => robot.models)])].slice(0, 24);
+  const jobs = (history.data?.jobs ?? []).filter((job) => job.token.address === market.token.address);
+  const paid = jobs.filter((job) => job.state === "paid").map((job) => BigInt(job.cost)).sort((one, other) => (one < other ? -1 : 1));
+  const here = robotsOf(agents?.agents).filter((robot) => !model || robot.models.includes(model));
+  return (
+    <section>
+      {models.length > 1 ? (
+        <div class="chips" role="group" aria-label={texts.byModel}>
+          <button type="button" class="chip" aria-pressed={!model} onClick={() => setModel("")}>{texts.all}</button>
+          {models.map((cid) => <ModelChip key={cid} cid={cid} chosen={cid === model} choose={setModel} />)}
+        </div>
+      ) : null}
+      <dl class="figures">
+        <div><dt>{texts.robotsHere}</dt><dd>{here.length}</dd></div>
+        <div><dt>{texts.jobsDone}</dt><dd>{paid.length.toLocaleString("en")}</dd></div>
+        <div><dt>{texts.usualPrice}</dt><dd>{paid.length ? amount(paid[paid.length >> 1], market.token) : "—"}</dd></div>
+        <div><dt>{texts.refundedShare}</dt><dd>{share(jobs)}</dd></div>
+      </dl>
+      <Show of={history}>{() => <Prices jobs={jobs} token={market.token} />}</Show>
+    </section>
+  );
+}
+
+/** Which part of the jobs that have ended was paid back. */
+function share(jobs: PastJob[]): string {
+  const ended = jobs.filter((job) => job.state !== "open");
+  const back = ended.filter((job) => job.state !== "paid").length;
+  return ended.length ? `${Math.round((100 * back) / ended.length)} %` : "—";
+}
+
+/** Each job as a point: when, and for how much. */
+function Prices({ jobs, token }: { jobs: PastJob[]; token: Token }) {
+  const box = useRef<HTMLDivElement>(null);
+  const points = jobs.filter((job) => job.at !== null).map((job) => [job.at!, Number(formatUnits(BigInt(job.cost), token.decimals))]).reverse();
+  const shown = JSON.stringify(points);
+  useEffect(() => {
+    const frame = box.current;
+    if (!frame || points.length < 2) return;
+    const { ink, grid, lines } = plotColors(frame);
+    const axis = { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid } };
+    const measure = () => ({ width: Math.max(240, frame.clientWidth), height: 180 });
+    const plot = new uPlot({
+      ...measure(), cursor: { show: false }, legend: { show: false }, axes: [axis, { ...axis, size: 56 }],
+      scales: { y: { range: (_, __, most) => [0, most * 1.15 || 1] } },
+      series: [{}, { stroke: lines[0], paths: () => null, points: { show: true, size: 7, fill: lines[0] } }],
+    }, [points.map(([at]) => at), points.map(([, price]) => price)], frame);
+    const resized = new ResizeObserver(() => plot.setSize(measure()));
+    resized.observe(frame);
+    return () => {
+      resized.disconnect();
+      plot.destroy();
+    };
+  }, [shown]);
+  if (points.length < 2) return <p class="quiet">{texts.noPrices}</p>;
+  return (
+    <>
+      <p class="hint">{texts.pricesOver(plain(token.symbol, 12))}</p>
+      <div class="plot" ref={box} role="img" aria-label={texts.pricesOver(plain(token.symbol, 12))} />
+    </>
+  );
+}
+
+/** What happens now: what comes is collected, and drawn ten times a second at most. */
+function Ticker() {
   const { market } = useApp();
   const [rows, setRows] = useState<Row[]>([]);
   const [counts, setCounts] = useState<Record<string, number>>({});
@@ -67,7 +155,7 @@ export function MarketPage() {
   return (
     <>
       <div class="row between">
-        <h1>{texts.marketTitle}</h1>
+        <h2>{texts.rightNow}</h2>
         <button type="button" class="button small quietly" aria-pressed={paused} onClick={() => setPaused(!paused)}>{paused ? texts.goOn : texts.pause}</button>
       </div>
       <p class="inline counts">

@@ -1,99 +1,41 @@
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { zeroAddress } from "viem";
+import type { Address } from "viem";
+import { post } from "../api";
 import { useApp, useData, wordsOf } from "../app";
-import { isCid } from "../cid";
+import { calls } from "../contracts";
 import { amount, duration, ether, plain } from "../format";
 import { parseAmount } from "../numbers";
-import { blocksOf, contractsOf, orderLocally, prepare, signAndPost } from "../ordering";
+import { RobotDeclined, blocksOf, contractsOf, orderLocally, prepare, signAndPost } from "../ordering";
 import type { Prepared, Wish } from "../ordering";
-import { calls } from "../contracts";
 import { texts } from "../texts";
 import { allowedContract, rememberContract } from "../trust";
-import type { AccountState, Agent, Model } from "../types";
-import { Action, Badge, Dialog, Facts, Field, Name, NumberField, Problem, Show, Strange } from "../ui";
+import type { AccountState, Model, Quote } from "../types";
+import { Action, Dialog, Facts, Field, Name, NumberField, Picture, Problem, Show, Strange } from "../ui";
 import { inWords } from "../values";
 import { Fit, ObjectiveChoice, firstChoice, useObjective, withoutDescription } from "./objective";
+import type { Make } from "./objective";
+import { nameOf } from "./robots";
 import { NOBODY, ValidatorChoice } from "./validator";
 import type { Judge } from "./validator";
 
 const LIFETIMES = [5, 60, 720];
 
-/** The page for ordering: a model, an objective, a price, a signature. */
-export function OrderPage(props: { model: string }) {
-  const [model, setModel] = useState(props.model);
-  const described = useData<Model>(model ? `models/${model}` : null);
+/** The page for ordering what a model describes: say how, choose who, look at it, sign. */
+export function OrderPage(props: { model: string; robot: string; objective: string }) {
+  const { model } = props;
+  const described = useData<Model>(`models/${model}`);
   const isMissing = described.error !== null && described.data === null;
   const known = useMemo(() => described.data ?? (isMissing ? withoutDescription(model) : null), [described.data, isMissing, model]);
+  const description = known?.description;
   return (
     <div class="order">
-      <h1>{texts.orderTitle}</h1>
-      <section class="step">
-        <h2><span class="count">1</span> {texts.chooseModel}</h2>
-        <ModelChoice model={model} choose={setModel} />
-      </section>
-      {model ? <Show of={described}>{() => null}</Show> : null}
-      {model && known ? <OrderForm key={`${model} ${known.described}`} model={known} /> : null}
+      <p class="back"><a href="#/">{texts.otherRobots}</a></p>
+      <h1><Strange text={description?.title ?? (known ? texts.undescribed : texts.loading)} most={80} /></h1>
+      {description?.description ? <p class="lead"><Strange text={description.description} /></p> : null}
+      <Show of={described}>{() => null}</Show>
+      {known ? <OrderForm key={`${known.described}`} model={known} robot={props.robot} objective={props.objective} /> : null}
     </div>
-  );
-}
-
-function ModelChoice(props: { model: string; choose: (cid: string) => void }) {
-  const agents = useData<{ agents: Agent[] }>("agents");
-  const [other, setOther] = useState("");
-  const type = (text: string) => {
-    setOther(text);
-    if (isCid(text)) props.choose(text);
-  };
-  const pick = (cid: string) => {
-    setOther("");
-    props.choose(cid);
-  };
-  const robots = agents.data?.agents.filter((agent) => agent.models.length) ?? [];
-  const models = [...new Set(robots.flatMap((robot) => robot.models))];
-  if (props.model && !models.includes(props.model)) models.unshift(props.model);
-  return (
-    <>
-      <Show of={agents}>
-        {() => (
-          <div class="cards" role="group" aria-label={texts.chooseModel}>
-            {models.map((cid) => (
-              <ModelCard key={cid} cid={cid} chosen={cid === props.model} robots={robots.filter((robot) => robot.models.includes(cid))} choose={pick} />
-            ))}
-            {!models.length ? <p class="quiet">{texts.noRobots}</p> : null}
-          </div>
-        )}
-      </Show>
-      <details class="more">
-        <summary>{texts.otherModel}</summary>
-        <Field label={texts.modelCid} error={other && !isCid(other) ? texts.notACid : ""} hint={texts.modelCidHint}>
-          {(id, described) => (
-            <input id={id} aria-describedby={described} class="wide" value={other} spellcheck={false} onInput={(event) => type(event.currentTarget.value.trim())} />
-          )}
-        </Field>
-      </details>
-    </>
-  );
-}
-
-function ModelCard(props: { cid: string; chosen: boolean; robots: Agent[]; choose: (cid: string) => void }) {
-  const model = useData<Model>(`models/${props.cid}`).data;
-  const { market } = useApp();
-  const description = model?.description;
-  const best = props.robots.flatMap((robot) => robot.offers).filter((offer) => offer.model === props.cid && offer.token === market.token.address)
-    .reduce<bigint | null>((least, offer) => (least === null || BigInt(offer.cost) < least ? BigInt(offer.cost) : least), null);
-  const done = props.robots.reduce((sum, robot) => sum + robot.record.done, 0);
-  const failed = props.robots.reduce((sum, robot) => sum + robot.record.failed, 0);
-  return (
-    <button type="button" class={`card ${props.chosen ? "chosen" : ""}`} aria-pressed={props.chosen} onClick={() => props.choose(props.cid)}>
-      <strong><Strange text={description?.title ?? texts.undescribed} most={80} /></strong>
-      <span class="about"><Strange text={description?.description ?? model?.text ?? props.cid} most={160} /></span>
-      <span class="meta">
-        {best !== null ? <Badge kind="calm">{texts.offered(amount(best, market.token))}</Badge> : description?.price ? <Badge kind="calm">{texts.typically(plain(description.price, 40))}</Badge> : null}
-        {description?.seconds ? <Badge kind="calm">{duration(description.seconds)}</Badge> : null}
-        <Badge kind={props.robots.some((robot) => robot.health === "alive") ? "good" : "calm"}>{texts.robotsPresent(props.robots.length)}</Badge>
-        {done + failed ? <Badge kind={failed > done ? "warn" : "good"}>{texts.recordShort(done, failed)}</Badge> : null}
-      </span>
-    </button>
   );
 }
 
@@ -103,46 +45,128 @@ function typicalPrice(price: string | undefined, symbol: string): string {
   return unit === symbol ? number : "";
 }
 
-function OrderForm({ model }: { model: Model }) {
+/** Who is to do it; null until the person or the quotes have said. */
+type Choosing = Address | "" | null;
+
+function OrderForm({ model, robot, objective }: { model: Model; robot: string; objective: string }) {
   const { market, account } = useApp();
-  const [choice, setChoice] = useState(() => firstChoice(model));
+  const [choice, setChoice] = useState(() => (objective ? { ...firstChoice(model), way: "cid" as const, cid: objective } : firstChoice(model)));
   const [price, setPrice] = useState(typicalPrice(model.description?.price, market.token.symbol) || "1");
   const [minutes, setMinutes] = useState<number | null>(null);
   const [judge, setJudge] = useState<Judge | null>(NOBODY);
+  const [chosen, choose] = useState<Choosing>(null);
   const make = useObjective(model, choice);
-  const cost = parseAmount(price, market.token.decimals);
+  const { quotes, ask } = useQuotes(model, make);
+  const fitting = quotes?.filter((quote) => isUsable(quote, market.token.address)) ?? [];
+  const wanted = chosen ?? (fitting.find((quote) => quote.agent === robot) ?? fitting[0])?.agent ?? (quotes ? "" : null);
+  const quote = fitting.find((one) => one.agent === wanted);
+  const offered = parseAmount(price, market.token.decimals);
+  const cost = wanted ? (quote ? BigInt(quote.cost) : null) : offered;
   const wish = useMemo<Wish | null>(() => {
-    if (make === null || cost === null || judge === null) return null;
-    return { model, objective: make, cost, validator: judge.address, validatorFee: judge.fee, minutes, confirm: judge.confirm };
-  }, [make, cost, minutes, judge]);
+    if (make === null || cost === null || judge === null || wanted === null) return null;
+    return { model, objective: make, robot: wanted, cost, validator: judge.address, validatorFee: judge.fee, minutes, confirm: judge.confirm };
+  }, [make, cost, minutes, judge, wanted]);
   return (
     <>
       <section class="step">
-        <h2><span class="count">2</span> {texts.chooseObjective}</h2>
+        <h2>{texts.chooseObjective}</h2>
         <ObjectiveChoice model={model} choice={choice} make={make} change={setChoice} />
       </section>
       <section class="step">
-        <h2><span class="count">3</span> {texts.choosePrice}</h2>
-        <div class="fields">
-          <NumberField label={texts.youPay(plain(market.token.symbol, 12))} text={price} change={setPrice} error={cost === null ? texts.notAnAmount : ""} hint={texts.youPayHint} class="big number" />
-          <Field label={texts.waitFor} hint={texts.waitForHint}>
-            {(id, described) => (
-              <select id={id} aria-describedby={described} class="big" value={minutes ?? ""} onChange={(event) => setMinutes(Number(event.currentTarget.value) || null)}>
-                <option value="">{duration(market.defaultLifetime * (market.blockTime || 1))}</option>
-                {LIFETIMES.filter((one) => blocksOf(one, market) <= market.limits.lifetime).map((one) => <option key={one} value={one}>{duration(one * 60)}</option>)}
-              </select>
-            )}
-          </Field>
-        </div>
+        <h2>{texts.chooseRobot}</h2>
+        <Robots quotes={quotes} asking={make !== null} wanted={wanted} choose={choose} again={ask} />
+        {wanted === "" ? (
+          <div class="fields">
+            <NumberField label={texts.youPay(plain(market.token.symbol, 12))} text={price} change={setPrice} error={offered === null ? texts.notAnAmount : ""} hint={texts.youPayHint} class="big number" />
+            <Field label={texts.waitFor} hint={texts.waitForHint}>
+              {(id, described) => (
+                <select id={id} aria-describedby={described} class="big" value={minutes ?? ""} onChange={(event) => setMinutes(Number(event.currentTarget.value) || null)}>
+                  <option value="">{duration(market.defaultLifetime * (market.blockTime || 1))}</option>
+                  {LIFETIMES.filter((one) => blocksOf(one, market) <= market.limits.lifetime).map((one) => <option key={one} value={one}>{duration(one * 60)}</option>)}
+                </select>
+              )}
+            </Field>
+          </div>
+        ) : null}
         <ValidatorChoice choose={setJudge} />
-        {account ? <OrderButton wish={wish} /> : <p class="callout">{texts.connectFirst}</p>}
+        {account ? <OrderButton wish={wish} declined={(one) => { choose(null); ask(); return one; }} /> : <p class="callout">{texts.connectFirst}</p>}
       </section>
     </>
   );
 }
 
+const isUsable = (quote: Quote, token: Address) => !quote.code && quote.token.address === token && !quote.validator;
+
+/** Milliseconds without a key after which robots are asked. */
+const SETTLED = 500;
+
+/** What the robots of a model want for an objective; null until they have answered. */
+function useQuotes(model: Model, make: Make | null): { quotes: Quote[] | null; ask: () => void } {
+  const [found, setFound] = useState<{ of: Make; quotes: Quote[] } | null>(null);
+  const [turn, setTurn] = useState(0);
+  useEffect(() => {
+    if (make === null) return;
+    let current = true;
+    const timer = setTimeout(async () => {
+      const objective = await make().catch(() => null);
+      const asked = objective?.preflight.ok ? post<{ quotes: Quote[] }>("quotes", { model: model.cid, objective: objective.cid }) : null;
+      const quotes = (await asked?.catch(() => null))?.quotes ?? [];
+      if (current) setFound({ of: make, quotes });
+    }, SETTLED);
+    return () => {
+      current = false;
+      clearTimeout(timer);
+    };
+  }, [make, turn]);
+  return { quotes: found?.of === make ? found.quotes : null, ask: () => setTurn((known) => known + 1) };
+}
+
+/** Who could do it, side by side: price, start, duration, record; the cheapest first, refusals last. */
+function Robots(props: { quotes: Quote[] | null; asking: boolean; wanted: Choosing; choose: (who: Address | "") => void; again: () => void }) {
+  const { market } = useApp();
+  const { quotes, wanted, choose } = props;
+  if (!props.asking) return <p class="quiet">{texts.sayFirst}</p>;
+  if (quotes === null) return <p class="quiet" aria-busy="true">{texts.askingRobots}</p>;
+  const ready = quotes.filter((quote) => isUsable(quote, market.token.address));
+  const others = quotes.filter((quote) => !isUsable(quote, market.token.address));
+  return (
+    <>
+      <div class="quotes" role="radiogroup" aria-label={texts.chooseRobot}>
+        {ready.map((quote) => <QuoteRow key={quote.agent} quote={quote} chosen={wanted === quote.agent} choose={() => choose(quote.agent)} />)}
+        <label class={`quote ${wanted === "" ? "chosen" : ""}`}>
+          <input type="radio" name="robot" id="anybody" checked={wanted === ""} onChange={() => choose("")} />
+          <span class="who"><strong>{texts.anybody}</strong><span class="quiet">{ready.length ? texts.anybodyHint : texts.nobodyQuotes}</span></span>
+        </label>
+      </div>
+      {others.length ? (
+        <ul class="plain refusals">
+          {others.map((quote) => <li key={quote.agent}><Name text={quote.agent} href={`#/robot/${quote.agent}`} /> <Strange text={quote.code ? texts.declines(quote.detail || quote.code) : texts.wantsOther(amount(quote.cost, quote.token))} most={200} /></li>)}
+        </ul>
+      ) : null}
+      <p><button type="button" class="button small quietly" onClick={props.again}>{texts.askAgain}</button></p>
+    </>
+  );
+}
+
+function QuoteRow({ quote, chosen, choose }: { quote: Quote; chosen: boolean; choose: () => void }) {
+  const { market, robotAt } = useApp();
+  const robot = robotAt(quote.agent);
+  const { done = 0, failed = 0 } = robot?.record ?? {};
+  return (
+    <label class={`quote ${chosen ? "chosen" : ""}`}>
+      <input type="radio" name="robot" checked={chosen} onChange={choose} value={quote.agent} />
+      <Picture address={quote.agent} cid={robot?.profile?.picture} size="small" />
+      <span class="who">
+        <strong>{robot ? nameOf(robot) : plain(quote.name, 80) || <Name text={quote.agent} />}</strong>
+        <span class="quiet">{[quote.start ? texts.beginsIn(duration(quote.start)) : texts.beginsNow, quote.seconds ? texts.takes(duration(quote.seconds)) : "", done + failed ? texts.recordShort(done, failed) : texts.noRecord].filter(Boolean).join(" · ")}</span>
+      </span>
+      <span class="price-tag">{amount(quote.cost, market.token)}</span>
+    </label>
+  );
+}
+
 /** Names what stands in the way of an order, each with a button that removes it; then the order's button. */
-export function OrderButton(props: { wish: Wish | null }) {
+export function OrderButton(props: { wish: Wish | null; declined?: (error: RobotDeclined) => void }) {
   const { market, account, fixChain, send, notify, reloadMarket } = useApp();
   const state = useData<AccountState>(account ? `accounts/${account.address}` : null);
   const [review, setReview] = useState<Prepared | null>(null);
@@ -184,6 +208,12 @@ export function OrderButton(props: { wish: Wish | null }) {
     rememberContract(market);
     setKnown(market.factory);
   };
+  const copyAddress = (
+    <p class="row">
+      <Action class="button small" run={async () => { await navigator.clipboard.writeText(account.address); notify(texts.copied); }}>{texts.copyAddress}</Action>
+      <Action class="button small quietly" run={state.reload}>{texts.checkAgain}</Action>
+    </p>
+  );
   return (
     <div class="sign">
       {state.error ? <Problem error={state.error} retry={state.reload} /> : null}
@@ -196,10 +226,7 @@ export function OrderButton(props: { wish: Wish | null }) {
       {short.map((need) => (
         <div class="callout warn" key={need.token}>
           <p>{texts.tooLittle(amount(need.balance, market[need.token]), amount(need.amount, market[need.token]))}</p>
-          <p class="row">
-            <Action class="button small" run={async () => { await navigator.clipboard.writeText(account.address); notify(texts.copied); }}>{texts.copyAddress}</Action>
-            <Action class="button small quietly" run={state.reload}>{texts.checkAgain}</Action>
-          </p>
+          {copyAddress}
         </div>
       ))}
       {unallowed.map((need) => (
@@ -207,10 +234,7 @@ export function OrderButton(props: { wish: Wish | null }) {
           {BigInt(state.data!.eth) === 0n ? (
             <>
               <p>{texts.noGas(ether(state.data!.eth))}</p>
-              <p class="row">
-                <Action class="button small" run={async () => { await navigator.clipboard.writeText(account.address); notify(texts.copied); }}>{texts.copyAddress}</Action>
-                <Action class="button small quietly" run={state.reload}>{texts.checkAgain}</Action>
-              </p>
+              {copyAddress}
             </>
           ) : known && known !== market.factory ? (
             <>
@@ -225,13 +249,16 @@ export function OrderButton(props: { wish: Wish | null }) {
           )}
         </div>
       ))}
-      {account.kind === "local" ? <p class="callout warn">{texts.localSigns}</p> : null}
       {error ? <Problem error={error} /> : null}
-      <Action id="order" class="button huge" disabled={blocked} run={open} onError={setError}>
-        {account.kind === "local" ? texts.reviewLocal : texts.review}
-      </Action>
+      <p class="total row between">
+        <span>{wish ? <>{texts.youPayShort} <strong class="price-tag">{amount(wish.cost, market.token)}</strong></> : null}</span>
+        <Action id="order" class="button huge" disabled={blocked} run={open} onError={setError}>
+          {account.kind === "local" ? texts.reviewLocal : texts.review}
+        </Action>
+      </p>
+      {account.kind === "local" ? <p class="hint">{texts.localSigns}</p> : null}
       <Dialog title={account.kind === "local" ? texts.whatYouOrder : texts.whatYouSign} open={review !== null && isCurrent(review)} onClose={() => setReview(null)}>
-        {review ? <Review of={review} isWanted={() => opened.current === review && isCurrent(review)} close={() => setReview(null)} /> : null}
+        {review ? <Review of={review} isWanted={() => opened.current === review && isCurrent(review)} close={() => setReview(null)} declined={props.declined} /> : null}
       </Dialog>
     </div>
   );
@@ -254,40 +281,54 @@ function needsOf(draft: Wish, state: AccountState, sameToken: boolean): Need[] {
   return [need("token", draft.cost), need("xrt", draft.validatorFee)];
 }
 
-/** The terms exactly as they are signed, the objective's values in words, and the hash that the browser made of them. */
-function Review(props: { of: Prepared; isWanted: () => boolean; close: () => void }) {
-  const { block } = useApp();
+/** What is ordered in words, and on demand the terms exactly as they are signed, with the hash that the browser made. */
+function Review(props: { of: Prepared; isWanted: () => boolean; close: () => void; declined?: (error: RobotDeclined) => void }) {
+  const { block, robotAt } = useApp();
   const { draft, demand, hash, market, account, objective, wish } = props.of;
   const [error, setError] = useState("");
+  const robot = draft.robot ? robotAt(draft.robot) : undefined;
   const sign = async () => {
     setError("");
-    const order = demand ? await signAndPost(demand, hash!, account, props.isWanted) : await orderLocally(draft, account.address, market);
+    const order = demand ? await signAndPost(demand, hash!, draft.robot, account, props.isWanted) : await orderLocally(draft, account.address, market);
     props.close();
     location.hash = `#/order/${order}`;
+  };
+  const failed = (problem: unknown) => {
+    setError(wordsOf(problem));
+    if (problem instanceof RobotDeclined) props.declined?.(problem);
   };
   const left = demand ? Number(demand.deadline) - block : draft.lifetime;
   return (
     <>
-      <p>{demand ? texts.whatYouSignHint : texts.whatYouOrderHint}</p>
       <InWords of={props.of} />
       <Facts
         of={[
           [texts.youPayShort, <strong>{amount(draft.cost, market.token)}</strong>],
-          [texts.account, <Name text={account.address} label={account.address} />],
-          [texts.model, <><Strange text={wish.model.description?.title ?? texts.undescribed} most={80} /> <Name text={draft.model} label={draft.model} /></>],
-          [texts.objective, <Name text={draft.objective} label={draft.objective} />],
-          [texts.market, <><Strange text={market.lighthouse.name} /> <Name text={market.lighthouse.address} /></>],
-          [texts.token, <Name text={market.token.address} />],
-          [texts.validator, draft.validator === zeroAddress ? texts.none : <Name text={draft.validator} label={draft.validator} />],
-          [texts.validatorFee, amount(draft.validatorFee, market.xrt)],
-          [texts.validUntil, left > 0 ? texts.blockIn(block + left, duration(left * market.blockTime)) : texts.orderState.expired],
-          [texts.nonce, demand ? <code class="break">{String(demand.nonce)}</code> : ""],
-          [texts.hash, hash ? <code class="break" id="hash">{hash}</code> : ""],
+          [texts.to, draft.robot ? <>{robot ? <strong>{nameOf(robot)}</strong> : null} <Name text={draft.robot} label={draft.robot} /></> : texts.anybody],
+          [texts.ifStopped, wish.model.description?.onStop ? texts.stopCosts[wish.model.description.onStop] : ""],
+          [texts.validator, draft.validator === zeroAddress ? "" : <Name text={draft.validator} label={draft.validator} />],
+          [texts.validatorFee, draft.validatorFee ? amount(draft.validatorFee, market.xrt) : ""],
         ]}
       />
+      <p class="hint">{demand ? (draft.robot ? texts.whatYouSignThrice : texts.whatYouSignHint) : texts.whatYouOrderHint}</p>
+      <details class="more" id="signed-terms" open={demand !== undefined}>
+        <summary>{texts.termsAsSigned}</summary>
+        <Facts
+          of={[
+            [texts.account, <Name text={account.address} label={account.address} />],
+            [texts.model, <Name text={draft.model} label={draft.model} />],
+            [texts.objective, <span id="objective"><Name text={draft.objective} label={draft.objective} href={`#/file/${draft.objective}`} /></span>],
+            [texts.market, <><Strange text={market.lighthouse.name} /> <Name text={market.lighthouse.address} /></>],
+            [texts.token, <Name text={market.token.address} />],
+            [texts.validUntil, left > 0 ? texts.blockIn(block + left, duration(left * market.blockTime)) : texts.orderState.expired],
+            [texts.nonce, demand ? <code class="break">{String(demand.nonce)}</code> : ""],
+            [texts.hash, hash ? <code class="break" id="hash">{hash}</code> : ""],
+          ]}
+        />
+      </details>
       {error ? <p class="problem" role="alert">{error}</p> : null}
       <p class="row">
-        <Action id="sign" class="button huge" disabled={!objective.preflight.ok || left <= 0} run={sign} onError={(problem) => setError(wordsOf(problem))}>{demand ? texts.sign : texts.orderLocal}</Action>
+        <Action id="sign" class="button huge" disabled={!objective.preflight.ok || left <= 0} run={sign} onError={failed}>{demand ? texts.sign : texts.orderLocal(amount(draft.cost, market.token))}</Action>
         <button type="button" class="button quietly" onClick={props.close}>{texts.notNow}</button>
       </p>
     </>
@@ -300,8 +341,7 @@ function InWords({ of: { objective, messages, wish: { model } } }: { of: Prepare
   const more = objective.summary.messages - messages.length;
   return (
     <section id="in-words">
-      <h3>{texts.whatItDoes}</h3>
-      {objective.cid === model.cid ? <p>{texts.withoutObjective}</p> : <Fit objective={objective} described={model.described} />}
+      {objective.cid === model.cid ? <p>{texts.withoutObjective}</p> : objective.preflight.ok ? null : <Fit objective={objective} described={model.described} />}
       <ol class="in-words">
         {messages.map((message) => {
           const topic = topics.find((one) => one.topic === message.topic);

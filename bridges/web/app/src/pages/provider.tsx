@@ -4,18 +4,17 @@ import { calls } from "../contracts";
 import { amount, duration, ether } from "../format";
 import { parseAmount } from "../numbers";
 import { texts } from "../texts";
-import type { AccountState, Lighthouse, Order } from "../types";
+import type { AccountState, Lighthouse as Turns, Order } from "../types";
 import { Action, Badge, Facts, Field, Money, Name, NumberField, Show, Strange, Table } from "../ui";
 
 /** The lighthouse for those who run it: providers, turns, gas and earnings, stakes, the order book. */
-export function ProviderPage() {
+export function Lighthouse() {
   const { market, account } = useApp();
-  const lighthouse = useData<Lighthouse>("lighthouse");
+  const lighthouse = useData<Turns>("lighthouse");
   const orders = useData<{ orders: Order[]; dropped: number }>("orders?limit=100");
   useTopic("chain", () => { lighthouse.reload(); orders.reload(); });
   return (
     <>
-      <h1>{texts.providerTitle}</h1>
       <Show of={lighthouse}>
         {(known) => (
           <>
@@ -70,7 +69,7 @@ export function ProviderPage() {
   );
 }
 
-function Stake(props: { lighthouse: Lighthouse; address: string; changed: () => void }) {
+function Stake(props: { lighthouse: Turns; address: string; changed: () => void }) {
   const { market, send, notify } = useApp();
   const state = useData<AccountState>(`accounts/${props.address}`);
   const [value, setValue] = useState("");

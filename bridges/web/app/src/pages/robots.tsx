@@ -1,213 +1,144 @@
-import { useEffect, useState } from "preact/hooks";
-import type { Address } from "viem";
-import { post, query } from "../api";
-import { useApp, useData, useTopic } from "../app";
-import { amount, clock, duration, ether, size } from "../format";
+import { useMemo, useState } from "preact/hooks";
+import { useApp, useModel } from "../app";
+import { isCid } from "../cid";
+import { duration, plain } from "../format";
 import { texts } from "../texts";
-import type { AccountState, Agent, Agents, Liability, LogEvent } from "../types";
-import { Action, Badge, Facts, Field, Money, Name, Show, Strange, Table } from "../ui";
-import { JobTable } from "./account";
-import { LoginForm } from "./login";
+import type { Agent } from "../types";
+import { Badge, Field, Picture, Strange } from "../ui";
 
-/** Who is present, for owners and operators: health, jobs by phase, earnings, alerts, actions. */
+/** The robots of an owner, not the programs of people who order. */
+export function robotsOf(agents: Agent[] | undefined): Agent[] {
+  return (agents ?? []).filter((agent) => agent.role === "agent" && (agent.profile || agent.models.length));
+}
+
+/** Home: who is here, what each does and for how much. */
 export function RobotsPage() {
-  const agents = useData<Agents>("agents");
-  const [live, setLive] = useState<Agents | null>(null);
-  useTopic("agents", (event) => event.kind === "agents" ? setLive(event.data) : agents.reload());
+  const { agents } = useApp();
+  const [search, setSearch] = useState("");
+  const [model, setModel] = useState("");
+  const robots = robotsOf(agents?.agents);
+  const models = [...new Set(robots.flatMap((robot) => robot.models))];
+  const shown = robots.filter((robot) => (!model || robot.models.includes(model)) && matches(robot, search));
+  const order = { idle: 0, working: 1, closed: 2, stopped: 3 };
+  shown.sort((one, other) => (order[one.profile?.state ?? "stopped"] - order[other.profile?.state ?? "stopped"]) || nameOf(one).localeCompare(nameOf(other)));
   return (
     <>
-      <h1>{texts.robotsTitle}</h1>
-      <Show of={agents}>{(known) => <AgentList {...(live ?? known)} />}</Show>
+      <h1>{texts.homeTitle}</h1>
+      {robots.length > 1 ? (
+        <div class="row find" role="search">
+          <input type="search" aria-label={texts.search} placeholder={texts.search} value={search} onInput={(event) => setSearch(event.currentTarget.value)} />
+          {models.length > 1 ? (
+            <div class="chips" role="group" aria-label={texts.byModel}>
+              <button type="button" class="chip" aria-pressed={!model} onClick={() => setModel("")}>{texts.all}</button>
+              {models.map((cid) => <ModelChip key={cid} cid={cid} chosen={cid === model} choose={setModel} />)}
+            </div>
+          ) : null}
+        </div>
+      ) : null}
+      {agents === null ? <p class="quiet" aria-busy="true">{texts.loading}</p> : null}
+      <div class="robots">{shown.map((robot) => <RobotCard key={robot.address} robot={robot} />)}</div>
+      {agents !== null && !robots.length ? (
+        <div class="empty">
+          <h2>{texts.noRobotsTitle}</h2>
+          <p>{texts.noRobotsHint}</p>
+          <pre>{texts.noRobotsCommand}</pre>
+        </div>
+      ) : agents !== null && !shown.length ? <p class="empty">{texts.noneFound} <button type="button" class="button small quietly" onClick={() => { setSearch(""); setModel(""); }}>{texts.showAll}</button></p> : null}
+      <ByModel />
     </>
   );
 }
 
-function AgentList(props: Agents) {
-  const { market } = useApp();
-  const [open, setOpen] = useState("");
-  const chosen = props.agents.find((agent) => agent.address + agent.role === open);
-  return (
-    <>
-      {props.alerts.map((alert) => (
-        <p class="callout warn" key={alert.agent + alert.code + alert.detail}>
-          <strong>{texts.alert[alert.code] ?? alert.code}</strong> <Name text={alert.agent} /> <Strange text={alert.detail} />
-        </p>
-      ))}
-      <Table label={texts.robotsTitle} head={[texts.healthTitle, texts.role, texts.account, texts.jobs, texts.record, texts.earned, texts.uptime, ""]} numbers={[5, 6]} empty={texts.nobodyPresent}>
-        {props.agents.map((agent) => (
-          <tr key={agent.address + agent.role} class={agent === chosen ? "chosen" : ""}>
-            <td><span class={`dot ${agent.health === "alive" ? "good" : agent.health === "degraded" ? "warn" : "bad"}`} aria-hidden="true" /> {texts.health[agent.health]}</td>
-            <td data-role={agent.role}><Strange text={agent.role} most={40} /></td>
-            <td><Name text={agent.address} href={`#/account/${agent.address}`} /></td>
-            <td><Phases jobs={agent.status?.work?.jobs ?? agent.status?.validation?.cases} /></td>
-            <td>{texts.recordShort(agent.record.done, agent.record.failed)}</td>
-            <td class="right"><Money units={agent.record.earned} token={market.token} /></td>
-            <td class="right">{agent.status?.uptime ? duration(agent.status.uptime) : ""}</td>
-            <td>
-              <button type="button" class="button small quietly" aria-expanded={agent === chosen} onClick={() => setOpen(agent === chosen ? "" : agent.address + agent.role)}>{texts.details}</button>
-            </td>
-          </tr>
-        ))}
-      </Table>
-      {props.unlisted ? <p class="hint">{texts.unlisted(props.unlisted)}</p> : null}
-      {chosen ? <AgentDetails key={open} agent={chosen} /> : null}
-    </>
-  );
+/** What a robot is called here. */
+export function nameOf(robot: Agent): string {
+  return plain(robot.profile?.name ?? "", 80) || `${texts.robot} ${robot.address.slice(0, 6)}…${robot.address.slice(-4)}`;
 }
 
-function Phases(props: { jobs?: Record<string, number> }) {
-  const busy = Object.entries(props.jobs ?? {}).filter(([, count]) => count > 0);
-  return <span class="inline">{busy.map(([phase, count]) => <Badge key={phase} kind="calm">{texts.phase[phase] ?? phase} {count}</Badge>)}</span>;
+function matches(robot: Agent, search: string): boolean {
+  const { name = "", about = "", place = "" } = robot.profile ?? {};
+  const text = `${name} ${about} ${place} ${robot.address}`.toLowerCase();
+  return search.toLowerCase().split(/\s+/).every((word) => text.includes(word));
 }
 
-function AgentDetails({ agent }: { agent: Agent }) {
-  const { market } = useApp();
-  const { status } = agent;
-  const jobs = useData<{ liabilities: Liability[] }>(`liabilities?party=${agent.address}&limit=20`);
-  const account = useData<AccountState>(`accounts/${agent.address}`);
-  useTopic("chain", () => { jobs.reload(); account.reload(); });
+export function ModelChip(props: { cid: string; chosen: boolean; choose: (cid: string) => void }) {
+  const model = useModel(props.cid);
+  return <button type="button" class="chip" aria-pressed={props.chosen} onClick={() => props.choose(props.cid)}><Strange text={model?.description?.title ?? texts.undescribed} most={40} /></button>;
+}
+
+function RobotCard({ robot }: { robot: Agent }) {
+  const { profile, record } = robot;
+  const cid = robot.models[0] ?? "";
+  const description = useModel(cid)?.description;
+  const page = `#/robot/${robot.address}`;
+  const price = priceOf(robot, description?.price);
   return (
-    <section class="panel">
-      <h2><Strange text={agent.role} most={40} /> <Name text={agent.address} /></h2>
-      <div class="columns three">
-        <div>
-          <h3>{texts.parts}</h3>
-          <Facts of={Object.entries(status?.parts ?? {}).map(([part, state]) => [part, <Badge kind={state === "alive" ? "good" : state === "off" ? "calm" : "warn"}><Strange text={state} /></Badge>])} />
-        </div>
-        <div>
-          <h3>{texts.numbers}</h3>
-          <Facts
-            of={[
-              [texts.version, status?.version ? <Strange text={status.version} most={40} /> : ""],
-              [texts.lastBlock, status?.head ?? ""],
-              [texts.outbox, status?.work?.outbox ?? ""],
-              [texts.store, status?.work ? texts.filesOf(status.work.store.files, size(status.work.store.bytes)) : ""],
-              [texts.bookOrders, status?.market?.openOrders ?? ""],
-              [texts.contractsMade, status?.market ? `${status.market.created} / ${status.market.finalized}` : ""],
-              [texts.judgesFor, status?.validation ? <span class="inline">{status.validation.validators.slice(0, 4).map((one) => <Name key={one} text={one} />)}</span> : ""],
-              [texts.judgesBy, status?.validation ? <Strange text={status.validation.policies.join(", ")} /> : ""],
-              [texts.itsFee, status?.validation ? amount(BigInt(status.validation.fee), market.xrt) : ""],
-              ...Object.entries(status?.dropped ?? {}).map(([reason, count]) => [texts.dropped(reason), count] as [string, number]),
-            ]}
-          />
-        </div>
-        <div>
-          <h3>{texts.money}</h3>
-          <Show of={account}>
-            {({ record, spent, token, eth }) => (
-              <Facts
-                of={[
-                  [texts.earned, <Money units={record.earned} token={market.token} />],
-                  [texts.spent, <Money units={spent} token={market.token} />],
-                  [texts.balance, <Money units={token.balance} token={market.token} />],
-                  [texts.gas, ether(eth)],
-                  [texts.gasSpent, status?.market ? ether(status.market.spent) : ""],
-                  [texts.feesAndMinted, status?.market ? `${amount(status.market.fees, market.xrt)} + ${amount(status.market.minted, market.xrt)}` : ""],
-                ]}
-              />
-            )}
-          </Show>
+    <article class="robot">
+      <a class="face" href={page} tabIndex={-1} aria-hidden="true"><Picture address={robot.address} cid={profile?.picture} size="large" /></a>
+      <div class="inside">
+        <h2><a href={page}>{nameOf(robot)}</a></h2>
+        <p class="does"><Strange text={description?.title ?? texts.undescribed} most={80} /></p>
+        <p class="about"><Strange text={profile?.about || description?.description || ""} most={160} /></p>
+        <p class="inline"><Doing robot={robot} />{profile?.place ? <Badge kind="calm"><Strange text={profile.place} most={40} /></Badge> : null}</p>
+        <Readings of={profile?.readings ?? {}} />
+        <div class="row between foot">
+          <span><strong class="price-tag">{price || texts.asksPrice}</strong><span class="quiet record">{record.done + record.failed ? texts.recordShort(record.done, record.failed) : texts.noRecord}</span></span>
+          {cid ? <a class="button" href={`#/order/model/${cid}/${robot.address}`} aria-label={texts.orderFrom(nameOf(robot))}>{texts.order}</a> : null}
         </div>
       </div>
-      {agent.offers.length ? (
-        <>
-          <h3>{texts.offers}</h3>
-          <Table label={texts.offers} head={[texts.offer, texts.price, texts.model, texts.objective]} numbers={[1]}>
-            {agent.offers.map((offer) => (
-              <tr key={offer.hash}>
-                <td><Name text={offer.hash} href={`#/order/${offer.hash}`} /></td>
-                <td class="right">{amount(offer.cost, market.token)}</td>
-                <td><Name text={offer.model} href={`#/order/model/${offer.model}`} /></td>
-                <td><Name text={offer.objective} href={`#/file/${offer.objective}`} /></td>
-              </tr>
-            ))}
-          </Table>
-        </>
-      ) : null}
-      <h3>{texts.jobs}</h3>
-      <Show of={jobs}>{({ liabilities }) => <JobTable liabilities={liabilities} />}</Show>
-      <Log address={agent.address} />
-      {market.role === "operator" ? <OperateByAddress robot={agent.address} /> : <OperatorLogin />}
-    </section>
+    </article>
   );
 }
 
-const LEVELS = ["debug", "info", "warning", "error"];
+/** What a job of a robot usually costs, as it says; empty if it does not. */
+export function priceOf(robot: Agent, described: string | undefined): string {
+  return plain(robot.profile?.price || described || "", 40);
+}
 
-/** The latest events of a log, newest first; read again while they are shown. */
-function Log(props: { address: Address }) {
-  const [open, setOpen] = useState(false);
-  const [level, setLevel] = useState("info");
-  const log = useData<{ events: LogEvent[]; answered: boolean }>(open ? `agents/${props.address}/logs${query({ level, lines: 200 })}` : null);
-  useEffect(() => {
-    if (!open) return;
-    const timer = setInterval(log.reload, 3000);
-    return () => clearInterval(timer);
-  }, [open]);
+/** What a robot is doing, and how long a new job would wait. */
+export function Doing({ robot }: { robot: Agent }) {
+  const { profile, health } = robot;
+  if (health === "silent") return <Badge kind="warn">{texts.health.silent}</Badge>;
+  if (!profile) return <Badge kind="calm">{texts.doing.present}</Badge>;
+  const kinds = { idle: "good", working: "calm", stopped: "bad", closed: "warn" } as const;
   return (
-    <details class="more" id="log" open={open} onToggle={(event) => setOpen(event.currentTarget.open)}>
-      <summary>{texts.log}</summary>
-      <Field label={texts.level}>
-        {(id) => (
-          <select id={id} value={level} onChange={(event) => setLevel(event.currentTarget.value)}>
-            {LEVELS.map((one) => <option key={one} value={one}>{one}</option>)}
-          </select>
-        )}
-      </Field>
-      <Show of={log}>
-        {({ events, answered }) => (
-          <Table label={texts.log} head={[texts.time, texts.level, texts.what, texts.message]} empty={answered ? texts.noEvents : texts.noLog}>
-            {[...events].reverse().map((event) => (
-              <tr key={`${event.time}${event.sequence}`}>
-                <td class="number">{clock(Date.parse(event.time) / 1000)}</td>
-                <td><Badge kind={event.level === "error" || event.level === "critical" ? "bad" : event.level === "warning" ? "warn" : "calm"}>{event.level}</Badge></td>
-                <td><code><Strange text={event.event ?? ""} most={60} /></code></td>
-                <td><Strange text={event.message} /> {event.liability ? <Name text={event.liability} href={`#/job/${event.liability}`} /> : null}</td>
-              </tr>
-            ))}
-          </Table>
-        )}
-      </Show>
-    </details>
+    <>
+      <Badge kind={kinds[profile.state]}>{texts.doing[profile.state]}</Badge>
+      {profile.queue ? <Badge kind="calm">{texts.waiting(profile.queue)}</Badge> : null}
+      {profile.wait ? <Badge kind="calm">{texts.beginsIn(duration(profile.wait))}</Badge> : null}
+    </>
   );
 }
 
-/** Buttons that start, finish or restart a job; only for operators. */
-export function Operate(props: { robot: Address; job: string }) {
-  const { market, notify } = useApp();
-  if (market.role !== "operator") return null;
-  const act = (action: string) => async () => {
-    const { success, msg } = await post<{ success?: boolean; msg?: string }>(`agents/${props.robot}/${action}`, { liability: props.job });
-    if (success === false) notify(texts.notDone(action, msg ?? ""), "bad");
-    else notify(texts.sent(action));
-  };
+/** The latest readings of a robot, in its own words. */
+function Readings({ of }: { of: Record<string, string> }) {
+  const readings = Object.entries(of);
+  if (!readings.length) return null;
   return (
-    <p class="row operate">
-      {["start", "finish", "restart"].map((action) => (
-        <Action key={action} id={action} class="button small quietly" disabled={!props.job} run={act(action)}>{texts.action[action]}</Action>
-      ))}
-    </p>
+    <dl class="glance">
+      {readings.slice(0, 4).map(([topic, text]) => <div key={topic}><dt><Strange text={words(topic)} most={30} /></dt><dd><Strange text={text} most={40} /></dd></div>)}
+    </dl>
   );
 }
 
-function OperateByAddress(props: { robot: Address }) {
-  const [job, setJob] = useState("");
-  return (
-    <div class="row end">
-      <Field label={texts.jobAddress}>
-        {(id) => <input id={id} class="wide" spellcheck={false} value={job} onInput={(event) => setJob(event.currentTarget.value.trim())} />}
-      </Field>
-      <Operate robot={props.robot} job={job} />
-    </div>
-  );
+/** A topic as people say it: `/arm/battery_level` is the battery level. */
+export function words(topic: string): string {
+  const last = topic.split("/").filter(Boolean).at(-1) ?? topic;
+  return last.replace(/_/g, " ");
 }
 
-function OperatorLogin() {
-  const { reloadMarket } = useApp();
+/** For whoever has the CID of a model that nobody here names. */
+function ByModel() {
+  const [cid, setCid] = useState("");
+  const go = useMemo(() => (event: Event) => { event.preventDefault(); location.hash = `#/order/model/${cid}`; }, [cid]);
   return (
     <details class="more">
-      <summary>{texts.operatorsOnly}</summary>
-      <LoginForm label={texts.operatorToken} done={reloadMarket} />
+      <summary>{texts.otherModel}</summary>
+      <form class="row end" onSubmit={go}>
+        <Field label={texts.modelCid} error={cid && !isCid(cid) ? texts.notACid : ""} hint={texts.modelCidHint}>
+          {(id, described) => <input id={id} aria-describedby={described} class="wide" value={cid} spellcheck={false} onInput={(event) => setCid(event.currentTarget.value.trim())} />}
+        </Field>
+        <button class="button" disabled={!isCid(cid)}>{texts.goOn}</button>
+      </form>
     </details>
   );
 }
