@@ -19,6 +19,8 @@ export type { Sample } from "./tracks";
 
 /** Milliseconds between two renderings of what is live; plots are drawn in each frame. */
 const REFRESH = 125;
+/** Milliseconds between two times of a recording that plays. */
+const REPLAY = 45;
 /** Seconds that are in view while more comes. */
 const WINDOW = 60;
 const LINES = 40;
@@ -26,7 +28,7 @@ const LINES = 40;
 /** The topics of samples, each as what it is: numbers as plots, positions as a path, pictures, and texts as lines. */
 export function Topics(props: { samples: Sample[]; model: Description | null; until?: number; live?: boolean }) {
   const gathered = useMemo(() => gather(props.samples), [props.samples]);
-  return <Tracks gathered={gathered} model={props.model} frame={frameOf(gathered, { until: props.until })} live={props.live} />;
+  return <Tracks gathered={gathered} model={props.model} frame={frameOf(gathered, { until: props.until, live: props.live })} />;
 }
 
 /** What comes while a job runs, from its beginning. */
@@ -92,34 +94,63 @@ function Following<T>(props: { path: string; topic: string; model: Description |
           {[false, true].map((all) => <button key={String(all)} type="button" aria-pressed={whole === all} onClick={() => setWhole(all)}>{all ? texts.wholeTime : texts.lastMinute}</button>)}
         </div>
       ) : null}
-      <Tracks gathered={gathered} model={props.model} frame={frameOf(gathered, { clock: props.clock, live: true, window: whole ? Infinity : WINDOW })} live />
+      <Tracks gathered={gathered} model={props.model} frame={frameOf(gathered, { clock: props.clock, live: true, window: whole ? Infinity : WINDOW })} />
     </>
   );
 }
 
 /** What plots of `gathered` show: all of it, or the last `window` seconds; at first there is room for what comes. */
-function frameOf(gathered: Gathered, more: { until?: number; seek?: (at: number) => void; clock?: boolean; live?: boolean; window?: number }): Frame {
-  const from = () => Math.max(gathered.from, gathered.to - (more.window ?? Infinity));
-  return {
-    from,
-    to: () => (more.live ? Math.max(gathered.to, from() + 8) : gathered.to),
-    clock: more.clock ?? false,
-    news: more.live ? () => gathered.count : null,
-    until: more.until,
-    seek: more.seek,
-  };
+function frameOf(gathered: Gathered, { until, clock = false, live = false, window = Infinity }: { until?: number; clock?: boolean; live?: boolean; window?: number }): Frame {
+  const from = () => Math.max(gathered.from, gathered.to - window);
+  const to = () => (live ? Math.max(gathered.to, from() + 8) : gathered.to);
+  return { from, to, clock, until, news: () => `${gathered.count} ${from()} ${until}` };
 }
 
-function Tracks(props: { gathered: Gathered; model: Description | null; frame: Frame; live?: boolean }) {
+/** Panels in columns. A panel stays in its column, so that what is live never jumps; a new one goes where there is most room. */
+function Tracks(props: { gathered: Gathered; model: Description | null; frame: Frame }) {
+  const box = useRef<HTMLDivElement>(null);
+  const [count, setCount] = useState(0);
+  const placed = useRef<{ of: Map<string, number>; heights: number[] }>({ of: new Map(), heights: [] });
+  useEffect(() => {
+    const resized = new ResizeObserver(([{ contentRect }]) => setCount(Math.max(1, Math.floor(contentRect.width / NARROWEST))));
+    resized.observe(box.current!);
+    return () => resized.disconnect();
+  }, []);
+  if (placed.current.heights.length !== count) placed.current = { of: new Map(), heights: new Array(count).fill(0) };
+  const columns: Track[][] = Array.from({ length: count }, () => []);
+  const { of, heights } = placed.current;
+  for (const track of count ? inOrder(props.gathered.tracks, props.model) : []) {
+    const key = `${track.role} ${track.topic}`;
+    let column = of.get(key);
+    if (column === undefined) {
+      of.set(key, (column = heights.indexOf(Math.min(...heights))));
+      heights[column] += heightOf(track, props.model);
+    }
+    columns[column].push(track);
+  }
   return (
-    <div class="tracks">
-      {inOrder(props.gathered.tracks, props.model).map((track) => <Panel key={`${track.role} ${track.topic}`} track={track} model={props.model} frame={props.frame} live={props.live} />)}
+    <div class="tracks" ref={box}>
+      {columns.map((tracks, place) => (
+        <div key={place}>
+          {tracks.map((track) => <Panel key={`${track.role} ${track.topic}`} track={track} model={props.model} frame={props.frame} />)}
+        </div>
+      ))}
     </div>
   );
 }
 
+/** Pixels of a column, at least. */
+const NARROWEST = 340;
+
+/** About the height of a panel, in the heights of a plot. */
+function heightOf(track: Track, model: Description | null): number {
+  const { plots, position } = viewOf(track, model);
+  const parts = plots.length + (position ? 1.5 : 0) + (track.pictures.length ? 1.5 : 0);
+  return (parts || 1.2) + 0.4;
+}
+
 /** One topic. */
-function Panel(props: { track: Track; model: Description | null; frame: Frame; live?: boolean }) {
+function Panel(props: { track: Track; model: Description | null; frame: Frame }) {
   const { track, model, frame } = props;
   const view = viewOf(track, model);
   const described = topicOf(model, track);
@@ -246,7 +277,7 @@ function Player(props: { cid: string; summary: Summary; model: Description | nul
     let next = 0;
     const step = (time: number) => {
       next = requestAnimationFrame(step);
-      if (calm && time - last < 500) return;
+      if (time - last < (calm ? 500 : REPLAY)) return;
       const passed = (Math.max(0, time - last) / 1000) * speed;
       last = time;
       setAt((known) => Math.min(end, (known ?? end) + passed));
@@ -295,7 +326,7 @@ function Player(props: { cid: string; summary: Summary; model: Description | nul
           </select>
         </div>
       ) : null}
-      <Tracks gathered={gathered} model={props.model} frame={{ ...frameOf(gathered, { until: at ?? undefined, seek }), from: () => 0, to: () => Math.max(end, 1e-3) }} />
+      <Tracks gathered={gathered} model={props.model} frame={{ ...frameOf(gathered, { until: at ?? undefined }), from: () => 0, to: () => Math.max(end, 1e-3), seek }} />
       {left > 0 ? <p class="hint">{texts.moreTopics(left)}</p> : null}
     </>
   );

@@ -11,14 +11,14 @@ import type { Position, Series, Track } from "./tracks";
 const SERIES = 8;
 const HEIGHT = 144;
 
-/** The times in view, and how they are drawn. `draws` tells whether there is something new since the last frame. */
+/** The times in view, and how they are drawn. */
 export interface Frame {
   from: () => number;
   to: () => number;
   /** Times are clock times, in Unix seconds. */
   clock: boolean;
-  /** What changes when there is something new to draw; without it, only a new rendering draws. */
-  news: (() => unknown) | null;
+  /** What is another text when there is something new to draw. */
+  news: () => string;
   until?: number;
   seek?: (at: number) => void;
 }
@@ -47,31 +47,52 @@ function useScheme(): boolean {
   return dark;
 }
 
-/** Calls `draw` in each frame in which there is news, while the element is on the screen. */
-function useFrames(box: { current: HTMLElement | null }, news: Frame["news"], draw: () => void): void {
+/** Milliseconds of a frame in which drawings may begin; the others wait for the next one. */
+const BUDGET = 4;
+
+/** Drawings that are on the screen: each frame makes as many of those with news as it has time for, in turn. */
+const drawings: { news: () => string; draw: () => void; seen: string }[] = [];
+let planned = 0;
+
+function drawNext(): void {
+  planned = requestAnimationFrame(drawNext);
+  const end = performance.now() + BUDGET;
+  for (let left = drawings.length; left > 0 && performance.now() < end; left--) {
+    const first = drawings.shift()!;
+    drawings.push(first);
+    const now = first.news();
+    if (now === first.seen) continue;
+    first.seen = now;
+    first.draw();
+  }
+}
+
+/** Calls `draw` when there is news, while the element is on the screen. */
+function useDrawing(box: { current: HTMLElement | null }, news: Frame["news"], draw: () => void, isThere: boolean): void {
   const latest = useRef({ news, draw });
   latest.current = { news, draw };
-  const live = news !== null;
   useEffect(() => {
-    if (!live || !box.current) return;
-    let seen: unknown;
-    let inView = true;
-    let next = 0;
-    const watch = new IntersectionObserver(([entry]) => (inView = entry.isIntersecting));
+    if (!isThere || !box.current) return;
+    const drawing = { news: () => latest.current.news(), draw: () => latest.current.draw(), seen: "" };
+    const leave = () => {
+      const place = drawings.indexOf(drawing);
+      if (place >= 0) drawings.splice(place, 1);
+      if (drawings.length || !planned) return;
+      cancelAnimationFrame(planned);
+      planned = 0;
+    };
+    const watch = new IntersectionObserver((entries) => {
+      leave();
+      if (!entries.at(-1)!.isIntersecting) return;
+      drawings.push(drawing);
+      if (!planned) planned = requestAnimationFrame(drawNext);
+    });
     watch.observe(box.current);
-    const frame = () => {
-      next = requestAnimationFrame(frame);
-      const now = latest.current.news?.();
-      if (!inView || now === seen) return;
-      seen = now;
-      latest.current.draw();
-    };
-    frame();
     return () => {
-      cancelAnimationFrame(next);
       watch.disconnect();
+      leave();
     };
-  }, [live]);
+  }, [isThere]);
 }
 
 /** Numbers of one unit over time, and what they are at the time that is pointed at. */
@@ -115,9 +136,8 @@ export function Plot(props: { track: Track; series: Series[]; title: string; fra
       plot.current = null;
     };
   }, [isLine, names, dark, frame.clock]);
-  useEffect(draw);
   useEffect(() => series.forEach((one, place) => plot.current?.setSeries(place + 1, { show: !hidden.includes(one.name) })), [hidden, dark]);
-  useFrames(box, frame.news, draw);
+  useDrawing(box, frame.news, draw, isLine);
 
   const until = frame.until === undefined ? track.at.length - 1 : placeAt(track.at, frame.until);
   return (
@@ -215,20 +235,25 @@ export function Path(props: { track: Track; position: Position; label: string; f
   const box = useRef<HTMLCanvasElement>(null);
   const dark = useScheme();
   const colors = useRef<ReturnType<typeof plotColors> | null>(null);
+  const measured = useRef({ width: 0, height: 0 });
   const draw = () => {
-    if (box.current?.clientWidth && colors.current) drawPath(box.current, colors.current, track, position, frame.until);
+    if (box.current && measured.current.width && colors.current) drawPath(box.current, measured.current, colors.current, track, position, frame.until);
   };
+  const redraw = useRef(draw);
+  redraw.current = draw;
   useEffect(() => {
     colors.current = plotColors(box.current!.parentElement!);
     draw();
   }, [dark]);
   useEffect(() => {
-    const resized = new ResizeObserver(() => draw());
+    const resized = new ResizeObserver(([{ contentRect: { width, height } }]) => {
+      measured.current = { width, height };
+      redraw.current();
+    });
     resized.observe(box.current!);
     return () => resized.disconnect();
   }, []);
-  useEffect(draw);
-  useFrames(box, frame.news, draw);
+  useDrawing(box, frame.news, draw, true);
   const place = frame.until === undefined ? track.at.length - 1 : placeAt(track.at, frame.until);
   const [x, y] = [numberAt(columnOf(track, position.x), place), numberAt(columnOf(track, position.y), place)];
   return (
@@ -239,8 +264,7 @@ export function Path(props: { track: Track; position: Position; label: string; f
   );
 }
 
-function drawPath(canvas: HTMLCanvasElement, colors: ReturnType<typeof plotColors>, track: Track, position: Position, until?: number): void {
-  const { clientWidth: width, clientHeight: height } = canvas;
+function drawPath(canvas: HTMLCanvasElement, { width, height }: { width: number; height: number }, colors: ReturnType<typeof plotColors>, track: Track, position: Position, until?: number): void {
   const ratio = devicePixelRatio;
   if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
   if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
