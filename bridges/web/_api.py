@@ -28,6 +28,7 @@ from bridges.web._jobs import Views
 from bridges.web._live import Live
 from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms, liability_json
 from bridges.web._robots import Quotes
+from bridges.web._stops import Stops
 from bridges.web._stream import Stream
 from bridges.web.access import (
     FOREVER,
@@ -56,6 +57,7 @@ from schemas.decoding import InvalidData, decode_json
 from schemas.keys import RpcKey
 from schemas.records import ControlRobot
 from schemas.rpc import FinishLiability, LiabilityRequest, Nothing
+from schemas.signing import StopRequest
 from schemas.status import LEVELS
 
 if TYPE_CHECKING:
@@ -146,6 +148,13 @@ class LocalRefund(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     liability: str
 
 
+class LocalStop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The job that the local account stops, and why, for people."""
+
+    liability: str
+    why: str = ""
+
+
 class AgentAction(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The job that an operator starts, finishes or restarts."""
 
@@ -174,6 +183,7 @@ class Api(Lifecycle):
         self._views = Views(components, self._market, self.files)
         self._publisher = OrderPublisher(components, self._market)
         self._live = Live(components, self._market, self.stream)
+        self._stops = Stops(components, self._market)
         self._quotes = Quotes(components, self._market.labels)
         self._facts: dict[str, Any] = {}
         self._facts_at = float("-inf")
@@ -202,6 +212,8 @@ class Api(Lifecycle):
             post("/api/v1/local/orders", self.local_order),
             post("/api/v1/local/withdrawals", self.local_withdrawal),
             post("/api/v1/local/refunds", self.local_refund),
+            post("/api/v1/local/stops", self.local_stop),
+            post("/api/v1/stops", self.stop),
             get("/api/v1/models/{cid}", self.model),
             post("/api/v1/objectives", self.upload),
             post("/api/v1/objectives/form", self.form),
@@ -348,6 +360,13 @@ class Api(Lifecycle):
         address = parse_address((await body_of(request, LocalRefund)).liability)
         await self._publisher.refund(address)
         return answer({"liability": address})
+
+    async def local_stop(self, request: web.Request) -> web.Response:
+        wanted = await body_of(request, LocalStop)
+        return answer(await self._stops.stop(parse_address(wanted.liability), wanted.why))
+
+    async def stop(self, request: web.Request) -> web.Response:
+        return answer(await self._stops.send(StopRequest.decode(await request.read())))
 
     async def model(self, request: web.Request) -> web.Response:
         return answer(await self.files.model(cid_in(request)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,7 +12,8 @@ import msgspec
 from bridges.web._market import liability_json, result_json
 from bridges.web._robots import profile_json
 from mesh.agent.contracts import refusal
-from mesh.agent.jobs import read_reason
+from mesh.agent.jobs import ROBOT_STOPPED, STOPPED, read_reason
+from mesh.base.flood import BoundedDict
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
 from mesh.telemetry.metrics import is_healthy
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from bridges.web._market import Market, SeenJob, SeenOrder
     from bridges.web.components import WebComponents
     from mesh.watching import RoleStatus
+    from schemas import Liability
 
 
 LONGEST: Final = 200
@@ -102,6 +105,7 @@ class Views:
         self._parts = components
         self._market = market
         self._files = files
+        self._on_stops: BoundedDict[str, tuple[str, float]] = BoundedDict(1024)  # models whose `onStop` is known
         self._asking = asyncio.Lock()
         self._agents: dict[str, Any] | None = None
         self._agents_at = float("-inf")
@@ -116,6 +120,8 @@ class Views:
         for step in job.steps:
             if step["at"] is None and step["block"] is not None:
                 step["at"] = await self._market.time_of(step["block"])
+        reason = await self._reason(job)
+        order = self._market.order(job.demand)
         return {
             "liability": liability_json(liability, self._market.labels),
             "phase": "finalized" if liability.is_finalized else job.phase,
@@ -127,8 +133,23 @@ class Views:
             "timeline": timeline_of(job.steps),
             "resultMessage": None if result is None else result_json(result),
             "present": bool(await self._parts.channel.present("agent", liability.promisor)),
-            "reason": await self._reason(job),
+            "reason": reason,
+            "onStop": await self._on_stop(liability.model),
+            "stopped": job.stopped or _stopped_in(reason, liability),
+            "private": order is not None and bool(order.robot),
         }
+
+    async def _on_stop(self, model: str) -> str:
+        """What becomes of the cost of a stopped job, by its model's description: `refund`, `paid`, or empty."""
+        known, until = self._on_stops.get(model, ("", 0.0))
+        if time.monotonic() < until:
+            return known
+        known, kept = "", 60.0  # seconds after which a description that was not available is asked for again
+        with suppress(AiraError):
+            description = (await self._files.model(model))["description"]
+            known, kept = ("" if description is None else description.get("onStop", "refund")), float("inf")
+        self._on_stops[model] = known, time.monotonic() + kept
+        return known
 
     async def _refundable_from(self, job: SeenJob) -> int | None:
         if job.liability.is_finalized:
@@ -288,6 +309,14 @@ class Views:
         for job in self._market.jobs.values():
             found.setdefault(job.liability.promisor, set()).add(job.liability.model)
         return found
+
+
+def _stopped_in(reason: dict[str, str] | None, liability: Liability) -> dict[str, str] | None:
+    """Who has stopped a job that failed, and why, by its recording."""
+    parties = {STOPPED: liability.promisee, ROBOT_STOPPED: liability.promisor}
+    if reason is None or reason["code"] not in parties:
+        return None
+    return {"by": parties[reason["code"]], "why": reason["text"].partition(": ")[2]}
 
 
 def _own_model(status: RoleStatus | None) -> set[str]:

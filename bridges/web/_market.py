@@ -149,6 +149,8 @@ class SeenJob:
     phase: str = "incoming"
     reports: dict[str, ValidatorReport] = field(default_factory=dict)
     """How jurors of its validator have judged, by juror."""
+    stopped: dict[str, str] | None = None
+    """Who has stopped it through this server (`by`), and `why`."""
 
     @property
     def orders(self) -> tuple[tuple[str, str], tuple[str, str]]:

@@ -648,11 +648,16 @@ async def request_stop(
     check_stop(why, code)
     fields: dict[str, Any] = {"liability": liability.address, "why": why, "code": code or "", "time": int(time.time())}
     request = StopRequest(by=signer.address, **fields)
-    signed, until = request.signed_by(signer), time.monotonic() + STOP_SECONDS
+    return await send_stop(session, liability.promisor, request.signed_by(signer))
+
+
+async def send_stop(session: zenoh.Session, robot: str, request: StopRequest) -> Stopped:
+    """Send a signed request to the robot (address) until it answers. Raises `ServiceFailed` as `Contract.stop`."""
+    until = time.monotonic() + STOP_SECONDS
     while True:
         left = max(until - time.monotonic(), 0.1)
         try:
-            stopped: Stopped = await call(session, liability.promisor, "stop", signed, timeout=left)
+            stopped: Stopped = await call(session, robot, "stop", request, timeout=left)
         except ServiceFailed as error:
             if error.reason == "agent-error" or left <= STOP_AGAIN:
                 raise
