@@ -268,6 +268,8 @@ QUOTA_RETRY: Final = RetryPolicy(initial=0.1, ceiling=8.0)
 
 QUOTA_PATIENCE: Final = 60.0
 """Seconds for which a request is asked again of nodes that are over their quota, or as long as they ask to wait."""
+QUOTA_SILENCE: Final = 2.0
+"""Seconds of such a wait after which it is logged, once until a node answers."""
 LONGEST_WAIT: Final = 30.0
 """Seconds between two such requests, whatever the nodes ask for."""
 
@@ -363,6 +365,8 @@ class RpcClient:
         self._metrics = metrics
         self._expected: int | RpcFailure | None = None
         self._is_open = False
+        self._is_over_quota = False
+        """Whether it was logged that all nodes are over their quotas."""
         self._on_head: Callable[[BlockHeader | None], None] | None = None
 
     def open(self) -> None:
@@ -430,7 +434,7 @@ class RpcClient:
         if not self._is_open:
             raise ClosedError("the connection to the node is not open: use it with `async with`")
         backoff, quota = Backoff(self._timing.request_retry), Backoff(QUOTA_RETRY)
-        patient_until = asyncio.get_running_loop().time() + QUOTA_PATIENCE
+        began = asyncio.get_running_loop().time()
         while True:
             may_pass = False
             waits: list[float] = []
@@ -438,6 +442,7 @@ class RpcClient:
                 try:
                     answered = await self._ask(upstream, method, params, kind)
                     self._metrics.count(answered=True)
+                    self._is_over_quota = False
                     return answered
                 except AiraError:
                     raise
@@ -454,9 +459,15 @@ class RpcClient:
                         break  # it may have arrived
             log.debug("%s failed (%s)", method, reason)
             is_sent = method == SEND and not isinstance(failure, OverQuota)
-            if waits and not is_sent and asyncio.get_running_loop().time() < patient_until:
+            waited = asyncio.get_running_loop().time() - began
+            if waits and not is_sent and waited < QUOTA_PATIENCE:
                 # The nodes are there and say when to come back, so this does not count as an attempt.
-                await asyncio.sleep(min(max(min(waits), quota.next_delay() or 0.0), LONGEST_WAIT))
+                wait = min(max(min(waits), quota.next_delay() or 0.0), LONGEST_WAIT)
+                if waited + wait > QUOTA_SILENCE and not self._is_over_quota:
+                    self._is_over_quota = True
+                    facts = log_event("node-over-quota", node=self.endpoint, reason=reason)
+                    log.warning("the node %s is %s; asking again", self.endpoint, reason, extra=facts)
+                await asyncio.sleep(wait)
             elif is_sent or not may_pass or not await backoff.wait():
                 break
         self._metrics.count(answered=False)

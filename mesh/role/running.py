@@ -40,6 +40,8 @@ WAKE_INTERVAL: Final = 0.1
 
 def run_to_end(main: Callable[[], Coroutine[Any, Any, object]], *, interrupted: int = INTERRUPTED) -> None:
     """Run a command; Ctrl-C and SIGTERM end it with the exit code `interrupted`, errors with 1 or 2."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_WarningFormatter())
     if not _run(main):
         sys.exit(interrupted)
 
@@ -58,6 +60,15 @@ def run_until_stopped(
     else:
         configure_logging_from(settings, role)
     _run(main)
+
+
+class _WarningFormatter(logging.Formatter):
+    """Warnings of a command that keeps no log, which Python writes to stderr: as logged, without time and level."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        from mesh.telemetry.logs import event_of, text_lines
+
+        return text_lines(event_of(record))
 
 
 def fail(error: AiraError) -> NoReturn:

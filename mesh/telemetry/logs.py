@@ -93,8 +93,13 @@ def json_line(event: LogEvent) -> str:
 def human_line(event: LogEvent) -> str:
     """The event for people: local time, level, liability, message; below it the traceback of an error."""
     about = f"{event.liability}: " if event.liability else ""
-    line = printable(f"{_local_time(event.time)} {event.level.upper():<7} {about}{event.message}")
-    return "\n".join([line, *(MARGIN + printable(part.rstrip()) for part in event.trace.splitlines())])
+    return f"{_local_time(event.time)} {event.level.upper():<7} {printable(about)}{text_lines(event)}"
+
+
+def text_lines(event: LogEvent) -> str:
+    """The message alone, and below it the traceback of an error."""
+    lines = [printable(event.message), *(MARGIN + printable(part.rstrip()) for part in event.trace.splitlines())]
+    return "\n".join(lines)
 
 
 def printable(text: str) -> str:

@@ -19,7 +19,7 @@ from mesh.dev import EmbeddedChain
 from mesh.dev._rpc import JsonRpcServer
 from tests.mesh.chain.conftest import QUICK
 from tests.support.node_providers import PROVIDERS, Provider, ProviderServer, error, rows
-from tests.support.ports import free_port
+from tests.support.serving import serving
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -111,16 +111,8 @@ async def test_the_wait_that_a_node_asks_for_is_kept() -> None:
             return web.Response(status=429, headers={"Retry-After": "1"})
         return web.json_response({"jsonrpc": "2.0", "id": (await request.json())["id"], "result": "0x7"})
 
-    app = web.Application()
-    app.router.add_post("/", busy)
-    runner, port = web.AppRunner(app), free_port()
-    await runner.setup()
-    await web.TCPSite(runner, "127.0.0.1", port).start()
-    try:
-        async with Node(f"http://127.0.0.1:{port}", timing=QUICK) as node:
-            assert node.chain_id == 7
-    finally:
-        await runner.cleanup()
+    async with serving(busy) as url, Node(url, timing=QUICK) as node:
+        assert node.chain_id == 7
     assert asked[1] - asked[0] >= 1
 
 
@@ -150,8 +142,11 @@ def test_the_secret_parts_of_an_address_are_known() -> None:
     assert secrets_in("http://127.0.0.1:8545") == ()
 
 
-async def test_nodes_that_stay_over_their_quota_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mesh.chain.rpc.QUOTA_PATIENCE", 0.3)
+async def test_nodes_that_stay_over_their_quota_are_named(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("mesh.chain.rpc.QUOTA_PATIENCE", 0.8)
+    monkeypatch.setattr("mesh.chain.rpc.QUOTA_SILENCE", 0.2)
 
     class Full:
         async def make_request(self, method: str, params: Any) -> Any:
@@ -161,6 +156,9 @@ async def test_nodes_that_stay_over_their_quota_are_named(monkeypatch: pytest.Mo
         async with Node(Full(), timing=QUICK):
             pass
     assert "over its quota: daily request count exceeded" in failed.value.why
+    assert [record.__dict__["event"] for record in caplog.records if record.levelname == "WARNING"] == [
+        "node-over-quota"
+    ]
 
 
 @pytest.mark.parametrize(

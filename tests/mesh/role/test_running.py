@@ -40,6 +40,10 @@ async def clean_up_while_another_thread_gets_the_signals():
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     await clean_up_slowly()
 
+async def warn(text):
+    import logging
+    logging.getLogger("mesh.chain.rpc").warning("%s", text)
+
 async def fail(error):
     raise error
 
@@ -127,6 +131,12 @@ def test_an_error_without_hint_is_one_line() -> None:
 def test_an_error_does_not_show_secrets_of_a_url() -> None:
     errors = ended("run_to_end(lambda: fail(RemoteError('none at http://me:hunter2@node/v3/0123456789abcdef')))").stderr
     assert errors == "aira: none at http://node/v3/… [remote-error]\n"
+
+
+def test_a_warning_is_one_line_without_secrets_and_controls_no_terminal() -> None:
+    url = "https://mainnet.example/v3/9aa3d95b3bc440fa88ea12eaa4456161"
+    done = ended(f"run_to_end(lambda: warn('{url} fails: \\x1b[31m\\nand'))")
+    assert done.stderr == "https://mainnet.example/v3/… fails: \\x1b[31m\\nand\n"
 
 
 def test_expected_errors_of_several_tasks_are_one_line() -> None:
