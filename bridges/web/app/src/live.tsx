@@ -9,8 +9,8 @@ import "./live.css";
 import { Path, Plot } from "./plot";
 import type { Frame } from "./plot";
 import { texts } from "./texts";
-import { Gathered, MOST_MESSAGES, MOST_PICTURES, MOST_TRACKS, elapsed, gather, inOrder, latest, placeAt, topicOf, viewOf, withoutNumbers } from "./tracks";
-import type { Sample, Track } from "./tracks";
+import { Gathered, MOST_MESSAGES, MOST_PICTURES, MOST_STATES, MOST_TRACKS, elapsed, gather, inOrder, latest, placeAt, statesOf, topicOf, viewOf, withoutNumbers } from "./tracks";
+import type { Sample, State, Track } from "./tracks";
 import type { Description, Message, Summary, TopicSummary, ValueSchema, Values } from "./types";
 import { Action, Badge, Problem, Show, Strange, Table } from "./ui";
 import { inWords } from "./values";
@@ -211,7 +211,10 @@ function Lines(props: { track: Track; schema: ValueSchema; frame: Frame }) {
     if (last?.text === text) Object.assign(last, { at: message.at, times: last.times + 1 });
     else lines.push({ key: message.at, at: message.at, text, times: 1 });
   }
+  const said = track.messages.slice(-MOST_STATES * 4).map((message) => ({ at: message.at, text: lineOf(message, props.schema) }));
   return (
+    <>
+    <States states={statesOf(said, frame.to())} frame={frame} />
     <ol class="lines" tabIndex={0} aria-label={texts.messagesOf(plain(track.topic, 60))}>
       {lines.map((line) => (
         <li key={line.key}>
@@ -220,6 +223,32 @@ function Lines(props: { track: Track; schema: ValueSchema; frame: Frame }) {
         </li>
       ))}
     </ol>
+    </>
+  );
+}
+
+/** Over time, which of a few words held: what a lamp, a door or a mode was. */
+function States(props: { states: State[]; frame: Frame }) {
+  const { states, frame } = props;
+  if (states.length < 2) return null;
+  const from = Math.max(frame.from(), states[0].from);
+  const whole = frame.to() - frame.from();
+  const words = [...new Set(states.map((state) => state.text))].sort();
+  const share = (seconds: number) => `${Math.max(0, (100 * seconds) / whole)}%`;
+  const until = frame.until === undefined ? 0 : frame.to() - frame.until;
+  return (
+    <div class="states" aria-hidden="true">
+      {states.filter((state) => state.to > from).map((state) => {
+        const begins = Math.max(from, state.from);
+        const color = `var(--line-${(words.indexOf(state.text) % 8) + 1})`;
+        return (
+          <span key={state.from} title={state.text} style={{ left: share(begins - frame.from()), width: share(state.to - begins), background: `color-mix(in srgb, ${color} 26%, var(--panel))`, borderColor: color }}>
+            {state.to - begins > whole / 12 ? state.text : ""}
+          </span>
+        );
+      })}
+      {until > 0 ? <i style={{ width: share(until) }} /> : null}
+    </div>
   );
 }
 
@@ -362,11 +391,8 @@ function useRecorded(cid: string, summary: Summary): { gathered: Gathered | null
     (async () => {
       const made = new Gathered();
       const topics = summary.topics.filter((topic) => topic.messages).slice(0, MOST_TRACKS);
-      if (!topics.length) setState({ gathered: made, error: null });
-      await Promise.all(topics.map(async (topic) => {
-        await addTopic(made, cid, topic, topics, stopped.signal);
-        if (!stopped.signal.aborted) setState({ gathered: made, error: null });
-      }));
+      await Promise.all(topics.map((topic) => addTopic(made, cid, topic, topics, stopped.signal)));
+      setState({ gathered: made, error: null });
     })().catch((error) => {
       if (!stopped.signal.aborted) setState({ gathered: null, error });
     });
@@ -377,16 +403,17 @@ function useRecorded(cid: string, summary: Summary): { gathered: Gathered | null
 
 async function addTopic(made: Gathered, cid: string, { topic, role, messages, shown: how }: TopicSummary, all: TopicSummary[], signal: AbortSignal): Promise<void> {
   const most = how === "image" ? MOST_PICTURES : MOST_MESSAGES;
-  const isLong = messages > most && how === "values";
-  let next: number | null = -1;
-  for (let taken = 0; next !== null && taken < most && !isLong; taken += MOST_MESSAGES) {
+  const found: Message[] = [];
+  let next: number | null = messages > most && how === "values" ? null : -1;
+  for (let taken = 0; next !== null && taken < most; taken += MOST_MESSAGES) {
     const page: Page = await getExact<Page>(`files/${cid}/messages${query({ topic, after: next < 0 ? undefined : next, limit: MOST_MESSAGES })}`, signal);
-    for (const message of page.messages) if (message.role === role) made.add({ ...message, role, numbers: [] });
+    found.push(...page.messages.filter((message) => message.role === role));
     next = page.next;
   }
   // The columns of a topic do not say who sent what.
   const isShared = all.filter((one) => one.topic === topic).length > 1;
   const values = how === "values" && !isShared ? await get<Values>(`files/${cid}/values${query({ topic })}`, signal) : null;
+  for (const message of found) made.add({ ...message, role, numbers: [] });
   made.complete(topic, role, messages, values?.at ?? [], values?.columns ?? []);
 }
 

@@ -192,6 +192,7 @@ function optionsOf(element: HTMLElement, series: Series[], track: Track, frame: 
       ...series.map((one, place): uPlot.Series => ({
         stroke: lines[place],
         fill: series.length === 1 && !one.isBoolean ? fading(lines[place]) : undefined,
+        fillTo: (plot) => plot.scales.y.min ?? 0,
         width: 1.75,
         spanGaps: true,
         paths: one.isBoolean ? uPlot.paths.stepped!({ align: 1 }) : undefined,

@@ -157,6 +157,29 @@ export function numberAt(values: (number | null)[], place: number): number | nul
   return null;
 }
 
+/** That a text was said last, from one time to another. */
+export interface State {
+  text: string;
+  from: number;
+  to: number;
+}
+
+export const MOST_STATES = 60;
+
+/** The states that texts tell of, up to the time `to`; none if there are too many words for states, or too long ones. */
+export function statesOf(said: { at: number; text: string }[], to: number): State[] {
+  const states: State[] = [];
+  for (const { at, text } of said) {
+    const last = states.at(-1);
+    if (last) last.to = at;
+    if (last?.text !== text) states.push({ text, from: at, to });
+  }
+  if (states.length) states[states.length - 1].to = to;
+  const words = new Set(states.map((state) => state.text));
+  const areStates = said.length >= 3 && words.size <= 6 && [...words].every((word) => word.length <= 24);
+  return areStates ? states.slice(-MOST_STATES) : [];
+}
+
 /** What of a value is neither a number, which is plotted, nor the envelope of a message; undefined if that is nothing. */
 export function withoutNumbers(value: unknown): unknown {
   if (typeof value === "string") return value;

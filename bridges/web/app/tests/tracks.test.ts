@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { Gathered, MOST_COLUMNS, MOST_MESSAGES, MOST_POINTS, MOST_TRACKS, elapsed, figure, gather, inOrder, latest, placeAt, placesOf, roundLength, viewOf, withoutNumbers } from "../src/tracks";
+import { Gathered, MOST_COLUMNS, MOST_MESSAGES, MOST_POINTS, MOST_TRACKS, elapsed, figure, gather, inOrder, latest, placeAt, placesOf, roundLength, statesOf, viewOf, withoutNumbers } from "../src/tracks";
 import type { Sample } from "../src/tracks";
 
 const sample = (topic: string, at: number, numbers: Sample["numbers"], more: Partial<Sample> = {}): Sample =>
@@ -66,6 +66,12 @@ test("what moves on a plane or on the earth is a path; what only has an x and a 
   assert.equal(viewOf(only([1, 2].map((at) => sample("/a", at, [["x", 3], ["y", 4]]))), null).position, null, "what stands still");
   const track = only([sample("/gps", 1, [["latitude", 60], ["longitude", 10]]), sample("/gps", 2, [["latitude", 60.001], ["longitude", 10.001]]), sample("/gps", 3, [["latitude", 400], ["longitude", 0]])]);
   assert.deepEqual(placesOf(track, viewOf(track, null).position!).map((one) => [Math.round(one.x), Math.round(one.y)]), [[0, 0], [56, 111]]);
+});
+
+test("a few short words over time are states; sentences are not", () => {
+  const said = (...words: string[]) => words.map((text, at) => ({ at, text }));
+  assert.deepEqual(statesOf(said("on", "on", "off", "on"), 9), [{ text: "on", from: 0, to: 2 }, { text: "off", from: 2, to: 3 }, { text: "on", from: 3, to: 9 }]);
+  assert.deepEqual([statesOf(said("on", "off"), 9), statesOf(said("a", "b", "a", "something is in the way"), 9).length, statesOf(said("a", "b", "something is in the way, waiting"), 9), statesOf([], 9)], [[], 4, [], []]);
 });
 
 test("the envelope of a message is not plotted, and words beside numbers are kept", () => {
