@@ -40,6 +40,14 @@ where you order. It starts again when you change a file."""
 DEPLOY: Final = "`deploy` has what a server needs."
 KINDS: Final = {
     "robot": ProjectKind("chain", "A robot that blinks its light for 1 XRT.", f"{MARKET} {DEPLOY}"),
+    "device": ProjectKind(
+        "chain,serial",
+        "A board with a lamp that shines for 1 XRT.",
+        f"{MARKET} `board` is its sketch for an Arduino Uno;\n"
+        "`aira edge PORT --agent ADDRESS` connects it, where ADDRESS is the account that the robot logs.\n"
+        "Without a board, `python -m bridges.serial.firmware board -o build` compiles the sketch, and\n"
+        f"`aira board run build/board.elf --tty ./uno` simulates it at the port `./uno`. {DEPLOY}",
+    ),
     "client": ProjectKind(
         "chain",
         "A program that orders a job and pays for it.",
@@ -90,11 +98,14 @@ def write_project(kind: str, name: str, module: str, target: Path) -> None:
     words |= {"title": name.replace("-", " ").capitalize()}
     words = {key: Template(value).safe_substitute(words) for key, value in words.items() if isinstance(value, str)}
     words["command_list"] = "[" + ", ".join(f'"{word}"' for word in words["command"].split()) + "]"
-    for source in (path for part in (*chosen.parts, kind) for path in sorted((TEMPLATES / part).rglob(f"*{SUFFIX}"))):
+    for source in (
+        path for part in (*chosen.parts, kind) for path in sorted((TEMPLATES / part).rglob("*")) if path.is_file()
+    ):
         path = target / str(source.relative_to(TEMPLATES).relative_to(source.relative_to(TEMPLATES).parts[0]))
         path = path.with_name(path.name.removesuffix(SUFFIX).replace("NAME", module))
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(Template(source.read_text(encoding="utf-8")).substitute(words), encoding="utf-8")
+        text = source.read_text(encoding="utf-8")
+        path.write_text(Template(text).substitute(words) if source.suffix == SUFFIX else text, encoding="utf-8")
     program = target / f"{module}.py"
     if "MODEL = " in program.read_text(encoding="utf-8"):
         (target / "model.json").write_bytes(description_from(program).encode())

@@ -1,0 +1,1 @@
+../../../../../examples/firmware/AiraFrames/src/AiraFrames.h
