@@ -20,7 +20,7 @@ export type { Sample } from "./tracks";
 /** Milliseconds between two renderings of what is live; plots are drawn in each frame. */
 const REFRESH = 125;
 /** Milliseconds between two times of a recording that plays. */
-const REPLAY = 45;
+const REPLAY = 60;
 /** Seconds that are in view while more comes. */
 const WINDOW = 60;
 const LINES = 40;
@@ -103,7 +103,7 @@ function Following<T>(props: { path: string; topic: string; model: Description |
 function frameOf(gathered: Gathered, { until, clock = false, live = false, window = Infinity }: { until?: number; clock?: boolean; live?: boolean; window?: number }): Frame {
   const from = () => Math.max(gathered.from, gathered.to - window);
   const to = () => (live ? Math.max(gathered.to, from() + 8) : gathered.to);
-  return { from, to, clock, until, news: () => `${gathered.count} ${from()} ${until}` };
+  return { from, to, clock, until, news: () => `${gathered.count} ${from()}` };
 }
 
 /** Panels in columns. A panel stays in its column, so that what is live never jumps; a new one goes where there is most room. */
@@ -247,7 +247,7 @@ function States(props: { states: State[]; frame: Frame }) {
           </span>
         );
       })}
-      {until > 0 ? <i style={{ width: share(until) }} /> : null}
+      {until > 0 ? <i class="veil" style={{ width: share(until) }} /> : null}
     </div>
   );
 }
@@ -374,12 +374,11 @@ function Activity(props: { gathered: Gathered; end: number; now: number }) {
     const most = Math.max(...counts);
     return counts.map((count, place) => (count ? `M${place} 1h.7v-${(0.15 + 0.85 * (count / most)).toFixed(3)}h-.7z` : "")).join("");
   }, [props.gathered.count, props.end]);
-  const past = (BARS * props.now) / props.end;
   return (
-    <svg class="activity" viewBox={`0 0 ${BARS} 1`} preserveAspectRatio="none" aria-hidden="true">
-      <path d={path} class="to-come" />
-      <svg x="0" y="0" width={past} height="1" viewBox={`0 0 ${past} 1`} preserveAspectRatio="none"><path d={path} /></svg>
-    </svg>
+    <div class="activity" aria-hidden="true">
+      <svg viewBox={`0 0 ${BARS} 1`} preserveAspectRatio="none"><path d={path} /></svg>
+      <i class="veil" style={{ left: `${(100 * props.now) / props.end}%` }} />
+    </div>
   );
 }
 

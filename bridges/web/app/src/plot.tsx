@@ -118,12 +118,22 @@ export function Plot(props: { track: Track; series: Series[]; title: string; fra
     });
   };
 
+  /** What has not happened yet at the time that is shown lies behind a veil. */
+  const veil = () => {
+    const cover = plot.current?.over.querySelector<HTMLElement>(".veil");
+    const { until } = latest.current;
+    if (!cover) return;
+    cover.hidden = until === undefined;
+    if (until !== undefined) cover.style.left = `${Math.max(0, plot.current!.valToPos(until, "x"))}px`;
+  };
+
   useEffect(() => {
     if (!isLine || !box.current) return;
     const element = box.current;
     const measure = () => ({ width: Math.max(200, element.clientWidth), height: HEIGHT });
-    const made = new uPlot(optionsOf(element, series, track, latest, setPointed), undefined, element);
+    const made = new uPlot(optionsOf(element, series, track, frame.clock, setPointed, veil), undefined, element);
     plot.current = made;
+    made.over.append(Object.assign(document.createElement("i"), { className: "veil" }));
     made.setSize(measure());
     draw();
     const resized = new ResizeObserver(() => made.setSize(measure()));
@@ -136,6 +146,7 @@ export function Plot(props: { track: Track; series: Series[]; title: string; fra
       plot.current = null;
     };
   }, [isLine, names, dark, frame.clock]);
+  useEffect(veil, [frame.until]);
   useEffect(() => series.forEach((one, place) => plot.current?.setSeries(place + 1, { show: !hidden.includes(one.name) })), [hidden, dark]);
   useDrawing(box, frame.news, draw, isLine);
 
@@ -169,11 +180,10 @@ export function Plot(props: { track: Track; series: Series[]; title: string; fra
   );
 }
 
-function optionsOf(element: HTMLElement, series: Series[], track: Track, frame: { current: Frame }, point: (place: number | null) => void): uPlot.Options {
-  const { ink, grid, ground, lines } = plotColors(element);
+function optionsOf(element: HTMLElement, series: Series[], track: Track, isClock: boolean, point: (place: number | null) => void, drawn: () => void): uPlot.Options {
+  const { ink, grid, lines } = plotColors(element);
   const font = "12px system-ui, sans-serif";
   const axis: uPlot.Axis = { stroke: ink, font, grid: { stroke: grid, width: 1 }, ticks: { show: false } };
-  const isClock = frame.current.clock;
   const clock = (tick: number, step: number) => new Date(tick * 1000).toLocaleTimeString(undefined, { hour: "2-digit", minute: "2-digit", second: step < 60 ? "2-digit" : undefined });
   return {
     width: 200,
@@ -201,20 +211,7 @@ function optionsOf(element: HTMLElement, series: Series[], track: Track, frame: 
     ],
     hooks: {
       setCursor: [(plot) => point(plot.cursor.left !== undefined && plot.cursor.left >= 0 ? plot.cursor.idx ?? null : null)],
-      draw: [(plot) => {
-        const { until } = frame.current;
-        if (until === undefined) return;
-        const { ctx, bbox } = plot;
-        const left = Math.min(bbox.left + bbox.width, Math.max(bbox.left, plot.valToPos(until, "x", true)));
-        ctx.save();
-        ctx.globalAlpha = 0.72;
-        ctx.fillStyle = ground;
-        ctx.fillRect(left, bbox.top, bbox.left + bbox.width - left, bbox.height);
-        ctx.globalAlpha = 1;
-        ctx.fillStyle = ink;
-        ctx.fillRect(left - 1, bbox.top, 2, bbox.height);
-        ctx.restore();
-      }],
+      draw: [drawn],
     },
   };
 }
@@ -254,7 +251,7 @@ export function Path(props: { track: Track; position: Position; label: string; f
     resized.observe(box.current!);
     return () => resized.disconnect();
   }, []);
-  useDrawing(box, frame.news, draw, true);
+  useDrawing(box, () => `${frame.news()} ${frame.until}`, draw, true);
   const place = frame.until === undefined ? track.at.length - 1 : placeAt(track.at, frame.until);
   const [x, y] = [numberAt(columnOf(track, position.x), place), numberAt(columnOf(track, position.y), place)];
   return (
