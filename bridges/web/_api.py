@@ -24,6 +24,7 @@ from bridges.web._files import (
     picture_of,
     summary_of,
 )
+from bridges.web._history import PastContracts
 from bridges.web._jobs import Views
 from bridges.web._live import Live
 from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms, liability_json
@@ -183,6 +184,7 @@ class Api(Lifecycle):
         self._views = Views(components, self._market, self.files)
         self._publisher = OrderPublisher(components, self._market)
         self._live = Live(components, self._market, self.stream)
+        self._history = PastContracts(components, self._market)
         self._stops = Stops(components, self._market)
         self._quotes = Quotes(components, self._market.labels)
         self._facts: dict[str, Any] = {}
@@ -204,6 +206,7 @@ class Api(Lifecycle):
         return [
             get("/api/v1/openapi.json", self.openapi),
             get("/api/v1/market", self.market),
+            get("/api/v1/market/history", self.history),
             get("/api/v1/agents", self.agents),
             post("/api/v1/quotes", self.quotes),
             get("/api/v1/orders", self.orders),
@@ -231,6 +234,7 @@ class Api(Lifecycle):
             get("/api/v1/liabilities/{address}/verification", self.verification),
             get("/api/v1/liabilities/{address}/live", self.live),
             get("/api/v1/accounts/{address}", self.account),
+            get("/api/v1/accounts/{address}/statement", self.statement),
             get("/api/v1/agents/{address}/readings", self.readings),
             get("/api/v1/agents/{address}/logs", self.logs),
             get("/api/v1/agents/{address}/settings", self.control),
@@ -469,6 +473,20 @@ class Api(Lifecycle):
 
     async def account(self, request: web.Request) -> web.Response:
         return answer(await self._views.account(address_in(request)))
+
+    async def statement(self, request: web.Request) -> web.Response:
+        account, sender = address_in(request), request[SENDER]
+        if request.query.get("format", "json") == "json":
+            return answer(await self._history.statement(account, sender=sender))
+        if request.query["format"] != "csv":
+            raise WebError("a statement is json or csv")
+        text = await self._history.statement_csv(account, sender=sender)
+        headers = {"Content-Disposition": f'attachment; filename="statement-{account}.csv"'}
+        return web.Response(text=text, content_type="text/csv", headers=headers | SANDBOX)
+
+    async def history(self, request: web.Request) -> web.Response:
+        model = request.query.get("model", "")
+        return answer(await self._history.jobs(parse_text_cid(model) if model else ""))
 
     async def lighthouse(self, request: web.Request) -> web.Response:
         return answer(await self._views.lighthouse())

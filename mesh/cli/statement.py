@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from mesh.agent.statement import Statement
+    from mesh.chain import Chain
     from mesh.settings import Settings
 
     Units: TypeAlias = Mapping[str, Unit]
@@ -55,13 +56,13 @@ async def statement(
     async with open_chain(settings) as chain:
         whose = await account_of(chain, settings, account)
         found = await read_statement(chain, whose, since=since, until=until)
-        units = {token: await token_unit(chain, token) for token in {one.token for one in found.entries}}
+        units = await units_of(chain, found)
     if as_json:
-        print_json(_json(found, units))
+        print_json(statement_json(found, units))
     elif as_csv and only_sums:
-        _print_csv(SUM_COLUMNS, found.sums, units)
+        print_line(csv_of(SUM_COLUMNS, found.sums, units).rstrip("\n"))
     elif as_csv:
-        _print_csv(ENTRY_COLUMNS, found.entries, units)
+        print_line(csv_of(ENTRY_COLUMNS, found.entries, units).rstrip("\n"))
     elif not found.entries:
         print_line(f"no contracts of {whose} in this period")
     else:
@@ -69,6 +70,11 @@ async def statement(
             _print_entries(found, units)
             print_line()
         _print_sums(found, units)
+
+
+async def units_of(chain: Chain, found: Statement) -> Units:
+    """The units of the tokens in a statement. Raises `ChainError`."""
+    return {token: await token_unit(chain, token) for token in {one.token for one in found.entries}}
 
 
 AMOUNTS: Final = ("EARNED", "SPENT", "FEE", "GAS", "OWN GAS")
@@ -154,13 +160,16 @@ SUM_COLUMNS: Final[Mapping[str, Column[Sum]]] = {
 }
 
 
-def _print_csv(columns: Mapping[str, Column[T]], rows: Sequence[T], units: Units) -> None:
-    """Print rows below their heads (RFC 4180); nothing in them is a formula for a spreadsheet."""
+def csv_of(columns: Mapping[str, Column[T]], rows: Sequence[T], units: Units) -> str:
+    """Rows below their heads (RFC 4180), for a spreadsheet: nothing in them is a formula.
+
+    `columns` are `ENTRY_COLUMNS` or `SUM_COLUMNS`, and `units` has that of each token.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows([_cell(column(one, units[one.token])) for column in columns.values()] for one in rows)
-    print_line(text.getvalue().rstrip("\n"))
+    return text.getvalue()
 
 
 def _cell(value: str) -> str:
@@ -168,8 +177,11 @@ def _cell(value: str) -> str:
     return f"'{text}" if text.lstrip().startswith(FORMULA) else text
 
 
-def _json(found: Statement, units: Units) -> dict[str, Any]:
-    """The statement for JSON: amounts are text, in the smallest unit of their token, in wn or in wei."""
+def statement_json(found: Statement, units: Units) -> dict[str, Any]:
+    """The statement for JSON, with the `units` of its tokens.
+
+    Amounts are text, in the smallest unit of their token, in wn or in wei.
+    """
     contracts = []
     for entry in found.entries:
         one = entry.liability
