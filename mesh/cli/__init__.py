@@ -30,6 +30,7 @@ COMMANDS: Final = {
     "provider": ("mesh.cli.provider:command", "match the orders of a lighthouse and settle them"),
     "quotes": ("mesh.cli.quotes:command", "ask the robots of a model what they want for a job"),
     "replay": ("mesh.cli.replay:command", "publish the messages of a recording again"),
+    "robot": ("mesh.cli.robot:command", "change how a robot works while it runs; stop and release it"),
     "robots": ("mesh.cli.robots:command", "list the robots on a lighthouse's channel"),
     "router": ("mesh.cli.router:command", "run a Zenoh router for the mesh"),
     "rpc": ("mesh.cli.rpc:command", "call a service of an agent"),

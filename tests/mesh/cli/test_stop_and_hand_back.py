@@ -8,15 +8,17 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from tests.support.commands import AIRA, Serving, aira
+from tests.support.commands import AIRA, Serving, aira, invoke
 from tests.support.objectives import objective
 from tests.support.ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+    from typing import Any
 
 MODEL = "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82"
+CUSTOMER = "0x000000000000000000000000000000000000bEEF"
 ROBOT = f"""
 import asyncio, sys
 from mesh import Agent
@@ -93,3 +95,42 @@ def test_a_job_that_was_stopped_ends_stopped_also_if_its_robot_is_killed_right_a
             assert "stopped by the customer: smoke (stopped)" in ordering.log()
             assert "safe after smoke" in restarted.log()
             assert (begun, restarted.log().count("begun")) == (1, 0)
+
+
+def test_an_owner_changes_the_price_pauses_stops_and_releases_a_robot_that_runs(tmp_path: Path) -> None:
+    with ordered(tmp_path) as (_, ordering, robot, roles):
+        own = roles["robot"]
+
+        def control(*words: str) -> dict[str, Any]:
+            done = invoke("robot", *words, "--json", **own)
+            assert done.returncode == 0, done.stderr
+            return dict(json.loads(done.stdout))
+
+        changed = control("set", "--price", "6", "--paused", "true", "--least-price", "5.5", "--refuse", CUSTOMER)
+        assert changed | {"robot": ""} == {
+            "robot": "",
+            "price": "6 XRT",
+            "paused": True,
+            "refuse": [CUSTOMER],
+            "leastPrice": "5.5 XRT",
+            "held": False,
+            "stopped": "",
+        }
+        listed = invoke("robots", **own).stdout
+        assert ("closed" in listed, "6 XRT" in listed) == (True, True), listed
+        wrong = invoke("robot", "set", changed["robot"], "--price", "a lot", **own)
+        assert (wrong.returncode, "[invalid-amount]" in wrong.stderr) == (2, True), wrong.stderr
+        stopped = control("stop", "--why", "smoke")
+        assert (stopped["held"], stopped["stopped"]) == (True, "stopped 1 job")
+        assert ordering.wait() == 1
+        assert "stopped by the robot's side: smoke (robot-stopped)" in ordering.log()
+        robot.end(signal.SIGKILL)
+        gone = invoke("robot", "show", **own)
+        assert (gone.returncode, "[no-answer]" in gone.stderr) == (1, True), gone.stderr
+        nobody = invoke("robot", "show", **(own | {"AIRA_KEYFILE": ""}))
+        assert (nobody.returncode, "[robot-unknown]" in nobody.stderr) == (2, True), nobody.stderr
+        with Serving(sys.executable, tmp_path / "robot.py", "0", says="account 0x", variables=own):
+            assert control("show") == stopped | {"stopped": ""}
+            released = control("release")
+            assert (released["held"], released["paused"]) == (False, True)
+            assert "takes        no jobs: it is paused\n" in invoke("robot", "show", **own).stdout
