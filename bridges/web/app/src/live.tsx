@@ -162,7 +162,7 @@ function Panel(props: { track: Track; model: Description | null; frame: Frame })
       <header>
         <h3><bdi>{title}</bdi></h3>
         {track.role === "objective" ? <Badge kind="calm">{texts.asked}</Badge> : null}
-        {described?.title ? <code class="quiet"><Strange text={track.topic} most={60} /></code> : null}
+        <code class="quiet"><Strange text={track.topic} most={60} /></code>
       </header>
       {described?.description ? <p class="hint"><Strange text={described.description} most={200} /></p> : null}
       {track.pictures.length ? <Picture track={track} title={title} frame={frame} /> : null}
@@ -243,7 +243,7 @@ function States(props: { states: State[]; frame: Frame }) {
         const color = `var(--line-${(words.indexOf(state.text) % 8) + 1})`;
         return (
           <span key={state.from} title={state.text} style={{ left: share(begins - frame.from()), width: share(state.to - begins), background: `color-mix(in srgb, ${color} 26%, var(--panel))`, borderColor: color }}>
-            {state.to - begins > whole / 12 ? state.text : ""}
+            {(state.to - begins) / whole > (state.text.length + 2) / 42 ? state.text : ""}
           </span>
         );
       })}

@@ -346,5 +346,5 @@ function drawPath(canvas: HTMLCanvasElement, { width, height }: { width: number;
   context.stroke();
   const unit = position.onEarth ? "m" : plain(position.unit, 8);
   context.fillText(`${figure(square)} ${unit}`, 18, height - 16);
-  if (position.onEarth) context.fillText(texts.north, width - 22, 20);
+  if (position.onEarth) context.fillText(texts.north, width - 34, 20);
 }

@@ -238,7 +238,13 @@ export function viewOf(track: Track, model: Description | null): View {
     const key = one.isBoolean ? "boolean" : `unit ${one.unit}`;
     groups.set(key, [...(groups.get(key) ?? []), one]);
   }
-  return { title: described?.title || track.topic, position, plots: [...groups.values()].slice(0, MOST_PLOTS) };
+  return { title: described?.title || described?.value?.title || wordsOf(track.topic), position, plots: [...groups.values()].slice(0, MOST_PLOTS) };
+}
+
+/** A topic's name for people: `/arm/left_grip` is "Arm left grip". */
+function wordsOf(topic: string): string {
+  const words = topic.replace(/[/_]+/g, " ").trim() || topic;
+  return words.charAt(0).toUpperCase() + words.slice(1);
 }
 
 export function topicOf(model: Description | null, track: Track): ModelTopic | undefined {

@@ -55,7 +55,7 @@ test("titles and units are those of the description, and each plot has one unit"
   ]);
   const lone = only([sample("/driven", 1, [["data", 1]])]);
   assert.deepEqual(viewOf(lone, { title: "", result: [{ topic: "/driven", value: { type: "number", title: "Distance", unit: "m" } }] }).plots[0][0], { name: "data", title: "Distance", unit: "m", isBoolean: false });
-  assert.equal(viewOf(lone, null).title, "/driven");
+  assert.deepEqual([viewOf(lone, null).title, viewOf(only([sample("/arm/left_grip", 1, [])]), null).title, viewOf(only([sample("", 1, []), ]), null).title], ["Driven", "Arm left grip", ""]);
 });
 
 test("what moves on a plane or on the earth is a path; what only has an x and a y is none", () => {
