@@ -63,10 +63,11 @@ async def run(place: Place, client: str, *arguments: str) -> dict[str, Any]:
         env=os.environ | {"NODE_PATH": folders, "TMPDIR": str(place.folder)},
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
+    ending = asyncio.get_running_loop().call_later(60, process.kill)  # what it has reported is in the failure
     try:
-        async with asyncio.timeout(100):
-            output, errors = await process.communicate()
+        output, errors = await process.communicate()
     finally:
+        ending.cancel()
         if process.returncode is None:
             process.kill()
     assert process.returncode == 0, (output.decode(), errors.decode())

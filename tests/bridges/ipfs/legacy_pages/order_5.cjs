@@ -26,10 +26,14 @@ async function main() {
   const offered = new Promise((resolve) => robonomics.onOffer(model, resolve))
   const results = []
   robonomics.onResult((message) => results.push(message.result))
-  const liability = await robonomics.sendDemand({
+  // What its `sendDemand` returns subscribes to contracts only when the demand is sent: a quick market has made it by then.
+  const made = new Promise((resolve, reject) =>
+    robonomics.onLiability((error, liability) => error ? reject(error) : resolve(liability)))
+  await robonomics.sendDemand({
     model, objective: hash, token: robonomics.xrt.address, lighthouse: robonomics.lighthouse.address, cost: 42,
     deadline: 100000000
-  })
+  }, false)
+  const liability = await made
   report('liability', liability.address)
   // The job may have ended before the page could subscribe to its end.
   while (!(await liability.getInfo()).isFinalized) await new Promise((resolve) => setTimeout(resolve, 100))
