@@ -28,7 +28,7 @@ from bridges.web._history import PastContracts
 from bridges.web._jobs import Views
 from bridges.web._live import Live
 from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms, liability_json
-from bridges.web._robots import Quotes
+from bridges.web._robots import Questions
 from bridges.web._stops import Stops
 from bridges.web._stream import Stream
 from bridges.web.access import (
@@ -57,7 +57,7 @@ from schemas import parse_address, parse_cid
 from schemas.decoding import InvalidData, decode_json
 from schemas.keys import RpcKey
 from schemas.records import ControlRobot
-from schemas.rpc import FinishLiability, LiabilityRequest, Nothing
+from schemas.rpc import AcceptDemand, FinishLiability, LiabilityRequest, Nothing, OrderPair
 from schemas.signing import StopRequest
 from schemas.status import LEVELS
 
@@ -186,7 +186,7 @@ class Api(Lifecycle):
         self._live = Live(components, self._market, self.stream)
         self._history = PastContracts(components, self._market)
         self._stops = Stops(components, self._market)
-        self._quotes = Quotes(components, self._market.labels)
+        self._questions = Questions(components, self._market.labels)
         self._facts: dict[str, Any] = {}
         self._facts_at = float("-inf")
         self.chain_answers = True
@@ -209,6 +209,8 @@ class Api(Lifecycle):
             get("/api/v1/market/history", self.history),
             get("/api/v1/agents", self.agents),
             post("/api/v1/quotes", self.quotes),
+            post("/api/v1/pairs", self.post_pair),
+            post("/api/v1/pairs/offers", self.robot_offer),
             get("/api/v1/orders", self.orders),
             post("/api/v1/orders", self.post_order),
             get("/api/v1/orders/{hash}", self.order),
@@ -314,7 +316,7 @@ class Api(Lifecycle):
     async def quotes(self, request: web.Request) -> web.Response:
         wanted = await body_of(request, QuotesWanted)
         model, objective = parse_text_cid(wanted.model), parse_text_cid(wanted.objective)
-        return answer({"quotes": await self._quotes.of(model, objective, sender=request[SENDER])})
+        return answer({"quotes": await self._questions.quotes(model, objective, sender=request[SENDER])})
 
     async def orders(self, request: web.Request) -> web.Response:
         query, head = request.query, self._market.head
@@ -334,6 +336,15 @@ class Api(Lifecycle):
 
     async def post_order(self, request: web.Request) -> web.Response:
         order = await self._publisher.post(await request.read())
+        return answer(self._market.posted_json(order), status=202)
+
+    async def robot_offer(self, request: web.Request) -> web.Response:
+        wanted = AcceptDemand.decode(await request.read())
+        accepted = await self._questions.offer(wanted, sender=request[SENDER])
+        return web.Response(body=accepted.encode(), content_type="application/json")
+
+    async def post_pair(self, request: web.Request) -> web.Response:
+        order = await self._publisher.post_pair(OrderPair.decode(await request.read()))
         return answer(self._market.posted_json(order), status=202)
 
     async def order(self, request: web.Request) -> web.Response:

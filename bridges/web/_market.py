@@ -18,6 +18,7 @@ import msgspec
 
 from bridges.web.access import WebError, unusable
 from mesh.agent.contracts import is_about, verdict_words
+from mesh.agent.hiring import PROVIDERS, send_pair
 from mesh.agent.orders import OrderState
 from mesh.agent.validators import accepted_of
 from mesh.base.background import Background
@@ -28,7 +29,7 @@ from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation, Rev
 from mesh.cli.demand import JudgedTerms
 from mesh.cli.liability import liability_json as record_json
 from mesh.cli.liability import refund_words
-from mesh.errors import AiraError, ChainError, RemoteError
+from mesh.errors import AiraError, ChainError, RemoteError, public_text
 from mesh.network import Pump
 from mesh.role.program import RESEND
 from mesh.watching import JobEvent, MarketWatch
@@ -36,6 +37,7 @@ from mesh.watching.market import query_all
 from schemas import (
     Demand,
     EventKey,
+    InvalidMessage,
     Liability,
     Offer,
     PlaybackPosition,
@@ -49,6 +51,8 @@ from schemas import (
     verify,
     verify_message,
 )
+from schemas.messages import equal_terms
+from schemas.rpc import OrderPair
 from schemas.signing import Decline, Refusal, Rejection
 from schemas.verdicts import ValidatorReport
 
@@ -559,6 +563,8 @@ class Sent(msgspec.Struct):
     signer: str
     backoff: Backoff
     next_at: float
+    pair: OrderPair | None = None
+    """With it, the message is for one robot alone, and goes to the providers only."""
 
 
 class OrderPublisher(Lifecycle):
@@ -591,10 +597,8 @@ class OrderPublisher(Lifecycle):
         verified: Verified[Any] = await asyncio.to_thread(verify, payload)
         message, key = verified.message, verified.hash.hex() + verified.signer
         is_new = key not in self._sent
-        of_signer = sum(sent.signer == verified.signer for sent in self._sent.values())
-        if is_new and (len(self._sent) >= 4096 or of_signer >= PER_SIGNER):
-            hint = "wait until some have ended, or withdraw them"
-            raise WebError("too many orders are open here", hint=hint, code="too-many-requests")
+        if is_new:
+            self._check_place(verified.signer)
         match message:
             case Demand() | Offer():
                 await self._check(verified)
@@ -608,6 +612,37 @@ class OrderPublisher(Lifecycle):
             self._send_due()
         self._market.changed(order, order.state(self._market.head))
         return order
+
+    async def post_pair(self, pair: OrderPair) -> SeenOrder:
+        """Check a demand with a robot's offer, and send both to the providers; returns the demand, also if it is posted
+        again.
+
+        Raises as `post`, and `InvalidMessage` for a pair that a provider would refuse.
+        """
+        demand, offer = await asyncio.to_thread(_pair_of, pair)
+        key = demand.hash.hex() + demand.signer
+        if key in self._sent and (known := self._market.order(demand.hash.hex())) is not None:
+            return known
+        self._check_place(demand.signer)
+        await self._check(demand)
+        order = self._market.add(demand, posted=True, robot=offer.signer)
+        self._sent[key] = Sent(demand.message, demand.signer, Backoff(RESEND), time.monotonic(), pair)
+        self._send_due()
+        self._market.changed(order, order.state(self._market.head))
+        return order
+
+    async def _send_pair(self, pair: OrderPair) -> None:
+        session, providers = self._parts.network.session, sorted(await self._market.providers())[:PROVIDERS]
+        for said in await asyncio.gather(*(send_pair(session, provider, pair) for provider in providers)):
+            if said is not None:
+                detail = public_text(said.detail)
+                self._market.take_statement(said.order, "rejected", said.provider, said.reason, detail)
+
+    def _check_place(self, signer: str) -> None:
+        of_signer = sum(sent.signer == signer for sent in self._sent.values())
+        if len(self._sent) >= 4096 or of_signer >= PER_SIGNER:
+            hint = "wait until some have ended, or withdraw them"
+            raise WebError("too many orders are open here", hint=hint, code="too-many-requests")
 
     async def order(self, *, objective: str, validator: str, validator_fee: int | None, **terms: Any) -> SeenOrder:
         """The local account orders; its agent publishes, or sends the order to the one `robot` alone.
@@ -699,7 +734,10 @@ class OrderPublisher(Lifecycle):
             if not self._is_wanted(sent.message, key[:64]):
                 del self._sent[key]
             elif sent.next_at <= now and self._parts.network.connected:
-                self._parts.channel.publish(sent.message)
+                if sent.pair is None:
+                    self._parts.channel.publish(sent.message)
+                else:
+                    self._tasks.start(self._send_pair(sent.pair), f"pair {key[:64]}")
                 sent.next_at = now + (sent.backoff.next_delay() or 0.0)
 
     def _is_wanted(self, message: SignedMessage, order_hash: str) -> bool:
@@ -707,6 +745,17 @@ class OrderPublisher(Lifecycle):
             return message.deadline > self._market.head
         order = self._market.order(order_hash)
         return order is not None and order.state(self._market.head) == "open"
+
+
+def _pair_of(pair: OrderPair) -> tuple[Verified[Demand], Verified[Offer]]:
+    """The demand and the offer of a pair. Raises `InvalidMessage`."""
+    demand: Verified[Demand] = verify_message(pair.demand.message())
+    offer: Verified[Offer] = verify_message(pair.offer.message())
+    if not pair.is_signed or demand.signer != pair.maker:
+        raise InvalidMessage("signature", "the pair is not signed by the maker of its demand")
+    if equal_terms(demand.message) != equal_terms(offer.message):
+        raise InvalidMessage("terms", "the terms of the demand and the offer are not equal")
+    return demand, offer
 
 
 HINTS: Final = {

@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from bridges.web.access import WebError
+from mesh.agent.hiring import asked_offer
 from mesh.base.flood import Rate, RateLimiter
 from mesh.errors import public_text
 from mesh.watching.quotes import QUOTE_TIMEOUT, asked_quotes
-from schemas import InvalidAddress, parse_address
+from schemas import InvalidAddress, InvalidMessage, parse_address
 
 if TYPE_CHECKING:
     from bridges.web._market import Labels
     from bridges.web.components import WebComponents
     from mesh.watching import Robot
-    from schemas.rpc import Quote
+    from schemas.rpc import AcceptDemand, Accepted, Quote
 
 QUESTIONS: Final = Rate(per_second=1.0, burst=16)
-"""Questions for quotes that one person may ask."""
+"""Questions for quotes or offers that one person may ask."""
 LONGEST: Final = 200
 """Characters of why a robot declines."""
 
@@ -31,22 +32,22 @@ def profile_json(robot: Robot) -> dict[str, Any]:
     return {name: facts[name] for name in facts if name not in ("address", "model", "paid", "refunded")}
 
 
-class Quotes:
-    """Asks robots for quotes, as the server's `asker`."""
+class Questions:
+    """Asks robots for quotes, as the server's `asker`, and for offers, as people sign that."""
 
     def __init__(self, components: WebComponents, labels: Labels) -> None:
         self._parts = components
         self._labels = labels
         self._limiter = RateLimiter(per_sender=QUESTIONS)
-        self._asking = asyncio.Semaphore(8)  # questions that are open at a time
+        self._asking = asyncio.Semaphore(8)  # questions for quotes that are open at a time
+        self._asking_offers = asyncio.Semaphore(32)  # those for offers: a robot may take half a minute
 
-    async def of(self, model: str, objective: str, *, sender: str) -> list[dict[str, Any]]:
+    async def quotes(self, model: str, objective: str, *, sender: str) -> list[dict[str, Any]]:
         """What the robots of a model that are present want for an objective: the cheapest first, refusals last.
 
         Raises `WebError` if `sender` asks too often.
         """
-        if not self._limiter.allow(sender):
-            raise WebError("too many questions for quotes", hint="wait a moment", code="too-many-requests")
+        self._check(sender)
         parts = self._parts
         async with self._asking:
             robots = {one.address: one for one in await parts.robots.present(model, timeout=QUOTE_TIMEOUT)}
@@ -59,6 +60,22 @@ class Quotes:
                 objective=objective,
             )
             return [await self._json(quote, robots[quote.agent].name) for quote in quotes]
+
+    async def offer(self, request: AcceptDemand, *, sender: str) -> Accepted:
+        """The offer of a robot for a demand that is for it alone, or its refusal.
+
+        Raises `InvalidMessage`, `RemoteError`, and `WebError` if `sender` asks too often.
+        """
+        self._check(sender)
+        if not request.is_signed or request.demand.signature:
+            raise InvalidMessage("signature", "the maker of the order signs the request, and not yet the order")
+        parse_address(request.robot)
+        async with self._asking_offers:
+            return await asked_offer(self._parts.network.session, request)
+
+    def _check(self, sender: str) -> None:
+        if not self._limiter.allow(sender):
+            raise WebError("too many questions to robots", hint="wait a moment", code="too-many-requests")
 
     async def _json(self, quote: Quote, name: str) -> dict[str, Any]:
         token, validator = _address(quote.token), _address(quote.validator)

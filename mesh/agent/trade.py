@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent._hiring import Hiring
 from mesh.agent.contracts import (
     Attempt,
     Contract,
@@ -29,6 +28,7 @@ from mesh.agent.contracts import (
     seen_offers,
 )
 from mesh.agent.errors import ENDED, Declined, DemandDeclined, OtherRobot
+from mesh.agent.hiring import Hiring
 from mesh.agent.orders import (
     ALONE,
     EQUAL_DECLINED,

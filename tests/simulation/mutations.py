@@ -337,7 +337,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "a pair is sent to the providers once",
-        "mesh.agent._hiring:Hiring.send",
+        "mesh.agent.hiring:Hiring.send",
         "task.add_done_callback(lambda _task: self._under_way.discard(order))",
         "pass",
         "pair,drop",

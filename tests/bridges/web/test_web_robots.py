@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import json
+import secrets
 from typing import TYPE_CHECKING, Any
 
-from mesh import Demand, Verified  # noqa: TC001  handlers are read at run time
+import msgspec
+from msgspec.structs import replace
+
+from mesh import Demand, Verified
 from mesh.agent.errors import Declined
+from schemas import ZERO_ADDRESS, message_hash
+from schemas.rpc import AcceptDemand, OrderPair, SendDemand, SendOffer
 from tests.bridges.web.test_page_server import DATA
 from tests.mesh.agent.test_hiring import another, listening
 from tests.mesh.agent.test_quotes import priced
@@ -89,6 +95,89 @@ async def test_an_order_for_one_robot_is_seen_by_nobody_else(place: Place, serve
         assert "order" not in kinds
 
 
+async def demand_of(browser: Any, cost: int) -> Demand:
+    """An unsigned demand, as the page makes it."""
+    market = await browser.get("market")
+    return Demand(
+        model=MODEL,
+        objective=await made(browser),
+        token=market["token"]["address"],
+        cost=cost,
+        lighthouse=market["lighthouse"]["address"],
+        validator=ZERO_ADDRESS,
+        validator_fee=0,
+        deadline=market["block"] + 200,
+        nonce=secrets.token_hex(32),
+    )
+
+
+async def test_a_wallet_orders_from_one_robot_alone(place: Place, serve: Any) -> None:
+    signer, chain = place.market.accounts["person"].signer, place.chains["person"]
+    async with (
+        place.provider(),
+        working(place.agent("robot")) as robot,
+        another(place) as rival,
+        working(rival),
+        serve() as browser,
+        listening(place) as heard,
+        browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket,
+    ):
+        await socket.send_json({"subscribe": ["market"], "after": 0, "stream": browser.server.api.stream.id})
+        demand = await demand_of(browser, cost=9)
+        await chain.tokens.approve(chain.factory, 9)
+        asked = AcceptDemand(demand=SendDemand.of(demand), robot=robot.address, maker=signer.address)
+        await browser.post("pairs/offers", asked.encode(), status=400)  # nobody has signed it
+        whole = AcceptDemand(demand=SendDemand.of(signer.sign(demand)), robot=robot.address, maker=signer.address)
+        await browser.post("pairs/offers", whole.signed_by(signer).encode(), status=400)  # the robot could use it
+        accepted = await browser.post("pairs/offers", asked.signed_by(signer).encode())
+        offer = SendOffer.decode(msgspec.json.encode(accepted["offer"]))
+        pair = OrderPair(demand=SendDemand.of(signer.sign(demand)), offer=offer, maker=signer.address)
+        await browser.post("pairs", pair.encode(), status=400)
+        stranger = place.market.accounts["provider"].signer
+        await browser.post("pairs", replace(pair, maker=stranger.address).signed_by(stranger).encode(), status=400)
+        other = SendDemand.of(signer.sign(replace(demand, cost=8)))
+        await browser.post("pairs", replace(pair, demand=other).signed_by(signer).encode(), status=400)
+        signed = pair.signed_by(signer).encode()
+        posted, again = [await browser.post("pairs", signed, status=202) for _ in range(2)]
+        assert posted["order"] == again["order"]
+        order = posted["order"]
+        assert (order["private"], order["signature"], order["robot"]) == (True, "", robot.address)
+        assert order["hash"] == message_hash(demand).hex()
+        assert (await browser.get("orders"))["orders"] == []
+        job = await browser.get(f"liabilities/{await contract_of(browser, order['hash'])}")
+        assert (job["liability"]["promisor"], job["private"]) == (robot.address, True)
+        assert heard == []
+        kinds = set[str]()
+        async with asyncio.timeout(30):
+            while "matched" not in kinds:
+                kinds |= {event["kind"] for event in json.loads((await socket.receive()).data)}
+        assert "order" not in kinds
+        await browser.post(
+            "pairs", replace(pair, offer=replace(offer, signature="")).signed_by(signer).encode(), status=400
+        )
+
+
+async def test_a_pair_is_sent_until_a_provider_takes_it(place: Place, serve: Any) -> None:
+    signer, chain = place.market.accounts["person"].signer, place.chains["person"]
+    async with working(place.agent("robot")) as robot, serve() as browser:
+        demand = await demand_of(browser, cost=9)
+        await chain.tokens.approve(chain.factory, 9)
+        asked = AcceptDemand(demand=SendDemand.of(demand), robot=robot.address, maker=signer.address)
+        accepted = await browser.post("pairs/offers", asked.signed_by(signer).encode())
+        offer = SendOffer.decode(msgspec.json.encode(accepted["offer"]))
+        pair = OrderPair(demand=SendDemand.of(signer.sign(demand)), offer=offer, maker=signer.address)
+        posted = await browser.post("pairs", pair.signed_by(signer).encode(), status=202)
+
+        async def said() -> Any:
+            return (await browser.get(f"orders/{posted['order']['hash']}"))["statements"]
+
+        (statement,) = await until_found(said, what="that no provider answers")
+        assert (statement["kind"], statement["code"]) == ("rejected", "no-answer")
+        async with place.provider():
+            job = await browser.get(f"liabilities/{await contract_of(browser, posted['order']['hash'])}")
+            assert job["liability"]["promisor"] == robot.address
+
+
 async def test_a_robot_that_declines_an_order_for_it_alone_says_why(place: Place, serve: Any) -> None:
     robot = place.agent("robot")
 
@@ -102,6 +191,11 @@ async def test_a_robot_that_declines_an_order_for_it_alone_says_why(place: Place
         assert refused["error"]["code"] == "demand-declined"
         assert "50 wn at least" in refused["error"]["message"]
         await browser.post("local/orders", wanted | {"robot": "nobody"}, status=400)
+        signer = place.market.accounts["person"].signer
+        demand = SendDemand.of(await demand_of(browser, cost=7))
+        asked = AcceptDemand(demand=demand, robot=robot.address, maker=signer.address)
+        accepted = await browser.post("pairs/offers", asked.signed_by(signer).encode())
+        assert (accepted["decline"]["code"], accepted["decline"]["detail"]) == ("too-cheap", "50 wn at least")
 
 
 async def test_an_order_for_one_robot_is_known_after_a_restart(place: Place, serve: Any) -> None:

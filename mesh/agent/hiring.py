@@ -25,6 +25,8 @@ from schemas.signing import Decline, Rejection
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import zenoh
+
     from mesh.agent.components import AgentComponents
     from mesh.base.background import Background
     from schemas import Demand, Offer, Verified
@@ -36,6 +38,39 @@ ACCEPT_TIMEOUT: Final = 30.0
 """Seconds that a robot has to decide: it may fetch the objective first."""
 PROVIDERS: Final = 32
 """Providers that get a pair, at most."""
+
+
+async def asked_offer(session: zenoh.Session, request: AcceptDemand) -> Accepted:
+    """The robot's own offer for a demand that is for it alone, or its own refusal.
+
+    Raises `InvalidMessage`, `ServiceFailed`, and `RemoteError` (`not-its-answer`) for what is neither.
+    """
+    demand, robot = request.demand.message(), request.robot
+    accepted: Accepted = await call(session, robot, "accept", request, timeout=ACCEPT_TIMEOUT)
+    match accepted:
+        case Accepted(offer=SendOffer() as sent, decline=None):
+            answer: Verified[Offer] = verify_message(sent.message())
+            if answer.signer == robot and equal_terms(answer.message) == equal_terms(demand):
+                return accepted
+        case Accepted(offer=None, decline=Decline() as said):
+            if said.agent == robot and said.order == message_hash(demand).hex() and said.is_signed:
+                return accepted
+    raise RemoteError(
+        f"what answers for the robot {robot} is neither its offer nor its refusal",
+        hint="somebody else answers on its key; a router with a roster prevents that",
+        code="not-its-answer",
+    )
+
+
+async def send_pair(session: zenoh.Session, provider: str, pair: OrderPair) -> Rejection | None:
+    """Send a pair to a provider (address); returns what it says against it, unsigned."""
+    try:
+        taken: PairTaken = await call(session, provider, "pair", pair)
+        code, detail = taken.code, taken.detail
+    except RemoteError as error:
+        code, detail = error.code, "it does not answer, or takes no pairs"
+    order = message_hash(pair.demand.message()).hex()
+    return Rejection(order=order, reason=code, detail=detail, provider=provider) if code else None
 
 
 class Hiring:
@@ -77,7 +112,12 @@ class Hiring:
             offer = self._offers.pop(order, None) or await self._offer_of(demand, robot)
             lighthouse = await self._parts.chain.lighthouses.get(self._parts.settings.lighthouse_contract)
             providers = [*lighthouse.stakes][:PROVIDERS]
-            await asyncio.gather(*(self._send_to(provider, order, demand, offer) for provider in providers))
+            signer, session = self._parts.signer, self._parts.network.session
+            pair = OrderPair(demand=SendDemand.of(demand), offer=SendOffer.of(offer), maker=signer.address)
+            pair = pair.signed_by(signer)
+            for rejection in await asyncio.gather(*(send_pair(session, provider, pair) for provider in providers)):
+                if rejection is not None:
+                    self._rejected(rejection)
         except DemandDeclined as error:
             if (said := error.declines[0]).code != DEMAND_TAKEN:  # else the chain soon shows the contract here, too
                 self._declined(said)
@@ -85,34 +125,14 @@ class Hiring:
             facts = log_event("pair-not-sent", order=order, robot=robot, code=error.code)
             log.warning("the demand %s for %s can't be sent now: %s", order, robot, error, extra=facts)
 
-    async def _send_to(self, provider: str, order: str, demand: Demand, offer: Offer) -> None:
-        signer, session = self._parts.signer, self._parts.network.session
-        pair = OrderPair(demand=SendDemand.of(demand), offer=SendOffer.of(offer), maker=signer.address)
-        try:
-            taken: PairTaken = await call(session, provider, "pair", pair.signed_by(signer))
-            code, detail = taken.code, taken.detail
-        except RemoteError as error:
-            code, detail = error.code, "it does not answer, or takes no pairs"
-        if code:
-            self._rejected(Rejection(order=order, reason=code, detail=detail, provider=provider))
-
     async def _offer_of(self, demand: Demand, robot: str) -> Offer:
         """The robot's offer for a demand, of which it gets no signature."""
         signer, order = self._parts.signer, message_hash(demand).hex()
         unsigned = SendDemand.of(replace(demand, signature=""))
         request = AcceptDemand(demand=unsigned, robot=robot, maker=signer.address).signed_by(signer)
-        session = self._parts.network.session
-        accepted: Accepted = await call(session, robot, "accept", request, timeout=ACCEPT_TIMEOUT)
-        match accepted:
-            case Accepted(offer=SendOffer() as sent, decline=None):
-                answer: Verified[Offer] = verify_message(sent.message())
-                if answer.signer == robot and equal_terms(answer.message) == equal_terms(demand):
-                    return answer.message
-            case Accepted(offer=None, decline=Decline() as said):
-                if said.agent == robot and said.order == order and said.is_signed:
-                    raise DemandDeclined(order, (said,))
-        raise RemoteError(
-            f"what answers for the robot {robot} is neither its offer nor its refusal",
-            hint="somebody else answers on its key; a router with a roster prevents that",
-            code="not-its-answer",
-        )
+        accepted = await asked_offer(self._parts.network.session, request)
+        if accepted.decline is not None:
+            raise DemandDeclined(order, (accepted.decline,))
+        assert accepted.offer is not None
+        offer: Offer = accepted.offer.message()
+        return offer
