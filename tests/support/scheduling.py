@@ -14,7 +14,7 @@ TOGETHER: Final = ("tests/web", "tests/bridges/ipfs", "tests/bridges/ros1", "tes
 
 SECONDS: Final[dict[str, int]] = {
     "tests/web": 805,
-    "tests/bridges/ipfs": 510,
+    "tests/bridges/ipfs": 400,
     "tests/mesh/agent/test_jobs_behind_providers.py": 300,
     "tests/contracts": 220,
     "tests/examples/test_blink.py": 200,
@@ -27,8 +27,8 @@ SECONDS: Final[dict[str, int]] = {
     "tests/bridges/ros1": 110,
     "tests/mesh/dev/test_demo.py": 90,
     "tests/mesh/cli/test_demand_validator.py": 90,
-    "tests/peers/test_install.py": 80,
-    "tests/bridges/serial/test_firmware.py": 90,
+    "tests/peers/test_install.py": 40,
+    "tests/bridges/serial/test_firmware.py": 50,
     "tests/mesh/cli/test_restarts.py": 75,
     "tests/mesh/validator/test_tampered_on_chain.py": 70,
     "tests/mesh/cli/test_two_providers.py": 70,
