@@ -24,6 +24,8 @@ COPY LICENSE README.md pyproject.toml ./
 COPY schemas schemas
 COPY mesh mesh
 COPY bridges bridges
+# The header of boards, which `aira new device` writes.
+COPY examples/firmware/AiraFrames/src examples/firmware/AiraFrames/src
 RUN /tools/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /wheels .
 
 FROM tools AS edge-environment
