@@ -85,7 +85,7 @@ function Following<T>(props: { path: string; topic: string; model: Description |
   }, [gathered]);
   if (error) return <Problem error={error} retry={() => setTurn((known) => known + 1)} />;
   if (!gathered) return <p class="quiet" aria-busy="true">{texts.loading}</p>;
-  if (!gathered.tracks.length) return <p class="quiet waiting">{props.empty}</p>;
+  if (!gathered.tracks.length) return <p class="empty quiet">{props.empty}</p>;
   const isLong = gathered.to - gathered.from > WINDOW;
   return (
     <>

@@ -16,6 +16,10 @@ test("samples become columns by topic and role, with holes where a message had n
   assert.deepEqual(tracks[0].columns, [{ name: "x", values: [1, 2, null] }, { name: "y", values: [null, 5, 6] }]);
 });
 
+test("a name that a message has twice counts once", () => {
+  assert.deepEqual(only([sample("/a", 1, [["x", 1], [".x", 2]]), sample("/a", 2, [["x", 3]])]).columns, [{ name: "x", values: [1, 3] }]);
+});
+
 test("times of what is live count from the first sample, and an older one is left out", () => {
   const track = only([sample("/a", 1_700_000_000, [["", 1]]), sample("/a", 1_700_000_002.5, [["", 2]]), sample("/a", 1_700_000_001, [["", 3]]), sample("/a", NaN, [["", 4]])]);
   assert.deepEqual(track.at, [0, 2.5]);
@@ -71,7 +75,7 @@ test("what moves on a plane or on the earth is a path; what only has an x and a 
 test("a few short words over time are states; sentences are not", () => {
   const said = (...words: string[]) => words.map((text, at) => ({ at, text }));
   assert.deepEqual(statesOf(said("on", "on", "off", "on"), 9), [{ text: "on", from: 0, to: 2 }, { text: "off", from: 2, to: 3 }, { text: "on", from: 3, to: 9 }]);
-  assert.deepEqual([statesOf(said("on", "off"), 9), statesOf(said("a", "b", "a", "something is in the way"), 9).length, statesOf(said("a", "b", "something is in the way, waiting"), 9), statesOf([], 9)], [[], 4, [], []]);
+  assert.deepEqual([statesOf(said("on", "off"), 9), statesOf(said("a", "b", "a", "something is in the way"), 9).length, statesOf(said("a", "b", "something is in the way, waiting"), 9), statesOf(said("a", "b", "c", "d", "e", "f", "g"), 9), statesOf([], 9)], [[], 4, [], [], []]);
 });
 
 test("the envelope of a message is not plotted, and words beside numbers are kept", () => {
