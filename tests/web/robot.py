@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 import struct
 import sys
 import zlib
 from pathlib import Path
 from typing import Any
 
-from mesh import Agent, Demand, Job, JobFailed, Verified, cid_of_file
+from mesh import Agent, Demand, Job, JobFailed, QuoteRequest, Verified, cid_of_file
 
 STEPS = 20
 
@@ -31,6 +32,13 @@ def picture(shade: int) -> bytes:
 model = Path(sys.argv[1])
 agent = Agent(cid_of_file(model))
 said = sys.argv[2] if len(sys.argv) > 2 else "drove"
+
+
+if price := os.environ.get("ROBOT_PRICE"):
+
+    @agent.on_quote
+    async def quote(_request: QuoteRequest) -> str:
+        return price
 
 
 @agent.on_demand
