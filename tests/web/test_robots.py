@@ -50,7 +50,7 @@ def test_a_newcomer_orders_from_the_cheaper_robot_watches_it_and_stops_it(
         check(browser, pictures / "robots-two.png")
         browser.press("Order")
         browser.type("Duration", "60")
-        browser.until(lambda: len(browser.all(".quote")) == 3, "the quotes of both robots")
+        browser.until(lambda: len(browser.all(".quote")) > 1, "the quotes")
         browser.click(f".quote [value='{scout}']")
         browser.sees("2.5 XRT")
         check(browser, pictures / "quotes.png")
