@@ -54,22 +54,25 @@ function Following<T>(props: { path: string; topic: string; model: Description |
   const [turn, setTurn] = useState(0);
   const [whole, setWhole] = useState(props.clock);
   const [, setSeen] = useState(0);
-  const waiting = useRef<Sample[]>([]);
+  /** What comes while the answer is on its way. */
+  const waiting = useRef<Sample[] | null>([]);
   useTopic(topic, (event) => {
     if (event.kind === "gap") setTurn((known) => known + 1);
     else if (event.kind !== "message") return;
-    else if (gathered) gathered.add(event.data);
+    else if (!waiting.current) gathered?.add(event.data);
     else if (waiting.current.push(event.data) > 2 * MOST_MESSAGES) waiting.current.shift();
   });
   useEffect(() => {
     const stopped = new AbortController();
+    waiting.current ??= [];
     setError(null);
     get<T>(path, stopped.signal).then(
       (answer) => {
         const made = new Gathered(!props.clock);
         for (const sample of props.samplesOf(answer)) made.add(sample);
         // What came meanwhile is in the answer, too, up to the last one of its topic there.
-        for (const sample of waiting.current.splice(0)) if (sample.at > made.lastOf(sample.topic, sample.role)) made.add(sample);
+        for (const sample of waiting.current ?? []) if (sample.at > made.lastOf(sample.topic, sample.role)) made.add(sample);
+        waiting.current = null;
         setGathered(made);
       },
       (problem) => {
@@ -83,12 +86,13 @@ function Following<T>(props: { path: string; topic: string; model: Description |
     const timer = setInterval(() => setSeen(gathered.count), REFRESH);
     return () => clearInterval(timer);
   }, [gathered]);
-  if (error) return <Problem error={error} retry={() => setTurn((known) => known + 1)} />;
-  if (!gathered) return <p class="quiet" aria-busy="true">{texts.loading}</p>;
+  const problem = error ? <Problem error={error} retry={() => setTurn((known) => known + 1)} /> : null;
+  if (!gathered) return problem ?? <p class="quiet" aria-busy="true">{texts.loading}</p>;
   if (!gathered.tracks.length) return <p class="empty quiet">{props.empty}</p>;
   const isLong = gathered.to - gathered.from > WINDOW;
   return (
     <>
+      {problem}
       {isLong ? (
         <div class="segments" role="group" aria-label={texts.inView}>
           {[false, true].map((all) => <button key={String(all)} type="button" aria-pressed={whole === all} onClick={() => setWhole(all)}>{all ? texts.wholeTime : texts.lastMinute}</button>)}

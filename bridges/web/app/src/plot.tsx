@@ -5,7 +5,7 @@ import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
 import { plain } from "./format";
 import { texts } from "./texts";
-import { columnOf, elapsed, figure, numberAt, placeAt, placesOf, roundLength } from "./tracks";
+import { columnOf, elapsed, figure, numberAt, placeAt, placesOf, roundLength, tickText } from "./tracks";
 import type { Position, Series, Track } from "./tracks";
 
 const SERIES = 8;
@@ -195,7 +195,7 @@ function optionsOf(element: HTMLElement, series: Series[], track: Track, isClock
     axes: [
       { ...axis, size: 26, space: 70, grid: { show: false }, values: (_, ticks, __, ___, step) => ticks.map((tick) => isClock ? clock(tick, step) : elapsed(tick, Number.isInteger(tick) ? 0 : 1)) },
       { ...axis, size: (_, ticks) => 14 + 7 * Math.max(2, ...(ticks ?? []).map((tick) => tick.length)), space: 34,
-        values: (_, ticks) => series[0].isBoolean ? ticks.map((tick) => tick === 0 ? texts.no : tick === 1 ? texts.yes : "") : ticks.map(figure) },
+        values: (_, ticks, __, ___, step) => ticks.map((tick) => !series[0].isBoolean ? tickText(tick, step) : tick === 0 ? texts.no : tick === 1 ? texts.yes : "") },
     ],
     series: [
       {},

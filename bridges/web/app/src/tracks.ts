@@ -322,6 +322,12 @@ export function figure(number: number): string {
   return grouped(number.toFixed(size >= 1000 ? 0 : size >= 100 ? 1 : size >= 1 ? 2 : 3));
 }
 
+/** A number on an axis whose numbers are `step` apart: with as many decimals as tell them apart. */
+export function tickText(tick: number, step: number): string {
+  const digits = String(step).split(".")[1]?.length ?? 0;
+  return step < 1e-5 || Math.abs(tick) >= 1e9 ? figure(tick) : grouped(tick.toFixed(digits));
+}
+
 const grouped = (number: string) => number.replace(/^(-?\d+)/, (whole) => whole.replace(/\B(?=(\d{3})+$)/g, " ")).replace("-", "−");
 
 /** Seconds from a beginning: 3.2 s, 2:05, 1:02:05. */

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { Gathered, MOST_COLUMNS, MOST_MESSAGES, MOST_POINTS, MOST_TRACKS, elapsed, figure, gather, inOrder, latest, placeAt, placesOf, roundLength, statesOf, viewOf, withoutNumbers } from "../src/tracks";
+import { Gathered, MOST_COLUMNS, MOST_MESSAGES, MOST_POINTS, MOST_TRACKS, elapsed, figure, gather, inOrder, latest, placeAt, placesOf, roundLength, statesOf, tickText, viewOf, withoutNumbers } from "../src/tracks";
 import type { Sample } from "../src/tracks";
 
 const sample = (topic: string, at: number, numbers: Sample["numbers"], more: Partial<Sample> = {}): Sample =>
@@ -93,6 +93,7 @@ test("what the robot sent comes first, in the order of the description", () => {
 
 test("numbers and times are short", () => {
   assert.deepEqual([0, 5, 12345, 12345.6, 123.45, 1.2345, -0.12345, 0.00001, 3e12].map(figure), ["0", "5", "12 345", "12 346", "123.5", "1.23", "−0.123", "1.00e-5", "3.00e12"]);
+  assert.deepEqual([tickText(-172.85, 0.05), tickText(2, 2.5), tickText(12000, 500)], ["−172.85", "2.0", "12 000"]);
   assert.deepEqual([elapsed(3.21), elapsed(125), elapsed(3725.9)], ["3.2 s", "2:05", "1:02:05"]);
   assert.deepEqual([roundLength(7), roundLength(0.3), roundLength(199)], [5, 0.2, 100]);
   assert.deepEqual([placeAt([1, 2, 2, 3], 2), placeAt([1], 0), placeAt([], 1), placeAt([1, 2], 9)], [2, -1, -1, 1]);
