@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from bridges.serial.dialect import AUTO, dialect_names
-from mesh.cli.options import with_settings
+from mesh.cli.options import FiniteRange, with_settings
 from mesh.errors import AiraError, InputError
 from mesh.role.running import fail
 from mesh.settings import EdgeSettings, NetworkSettings, TelemetrySettings
@@ -104,7 +104,7 @@ def _number(text: str) -> int | float | str:
 @click.option("--baud", type=BaudRate(), default=AUTO, show_default=True, help="bits per second; auto finds them")
 @click.option(
     "--patience",
-    type=click.FloatRange(0, 3600),
+    type=FiniteRange(0, 3600),
     default=30.0,
     show_default=True,
     help="seconds for which a command waits while the board is absent or busy",

@@ -27,7 +27,7 @@ from mesh.base.background import Background
 from mesh.cli.chain_client import check_balance
 from mesh.cli.files import file_or_cid, model_named, require_writable
 from mesh.cli.liability import device_lines
-from mesh.cli.options import ADDRESS, PATH, AmountText, with_json, with_settings
+from mesh.cli.options import ADDRESS, PATH, SECONDS, AmountText, with_json, with_settings
 from mesh.cli.order import withdraw_orders, withdrawal_lines
 from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress, wait_for_broken_pipe
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
@@ -513,7 +513,7 @@ async def agreed_fee(
 )
 @click.option(
     "--start-within",
-    type=click.FloatRange(min=0, min_open=True),
+    type=SECONDS,
     metavar="SECONDS",
     help="stop a robot that does not begin so many seconds after the contract; the job has failed then [wait]",
 )

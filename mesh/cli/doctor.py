@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal, get_args
 
 import click
 
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.options import FiniteRange, with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable
 from mesh.errors import InputError
 from mesh.ops.doctor.checks import CheckStatus, DoctorContext, Role, SerialSettings, with_identity
@@ -30,7 +30,7 @@ MARK: Final = 6
 )
 @click.option(
     "--timeout",
-    type=click.FloatRange(0, 600, min_open=True),
+    type=FiniteRange(0, 600, min_open=True),
     default=15.0,
     show_default=True,
     help="time limit in seconds for all checks together",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.options import FILE, FOLDER, with_json, with_settings
+from mesh.cli.options import FILE, FOLDER, FiniteRange, with_json, with_settings
 from mesh.cli.output import print_result, printable
 from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.ops.identity.roster import ROLES
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mesh.ops.identity.roster import Member
     from mesh.settings import Settings
 
-DAYS = click.FloatRange(0, 36_500, min_open=True)
+DAYS = FiniteRange(0, 36_500, min_open=True)
 SITE = click.option("--site", required=True, type=FOLDER, help="folder of the site, created by `aira identity site`")
 ROSTER = click.option("--roster", type=FILE, help="roster file of the site, to update")
 

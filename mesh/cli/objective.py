@@ -29,7 +29,7 @@ from mesh.cli.files import (
     writing,
 )
 from mesh.cli.lazy import LazyGroup
-from mesh.cli.options import PATH, with_json, with_settings
+from mesh.cli.options import PATH, SECONDS, with_json, with_settings
 from mesh.cli.output import (
     format_duration,
     format_size,
@@ -568,7 +568,7 @@ def _print_schemas(objective: Objective) -> None:
 @click.option(
     "--hear", "keys", multiple=True, metavar="KEY", help="record the messages on this key expression (may be repeated)"
 )
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="how long to record [until Ctrl-C]")
+@click.option("--seconds", type=SECONDS, help="how long to record [until Ctrl-C]")
 @with_json
 @with_settings(NetworkSettings)
 def pack_objective(

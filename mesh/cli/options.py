@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial, wraps
 from inspect import iscoroutinefunction
 from pathlib import Path
@@ -32,12 +33,25 @@ class AmountText(click.ParamType[str]):
         return text
 
 
+class FiniteRange(click.FloatRange):
+    """A range of numbers. NaN, which click takes for a member of every range, and infinity are in none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{number} is not a finite number.", param, ctx)
+        return number
+
+
 PATH: Final = click.Path(path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
 FOLDER: Final = click.Path(file_okay=False, path_type=Path)
 PORT: Final = click.IntRange(0, 65_535)
-BLOCK_TIME: Final = click.FloatRange(0.01, 86_400)
+BLOCK_TIME: Final = FiniteRange(0.01, 86_400)
 """Seconds."""
+SECONDS: Final = FiniteRange(0, 366 * 86_400, min_open=True)
+"""A time of at most a year."""
 
 CHAIN_SETTINGS: Final = (
     "web3_http_provider",
@@ -110,8 +124,7 @@ def with_json(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def with_timeout(seconds: float | None = 3.0, *, meaning: str = "seconds to wait") -> Callable[..., Any]:
     """Give a command `--timeout`."""
-    kind = click.FloatRange(min=0, min_open=True)
-    return click.option("--timeout", type=kind, default=seconds, show_default=seconds is not None, help=meaning)
+    return click.option("--timeout", type=SECONDS, default=seconds, show_default=seconds is not None, help=meaning)
 
 
 def with_first_block(meaning: str) -> Callable[..., Any]:

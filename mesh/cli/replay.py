@@ -12,7 +12,7 @@ import zenoh
 
 from mesh.cli.chain_client import open_chain, own_address
 from mesh.cli.files import FETCH_SETTINGS, fetch, file_of, names_in, opened_store
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.options import FiniteRange, with_json, with_settings
 from mesh.cli.output import format_duration, plural, print_result, progress, said_by
 from mesh.errors import ConfigurationError, InputError
 from mesh.recording import GENEROUS, AtOnce, RecordedTimes, open_objective, play
@@ -44,11 +44,9 @@ Destination: TypeAlias = "Callable[[str, str], str]"
 @click.option(
     "--role", type=click.Choice(ROLES), help="publish only messages of the objective, the device or the agent"
 )
-@click.option(
-    "--rate", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, help="speed factor"
-)
+@click.option("--rate", type=FiniteRange(1e-6, 1e6), default=1.0, show_default=True, help="speed factor")
 @click.option("--at-once", is_flag=True, help="publish without pauses")
-@click.option("--from", "start", type=click.FloatRange(min=0), default=0.0, help="skip this many seconds at the start")
+@click.option("--from", "start", type=FiniteRange(0, 1e9), default=0.0, help="skip this many seconds at the start")
 @with_json
 @with_settings(*FETCH_SETTINGS, ChainSettings)
 async def command(

@@ -45,6 +45,11 @@ def test_an_empty_flag_wins_over_a_variable() -> None:
         ("demand", "--model", CID, "--objective", CID, "--validator-fee", "much"),
         ("demand", "--model", CID, "--objective", CID, "--lifetime", "0"),
         ("demo", "--generation", "4"),
+        ("robots", "--timeout", "nan"),
+        ("replay", CID, "--rate", "1e-300"),
+        ("replay", CID, "--from", "1e300"),
+        ("status", "--timeout", "inf"),
+        ("rpc", CID, "start", "--timeout", "1e300"),
     ],
 )
 def test_an_error_of_an_invalid_number_names_its_flag(arguments: tuple[str, ...]) -> None:
@@ -89,6 +94,17 @@ def options(flag: str) -> dict[str, click.Option]:
     """The option of each command that has it."""
     found = ((words, one) for words, command in commands() for one in command.params if flag in one.opts)
     return {words: one for words, one in found if isinstance(one, click.Option)}
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e999"])
+def test_every_number_is_finite(value: str) -> None:
+    numbers = [
+        one for _, command in commands() for one in command.params if isinstance(one.type, click.types.FloatParamType)
+    ]
+    assert len(numbers) > 15
+    for one in numbers:
+        with pytest.raises(click.BadParameter):
+            one.type.convert(value, one, None)
 
 
 def test_a_port_is_the_number_of_a_tcp_port_in_every_command() -> None:
