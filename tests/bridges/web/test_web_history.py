@@ -24,8 +24,9 @@ async def test_what_an_account_has_earned_and_what_was_ordered_is_told(place: Pl
         before = len((await browser.get("market/history"))["jobs"])
         earlier = len((await browser.get(f"accounts/{robot.address}/statement"))["contracts"])
         wanted = {"model": MODEL, "objective": await made(browser), "cost": str(COST)}
-        posted = await browser.post("local/orders", wanted, status=202)
-        address = await contract_of(browser, posted["order"]["hash"])
+        for _ in range(2):
+            posted = await browser.post("local/orders", wanted, status=202)
+            address = await contract_of(browser, posted["order"]["hash"])
 
         async def paid() -> Any:
             return (await browser.get(f"liabilities/{address}"))["liability"]["state"] == "paid"
@@ -35,7 +36,7 @@ async def test_what_an_account_has_earned_and_what_was_ordered_is_told(place: Pl
         history = await browser.get("market/history", model=MODEL)
         assert not history["truncated"]
         newest = history["jobs"][0]
-        assert len(history["jobs"]) == before + 1
+        assert len(history["jobs"]) == before + 2
         assert [newest[name] for name in ("address", "cost", "state", "promisor", "promisee")] == [
             *(address, str(COST), "paid", robot.address, person)
         ]
@@ -47,7 +48,7 @@ async def test_what_an_account_has_earned_and_what_was_ordered_is_told(place: Pl
         await browser.get("market/history", status=400, model="none")
     async with serve() as browser:  # which has no statement yet
         statement = await browser.get(f"accounts/{place.address('robot')}/statement")
-        assert len(statement["contracts"]) == earlier + 1
+        assert len(statement["contracts"]) == earlier + 2
         last = statement["contracts"][-1]
         assert (last["liability"], last["earned"], last["promisee"]) == (address, str(COST), person)
         assert statement["sums"]
