@@ -383,9 +383,14 @@ class PersonRole(Role):
         if draw("order-withdrawn", self.market.whims.withdraw):
             await asyncio.sleep(chance.uniform(0.1, 20))
             on_chain = chance.random() < 0.5
-            await (order.withdraw_on_chain() if on_chain else order.withdraw())
-            wanted.used_up = on_chain
-            self.market.trace(self.name, "withdrew", order=order.hash[:12], on_chain=on_chain)
+            try:
+                await (order.withdraw_on_chain() if on_chain else order.withdraw())
+            except OrderClosed as error:
+                if error.state != OrderState.MATCHED or not wanted.retry:
+                    raise  # its agent does not order this job again, so the person may turn to the next one
+            else:
+                wanted.used_up = on_chain
+                self.market.trace(self.name, "withdrew", order=order.hash[:12], on_chain=on_chain)
         return await order.contract()
 
     def _choose(self, wanted: Ordered) -> DemandTerms:
