@@ -176,12 +176,13 @@ async def test_an_upload_that_breaks_off_leaves_nothing(
 async def test_a_lifetime_that_no_provider_takes_is_refused_before_anything_is_approved(
     place: Place, serve: Any, lifetime: int
 ) -> None:
-    chain = place.chains["person"]
+    chain, person = place.chains["person"], place.address("person")
     async with serve("person") as browser:
+        before = await chain.tokens.allowance(person, chain.factory)
         data = {"X-Aira-Request": "1", "Content-Type": "application/octet-stream"}
         cid = (await browser.post("objectives", objective(("/blink", "on")), headers=data))["cid"]
         order = {"model": MODEL, "objective": cid, "cost": "5", "lifetime": lifetime}
         refused = await browser.post("local/orders", order, status=400)
         assert refused["error"]["code"] == "invalid-lifetime"
-        assert await chain.tokens.allowance(place.address("person"), chain.factory) == 0
+        assert await chain.tokens.allowance(person, chain.factory) == before
         assert browser.server.components.agent.orders() == []

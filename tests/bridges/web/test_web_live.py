@@ -25,13 +25,14 @@ PNG = b"\x89PNG\r\n\x1a\n" + bytes(100)
 
 
 async def received(socket: ClientWebSocketResponse, topic: str, number: int) -> list[Any]:
-    """The data of the first events of a topic, whose kind is `message`."""
+    """The samples of devices in the first events of a topic."""
     found: list[Any] = []
     async with asyncio.timeout(30):
         while len(found) < number:
             events = json.loads((await socket.receive()).data)
-            found += [event["data"] for event in events if event.get("topic") == topic and event["kind"] == "message"]
-    return found
+            told = [event["data"] for event in events if event.get("topic") == topic and event["kind"] == "message"]
+            found += [sample for sample in told if sample["role"] == "device"]
+    return found[:number]
 
 
 async def test_what_a_job_publishes_is_seen_while_it_runs_and_afterwards(place: Place, serve: Any) -> None:
