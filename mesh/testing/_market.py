@@ -61,6 +61,23 @@ ANY_MODEL: Final = cid_of_bytes(b"what a robot of a test does that names no mode
 """The model of orders from robots that do any."""
 
 
+class _NodeLine:
+    """The way to the node of a market."""
+
+    def __init__(self, node: EmbeddedChain) -> None:
+        self._node = node
+        self.is_down = False
+
+    async def make_request(self, method: str, params: Any) -> Any:
+        """The node's response. Raises `ConnectionRefusedError` while the node is down."""
+        if self.is_down:
+            raise ConnectionRefusedError("the node is down")
+        return await self._node.provider.make_request(method, params)
+
+    def __str__(self) -> str:
+        return "the node of the market"
+
+
 class MarketChain(Lifecycle):
     """An Ethereum node in this process with the contracts: `async with MarketChain() as chain`, then `Market(chain)`.
 
@@ -72,6 +89,7 @@ class MarketChain(Lifecycle):
 
     def __init__(self) -> None:
         self.node = EmbeddedChain()
+        self._line = _NodeLine(self.node)
         self._market: DevelopmentMarket | None = None
         self._numbers = count(1)
 
@@ -91,7 +109,7 @@ class MarketChain(Lifecycle):
 
     def chain(self, account: Account) -> Chain:
         """The chain for an account, not yet open."""
-        return Chain(self.node.provider, account=account, ens=self.market.deployment.ens, timing=TIMING)
+        return Chain(self._line, account=account, ens=self.market.deployment.ens, timing=TIMING)
 
     def new_account(self) -> Account:
         """An account that was never used; the accounts of each run are the same, in the same order."""
@@ -325,6 +343,15 @@ class Market(Lifecycle):
             raise InputError(why, hint="the blocks before made the market itself", code="too-deep")
         await self.chain.node.request("evm_revert", [hex(head - depth)])
         await self.chain.node.mine(depth + 1)
+
+    @asynccontextmanager
+    async def node_down(self) -> AsyncIterator[None]:
+        """Meanwhile no node answers, neither the robots and people nor the provider; `mine` and `reorg` still work."""
+        self.chain._line.is_down = True
+        try:
+            yield
+        finally:
+            self.chain._line.is_down = False
 
     async def _default_customer(self) -> Agent:
         if self._customer is None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh import XRT, Agent, AiraError, Declined, Demand, DemandDeclined, Job, JobFailed, Settings, Verified
+from mesh.chain import NodeUnreachable
 from mesh.testing import Market, assert_declined, assert_paid, assert_refunded
 from schemas import Withdrawal
 
@@ -196,3 +197,14 @@ async def test_a_robot_that_can_not_start_says_why(market: Market) -> None:
     with pytest.raises(AiraError, match=re.escape("can't read the model")):
         async with market.robot(Agent(Path("/nowhere.json"))):
             """It does not come here."""
+
+
+async def test_a_job_that_ends_without_a_node_is_paid_when_the_node_is_back(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        contract = await market.demand(forklift, [("/lift", 0.0)], cost=PRICE)
+        await market.running(contract)
+        async with market.node_down():
+            with pytest.raises(NodeUnreachable):
+                await xrt_of(forklift)
+            forklift.released.set()
+        assert_paid(await market.outcome(contract))
