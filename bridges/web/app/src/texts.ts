@@ -104,6 +104,7 @@ export const texts = {
   yourRobot: "Is it your robot? Log in to run it",
   operatorTokenHint: "It is in the operators' token file of the server.",
   runIt: "Run it",
+  notFromHere: "This robot does not let this page run it. Run it on its own machine, with `aira robot`, or let the page: open_services = true in its settings, where only its owner's programs reach the router.",
   stopRobot: "Stop the robot",
   stopRobotHint: "The device is told at once, and the job that it does ends: the customer gets the price back. It takes no job until you release it.",
   stoppedByOwner: "stopped by its owner",

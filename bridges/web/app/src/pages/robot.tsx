@@ -1,7 +1,7 @@
 import { useEffect, useState } from "preact/hooks";
 import { isAddress } from "viem";
 import type { Address } from "viem";
-import { post } from "../api";
+import { ApiError, post } from "../api";
 import { useApp, useData, useModel, useTopic } from "../app";
 import { amount, clock, plain } from "../format";
 import { Readings } from "../live";
@@ -88,7 +88,8 @@ function Owner({ robot }: { robot: Agent }) {
   return (
     <section class="panel owner">
       <h2>{texts.runIt}</h2>
-      <Show of={rules}>{(known) => <Controls key={JSON.stringify(known)} robot={robot} rules={known} changed={rules.reload} />}</Show>
+      {rules.error instanceof ApiError && rules.error.code === "service-failed" && !rules.data ? <p class="callout">{texts.notFromHere}</p> : null}
+      <Show of={rules.error instanceof ApiError && rules.error.code === "service-failed" ? { ...rules, error: null } : rules}>{(known) => <Controls key={JSON.stringify(known)} robot={robot} rules={known} changed={rules.reload} />}</Show>
       <Income address={robot.address} />
       <Log address={robot.address} />
     </section>
