@@ -305,7 +305,7 @@ function Review(props: { of: Prepared; isWanted: () => boolean; close: () => voi
         of={[
           [texts.youPayShort, <strong>{amount(draft.cost, market.token)}</strong>],
           [texts.to, draft.robot ? <>{robot ? <strong>{nameOf(robot)}</strong> : null} <Name text={draft.robot} label={draft.robot} /></> : texts.anybody],
-          [texts.ifStopped, wish.model.description?.onStop ? texts.stopCosts[wish.model.description.onStop] : ""],
+          [texts.ifStopped, wish.model.description ? texts.stopCosts[wish.model.description.onStop ?? "refund"] : ""],
           [texts.validator, draft.validator === zeroAddress ? "" : <Name text={draft.validator} label={draft.validator} />],
           [texts.validatorFee, draft.validatorFee ? amount(draft.validatorFee, market.xrt) : ""],
         ]}
