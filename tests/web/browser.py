@@ -213,9 +213,15 @@ class Browser:
         self.until(lambda: next(one for one in self.all(css) if one.is_displayed() and one.is_enabled()), css)
         self.until(lambda: self._clicked(css), f"a click on {css}")
 
+    def _show(self, element: WebElement) -> None:
+        """Move it into the middle of the screen, away from what stands above the page on phones."""
+        self.driver.execute_script("arguments[0].scrollIntoView({ block: 'center' })", element)
+
     def _clicked(self, css: str) -> bool:
         try:
-            next(one for one in self.all(css) if one.is_displayed() and one.is_enabled()).click()
+            one = next(one for one in self.all(css) if one.is_displayed() and one.is_enabled())
+            self._show(one)
+            one.click()
         except WebDriverException:
             return False
         return True
@@ -229,6 +235,7 @@ class Browser:
                 one for one in self.driver.find_elements(By.XPATH, path) if one.is_displayed() and one.is_enabled()
             )
             try:
+                self._show(one)
                 one.click()
             except WebDriverException:
                 return False
