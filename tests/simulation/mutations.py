@@ -320,6 +320,7 @@ MUTATIONS: Final = (
         "if not (ended.success or is_customers or number > self._total):",
         "self._called_off.clear()\n            if not (ended.success or number > self._total):",
         "retry,stop",
+        seeds=60,
     ),
     Mutation(
         "a job that failed is not ordered again",
