@@ -34,11 +34,12 @@ agent = Agent(cid_of_file(model))
 said = sys.argv[2] if len(sys.argv) > 2 else "drove"
 
 
-if price := os.environ.get("ROBOT_PRICE"):
+PRICE = os.environ.get("ROBOT_PRICE", "")
+if PRICE:
 
     @agent.on_quote
     async def quote(_request: QuoteRequest) -> str:
-        return price
+        return PRICE
 
 
 @agent.on_demand
