@@ -132,10 +132,12 @@ class Orders:
         """Bind a demand and an offer to each other by the will of the demand's maker, and begin to settle them.
 
         From now on neither is matched with another order. Its maker may bind a demand to a later offer; an offer stays
-        with its first demand. Returns why that can't be.
+        with its first demand, and with what its maker signs in its place. Returns why that can't be.
         """
         demand, offer = (order_id(order) for order in pair)
-        if self._pairs.get(offer, demand) != demand or any(self.settling(one) for one in (demand, offer)):
+        bound = self._pairs.get(offer, demand)
+        is_another = bound != demand and not self.versions.has_version(bound, pair.demand)
+        if is_another or any(self.settling(one) for one in (demand, offer)):
             return Refusal.DUPLICATE
         for order in pair:
             self._note(order)
@@ -448,6 +450,10 @@ class OrderVersions:
         if undecided is not None and self._is_open(undecided, head):
             others.add(undecided.identity)
         return None if others == {identity} else Refusal.UNDECIDED
+
+    def has_version(self, identity: bytes, order: Verified[Order]) -> bool:
+        """Whether an order is a version of the one with this identity, by the same maker."""
+        return order.message.generation == 5 and self._keys.get(identity) == (lasting_hash(order.message), order.signer)
 
     def is_undecided(self, identity: bytes, head: int) -> bool:
         """Whether, at block `head`, a transaction with a version of this order may still succeed."""

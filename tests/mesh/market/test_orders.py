@@ -20,6 +20,8 @@ from tests.support.orders import (
     MODEL,
     OBJECTIVE,
     OTHER_MODEL,
+    PERSON,
+    ROBOT,
     result,
     verified_demand,
     verified_offer,
@@ -64,6 +66,24 @@ def test_an_offer_stays_with_its_first_demand_and_a_demand_may_get_another_offer
     assert orders.pair(Match(demand, later), head=0) is None
     assert orders.is_pair(Match(demand, later))
     assert [orders.is_paired(one) for one in (demand, later, offer)] == [True, True, False]
+
+
+def test_an_offer_goes_on_with_what_is_signed_in_place_of_its_demand() -> None:
+    """In generation 5 a demand whose nonce another order has used is signed again, and the offer need not be."""
+    orders, offer = orders_with(), verified_offer(nonce=3, sender=ROBOT.address)
+    first, again = (verified_demand(nonce=nonce, sender=PERSON.address) for nonce in (7, 8))
+    costlier = verified_demand(nonce=9, sender=PERSON.address, cost=2)
+    of_another = verified_demand(signer=ROBOT, nonce=9, sender=ROBOT.address)
+    assert orders.pair(Match(first, offer), head=0) is None
+    for order in (first, offer):
+        orders.end(order)
+    assert [orders.pair(Match(one, offer), head=0) for one in (costlier, of_another)] == [Refusal.DUPLICATE] * 2
+    assert orders.pair(Match(again, offer), head=0) is None
+    assert orders.is_pair(Match(again, offer))
+    for order in (again, offer):
+        orders.end(order)
+    assert orders.pair(Match(first, offer), head=0) is Refusal.REPLACED
+    assert orders.is_pair(Match(again, offer))
 
 
 def test_a_pair_takes_its_orders_out_of_the_book() -> None:
