@@ -9,7 +9,7 @@ import "./live.css";
 import { Path, Plot } from "./plot";
 import type { Frame } from "./plot";
 import { texts } from "./texts";
-import { Gathered, MOST_MESSAGES, MOST_PICTURES, MOST_STATES, MOST_TRACKS, elapsed, gather, inOrder, latest, placeAt, statesOf, topicOf, viewOf, withoutNumbers } from "./tracks";
+import { Gathered, MOST_MESSAGES, MOST_PICTURES, MOST_STATES, MOST_TRACKS, elapsed, inOrder, latest, placeAt, statesOf, topicOf, viewOf, withoutNumbers } from "./tracks";
 import type { Sample, State, Track } from "./tracks";
 import type { Description, Message, Summary, TopicSummary, ValueSchema, Values } from "./types";
 import { Action, Badge, Problem, Show, Strange, Table } from "./ui";
@@ -24,12 +24,6 @@ const REPLAY = 60;
 /** Seconds that are in view while more comes. */
 const WINDOW = 60;
 const LINES = 40;
-
-/** The topics of samples, each as what it is: numbers as plots, positions as a path, pictures, and texts as lines. */
-export function Topics(props: { samples: Sample[]; model: Description | null; until?: number; live?: boolean }) {
-  const gathered = useMemo(() => gather(props.samples), [props.samples]);
-  return <Tracks gathered={gathered} model={props.model} frame={frameOf(gathered, { until: props.until, live: props.live })} />;
-}
 
 /** What comes while a job runs, from its beginning. */
 export function LiveJob(props: { address: Address; model: Description | null }) {

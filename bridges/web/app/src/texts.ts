@@ -152,9 +152,6 @@ export const texts = {
   modelCidHint: "46 characters that begin with Qm.",
   notACid: "This is not a CID: 46 characters that begin with Qm.",
   undescribed: "A model without a description",
-  offered: (price: string) => `from ${price}`,
-  typically: (price: string) => `about ${price}`,
-  robotsPresent: (count: number) => (count ? `${plural(count, "robot")} here` : "no robot seen yet"),
   ways: { form: "Fill in a form", file: "Upload a file", cid: "Give a CID", none: "Nothing to say" } as Record<string, string>,
   withoutObjective: "The robot does what it always does.",
   noObjectiveHint: "Some robots, such as sensors, need no objective.",
@@ -166,7 +163,6 @@ export const texts = {
   fileTooLarge: "This file is too large.",
   objectiveCid: "CID of the objective",
   objectiveCidHint: "A recording that the market's agents or IPFS have.",
-  whatItDoes: "What the robot is to do",
   notShown: (count: number) => `${plural(count, "more message")} in this objective.`,
   cutValue: "longer than is shown here",
   yes: "yes",
@@ -284,7 +280,6 @@ export const texts = {
   offer: "Offer",
   terms: "Terms",
   timeline: "Timeline",
-  recording: "Recording",
   notYet: "not yet",
   playback: "Playback",
   played: (position: number, total: number) => `${position} of ${plural(total, "message")} played.`,
@@ -348,7 +343,6 @@ export const texts = {
 
   // Recordings
   fileTitle: "File",
-  size: "Size",
   download: "Download",
   foxglove: "Open in Foxglove",
   playedTopic: "played",
@@ -436,7 +430,6 @@ export const texts = {
   sent: (action: string) => `Done: ${action}`,
 
   // Providers
-  providerTitle: "Lighthouse",
   lighthouse: "Lighthouse",
   providers: "Providers",
   noProviders: "Nobody has a stake here.",

@@ -1,6 +1,6 @@
 import { useEffect, useState } from "preact/hooks";
 import { post } from "../api";
-import { useApp, useData, useTopic } from "../app";
+import { useApp, useData, useModel, useTopic } from "../app";
 import { amount, duration, plain, short } from "../format";
 import { Replay } from "../live";
 import { withdraw } from "../ordering";
@@ -74,6 +74,7 @@ function WhatWouldWork({ order, changed }: { order: PostedOrder["order"]; change
 /** An answer without a contract, checked by this browser. One to another question of this account is not shown. */
 function AnswerView({ order, answer }: { order: PostedOrder["order"]; answer: Answer }) {
   const summary = useData<Summary>(`files/${answer.result}/summary`);
+  const description = useModel(order.model)?.description ?? null;
   const [checked, setChecked] = useState<unknown>(null);
   useEffect(() => void checkAnswer(answer, order.signer).then(() => setChecked(true), setChecked), [answer.signature]);
   const question = summary.data?.metadata["aira-answer"]?.demand;
@@ -85,7 +86,7 @@ function AnswerView({ order, answer }: { order: PostedOrder["order"]; answer: An
       <p>
         {checked === true ? <Badge kind="good">{texts.holds}</Badge> : null} {texts.answeredBy} <Name text={answer.signer} href={`#/account/${answer.signer}`} />
       </p>
-      <Replay cid={answer.result} model={null} />
+      <Replay cid={answer.result} model={description} />
     </section>
   );
 }

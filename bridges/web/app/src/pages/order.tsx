@@ -56,7 +56,7 @@ function OrderForm({ model, robot, objective }: { model: Model; robot: string; o
   const [judge, setJudge] = useState<Judge | null>(NOBODY);
   const [chosen, choose] = useState<Choosing>(null);
   const make = useObjective(model, choice);
-  const { quotes, ask } = useQuotes(model, make);
+  const { quotes, problem, ask } = useQuotes(model, make);
   const fitting = quotes?.filter((quote) => isUsable(quote, market.token.address)) ?? [];
   const wanted = chosen ?? (fitting.find((quote) => quote.agent === robot) ?? fitting[0])?.agent ?? (quotes ? "" : null);
   const quote = fitting.find((one) => one.agent === wanted);
@@ -74,6 +74,7 @@ function OrderForm({ model, robot, objective }: { model: Model; robot: string; o
       </section>
       <section class="step">
         <h2>{texts.chooseRobot}</h2>
+        {problem ? <Problem error={problem} /> : null}
         <Robots quotes={quotes} asking={make !== null} wanted={wanted} choose={choose} again={ask} />
         {wanted === "" ? (
           <div class="fields">
@@ -101,24 +102,28 @@ const isUsable = (quote: Quote, token: Address) => !quote.code && quote.token.ad
 const SETTLED = 500;
 
 /** What the robots of a model want for an objective; null until they have answered. */
-function useQuotes(model: Model, make: Make | null): { quotes: Quote[] | null; ask: () => void } {
-  const [found, setFound] = useState<{ of: Make; quotes: Quote[] } | null>(null);
+function useQuotes(model: Model, make: Make | null): { quotes: Quote[] | null; problem: unknown; ask: () => void } {
+  const [found, setFound] = useState<{ of: Make; quotes: Quote[]; problem?: unknown } | null>(null);
   const [turn, setTurn] = useState(0);
   useEffect(() => {
     if (make === null) return;
     let current = true;
     const timer = setTimeout(async () => {
-      const objective = await make().catch(() => null);
-      const asked = objective?.preflight.ok ? post<{ quotes: Quote[] }>("quotes", { model: model.cid, objective: objective.cid }) : null;
-      const quotes = (await asked?.catch(() => null))?.quotes ?? [];
-      if (current) setFound({ of: make, quotes });
+      try {
+        const objective = await make().catch(() => null); // what is wrong with it is said where it is chosen
+        const { quotes } = objective?.preflight.ok ? await post<{ quotes: Quote[] }>("quotes", { model: model.cid, objective: objective.cid }) : { quotes: [] };
+        if (current) setFound({ of: make, quotes });
+      } catch (problem) {
+        if (current) setFound({ of: make, quotes: [], problem });
+      }
     }, SETTLED);
     return () => {
       current = false;
       clearTimeout(timer);
     };
   }, [make, turn]);
-  return { quotes: found?.of === make ? found.quotes : null, ask: () => setTurn((known) => known + 1) };
+  const known = found?.of === make ? found : null;
+  return { quotes: known?.quotes ?? null, problem: known?.problem, ask: () => setTurn((known) => known + 1) };
 }
 
 /** Who could do it, side by side: price, start, duration, record; the cheapest first, refusals last. */
