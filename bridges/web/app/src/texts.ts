@@ -265,6 +265,7 @@ export const texts = {
   stoppedByPerson: "stopped by the customer",
   goOnWorking: "Let it work",
   stoppedLong: "You stopped it. The price went back.",
+  stoppedPaid: "You stopped it. The robot was paid all the same, as its model says.",
   job: "Job",
   jobs: "Jobs",
   noJobs: "No jobs.",

@@ -57,7 +57,7 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
       </section>
       <Steps done={done} active={!ended} failed={failed} share={job.phase === "running" || playback ? share : undefined} />
       <p class="lead" aria-live="polite">
-        <JobState state={liability.state} /> {owed ? texts.owedNow(amount(job.owed, liability.token), !failed) : code === "stopped" ? texts.stoppedLong : texts.jobStateLong[liability.state]}
+        <JobState state={liability.state} /> {owed ? texts.owedNow(amount(job.owed, liability.token), !failed) : code === "stopped" ? texts.stoppedLong : job.stopped && liability.state === "paid" ? texts.stoppedPaid : texts.jobStateLong[liability.state]}
         {playback && !ended && playback.total > 1 ? ` ${texts.played(playback.position, playback.total)}` : ""}
       </p>
       {job.reason ? <p class={code === "stopped" ? "callout" : "problem"}><Strange text={job.reason.text || texts.reason[code] || ""} /> <code>{code}</code></p> : null}
