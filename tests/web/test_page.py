@@ -33,7 +33,7 @@ def test_a_job_is_ordered_paid_and_checked_by_clicks(browser: Browser, site: Sit
     browser.sees("the robot was paid")
     browser.until(lambda: len(browser.all(".findings .badge.good")) >= 19, "all checks")
     assert not browser.all(".findings .badge.bad")
-    browser.until(lambda: browser.all(".plot canvas"), "the plot")
+    browser.find(".path canvas, .path svg")
     browser.find(".picture img")
     # What the robot said is a stranger's text: shown, and nothing else.
     browser.sees("<script>")
@@ -257,7 +257,7 @@ def test_each_page_is_accessible(site: Site, paid_job: str, pictures: Path, size
                 browser.until(lambda: not browser.all("[aria-busy=true]"), "the log")
             if name == "job":
                 browser.until(lambda: len(browser.all(".findings .badge.good")) >= 18, "all checks")
-                browser.until(lambda: browser.all(".plot canvas"), "the plot")
+                browser.find(".path canvas, .path svg")
             check(browser, pictures / f"{name}-{look}")
         fill_in(browser, site)
         review(browser)
