@@ -93,7 +93,7 @@ def json_line(event: LogEvent) -> str:
 def human_line(event: LogEvent) -> str:
     """The event for people: local time, level, liability, message; below it the traceback of an error."""
     about = f"{event.liability}: " if event.liability else ""
-    return f"{_local_time(event.time)} {event.level.upper():<7} {printable(about)}{text_lines(event)}"
+    return printable(f"{_local_time(event.time)} {event.level.upper():<7} {about}") + text_lines(event)
 
 
 def text_lines(event: LogEvent) -> str:

@@ -49,7 +49,7 @@ def test_control_characters_of_a_hostile_agent_are_not_printed(router: EmbeddedR
         for options in ((), ("--json",)):
             done = invoke("logs", ROBOT.address, *options, AIRA_CONNECT=router.endpoint)
             assert done.returncode == 0
-            assert all(line.isprintable() for line in done.stdout.split("\n"))
+            assert all(line.isprintable() for line in done.stdout.split("\n")), ascii(done.stdout)
             assert done.stdout.count("\n") == (1 if options else 5), done.stdout
         assert json.loads(done.stdout)["message"] == wild
         with Follower(ROBOT.address, endpoint=router.endpoint) as follower:

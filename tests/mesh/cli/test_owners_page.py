@@ -14,27 +14,48 @@ import pytest
 from mesh.agent._owner_rules import Hours
 from mesh.settings import load
 from mesh.settings.groups import OwnerEvent
+from tests.support.commands import Serving
 
 if TYPE_CHECKING:
     from tests.mesh.cli.served_chain import ServedChain
+    from tests.support.routers import EmbeddedRouter
 
 PAGE: Final = (Path(__file__).parents[3] / "docs" / "owners.md").read_text()
+ROBOT: Final = """
+import asyncio
+from mesh import Agent
+
+async def main():
+    async with Agent():
+        print("at work", flush=True)
+        await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
 COMMANDS: Final = re.findall(r"^    ((?:aira|openssl) .+)$", PAGE, re.MULTILINE)
 
 
-def test_every_command_of_the_page_runs(served: ServedChain, tmp_path: Path) -> None:
+def test_every_command_of_the_page_runs(served: ServedChain, router: EmbeddedRouter, tmp_path: Path) -> None:
     served.finalize(served.create_liability(cost=5))
     robot, stranger = served.people["robot"].address, served.people["stranger"].address
     served.run_json("xrt", "transfer", stranger, "1wn", by="robot")  # there is state to back up
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    variables = {**os.environ, **served.variables("robot"), "PATH": path}
+    variables = {**os.environ, **served.variables("robot"), "PATH": path, "AIRA_CONNECT": router.endpoint}
     assert len(COMMANDS) >= 15
-    for command in COMMANDS:
-        line = command.replace("NEW-ADDRESS", stranger).replace("OLD-ADDRESS", robot)
-        done = subprocess.run(
-            line, shell=True, cwd=tmp_path, env=variables, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, (line, done.stderr)
+
+    def run(commands: list[str]) -> None:
+        for command in commands:
+            line = command.replace("NEW-ADDRESS", stranger).replace("OLD-ADDRESS", robot)
+            done = subprocess.run(
+                line, shell=True, cwd=tmp_path, env=variables, capture_output=True, text=True, check=False
+            )
+            assert done.returncode == 0, (line, done.stderr)
+
+    own = [command for command in COMMANDS if command.startswith("aira robot ")]
+    assert len(own) == 5
+    with Serving(sys.executable, "-c", ROBOT, says="at work", variables=variables):
+        run(own)
+    run([command for command in COMMANDS if command not in own])
     statement = (tmp_path / "statement.csv").read_text().splitlines()
     assert statement[0].startswith("time,month,block,liability,state,")
     assert len(statement) == 2
