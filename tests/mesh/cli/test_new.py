@@ -39,7 +39,7 @@ def run(folder: Path, module: str, *arguments: str | Path) -> None:
     places = ":".join(map(str, (ROOT, *folder.iterdir())))
     variables = {"PYTHONPATH": places, "MYPYPATH": places, "ROS2_CONNECT": f"tcp/127.0.0.1:{free_port()}"}
     done = subprocess.run(
-        command, cwd=ROOT, env=environment(variables), capture_output=True, text=True, timeout=240, check=False
+        command, cwd=ROOT, env=environment(variables), capture_output=True, text=True, timeout=150, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
 
