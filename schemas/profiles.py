@@ -22,6 +22,8 @@ LONGEST_ABOUT: Final = 200
 """Characters of what a robot says of itself."""
 LARGEST_PROFILE: Final = 8192
 """Bytes of an encoded profile; receivers refuse more."""
+LARGEST_PICTURE: Final = 512 * 1024
+"""Bytes of a robot's picture."""
 MOST_WAITING: Final = 1_000_000
 """Jobs in a queue, and seconds of a wait, that a profile can state."""
 

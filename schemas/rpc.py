@@ -17,7 +17,7 @@ import msgspec
 
 from schemas.address import keccak256
 from schemas.errors import InvalidMessage
-from schemas.messages import Demand, Offer, Result
+from schemas.messages import Demand, Offer, Result, equal_terms
 from schemas.records import (
     MAX_UINT256,
     ControlRobot,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from schemas.messages import SignedMessage
+    from schemas.signing import Verified
 
 
 _MAX_DIGITS: Final = len(str(MAX_UINT256))
@@ -154,6 +155,16 @@ class OrderPair(SignedRecord, frozen=True, kw_only=True):
     demand: SendDemand
     offer: SendOffer
     maker: str
+
+    def check(self, demand: Verified[Demand], offer: Verified[Offer]) -> None:
+        """Raise `InvalidMessage` unless its maker has signed its demand, and that agrees with its offer.
+
+        `demand` and `offer` are its messages, verified. Whether the pair `is_signed` is checked before.
+        """
+        if demand.signer != self.maker:
+            raise InvalidMessage("maker", "only the demand's maker can bind it to an offer")
+        if equal_terms(demand.message) != equal_terms(offer.message):
+            raise InvalidMessage("terms", "the demand and the offer don't agree")
 
 
 class PairTaken(Record, frozen=True, omit_defaults=True):

@@ -433,17 +433,10 @@ class Api(Lifecycle):
         if not (number.isascii() and number.isdigit() and len(number) < 12):
             raise WebError("the number of a message is a number")
         found = await self.files.read(cid_in(request), image_of, int(number))
-        if found is None:
-            raise WebError("there is no image in this message", code="page-not-found")
-        data, kind = found
-        return web.Response(body=data, content_type=kind, headers=SANDBOX | FOREVER)
+        return _image(found, missing="there is no image in this message")
 
     async def picture(self, request: web.Request) -> web.Response:
-        found = await self.files.read(cid_in(request), picture_of)
-        if found is None:
-            raise WebError("this file is no picture", code="page-not-found")
-        data, kind = found
-        return web.Response(body=data, content_type=kind, headers=SANDBOX | FOREVER)
+        return _image(await self.files.read(cid_in(request), picture_of), missing="this file is no picture")
 
     async def validator(self, request: web.Request) -> web.Response:
         fee = request.query.get("fee", "")
@@ -588,6 +581,14 @@ async def _answer_rpc(node: Node, body: bytes) -> dict[str, Any]:
         return response | {"error": {"code": error.rpc_code, "message": public_text(error.detail)}}
     except ChainError as error:
         return response | {"error": {"code": -32000, "message": public_text(error)}}
+
+
+def _image(found: tuple[bytes, str] | None, *, missing: str) -> web.Response:
+    """An image with its media type. Raises `WebError` if there is none."""
+    if found is None:
+        raise WebError(missing, code="page-not-found")
+    data, kind = found
+    return web.Response(body=data, content_type=kind, headers=SANDBOX | FOREVER)
 
 
 def _signed(announcement: ValidatorAnnouncement) -> dict[str, Any]:

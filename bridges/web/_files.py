@@ -27,6 +27,7 @@ from mesh.role.models import description_in
 from schemas import parse_cid
 from schemas.decoding import decode_json
 from schemas.model import MAX_MODEL_SIZE, InvalidDescription
+from schemas.profiles import LARGEST_PICTURE
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
@@ -43,8 +44,6 @@ LONGEST_VALUE: Final = 4096
 """Bytes of a message's JSON that are returned."""
 MOST_NUMBERS: Final = 1_000_000
 """Messages of a topic that are read for a plot."""
-LARGEST_PICTURE: Final = 512 * 1024
-"""Bytes of a file that is shown as a picture."""
 _MAGIC: Final = (
     (b"\x89PNG\r\n\x1a\n", "image/png"),
     (b"\xff\xd8\xff", "image/jpeg"),

@@ -51,7 +51,6 @@ from schemas import (
     verify,
     verify_message,
 )
-from schemas.messages import equal_terms
 from schemas.rpc import OrderPair
 from schemas.signing import Decline, Refusal, Rejection
 from schemas.verdicts import ValidatorReport
@@ -749,12 +748,11 @@ class OrderPublisher(Lifecycle):
 
 def _pair_of(pair: OrderPair) -> tuple[Verified[Demand], Verified[Offer]]:
     """The demand and the offer of a pair. Raises `InvalidMessage`."""
+    if not pair.is_signed:
+        raise InvalidMessage("signature", "the pair is not signed by its maker")
     demand: Verified[Demand] = verify_message(pair.demand.message())
     offer: Verified[Offer] = verify_message(pair.offer.message())
-    if not pair.is_signed or demand.signer != pair.maker:
-        raise InvalidMessage("signature", "the pair is not signed by the maker of its demand")
-    if equal_terms(demand.message) != equal_terms(offer.message):
-        raise InvalidMessage("terms", "the terms of the demand and the offer are not equal")
+    pair.check(demand, offer)
     return demand, offer
 
 

@@ -27,7 +27,15 @@ from mesh.role.database import LedgerUnusable
 from schemas import ProfileKey
 from schemas.cid import is_cid
 from schemas.payloads import plain_value
-from schemas.profiles import LONGEST_READING, MOST_READINGS, MOST_WAITING, Profile, ProfileState, text_fault
+from schemas.profiles import (
+    LARGEST_PICTURE,
+    LONGEST_READING,
+    MOST_READINGS,
+    MOST_WAITING,
+    Profile,
+    ProfileState,
+    text_fault,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -44,8 +52,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LARGEST_PICTURE: Final = 512 * 1024
-"""Bytes of a robot's picture."""
 LARGEST_TEXT: Final = 4096
 """Bytes of a reading that is shown as text."""
 ASKED: Final = Rate(per_second=20.0, burst=100)

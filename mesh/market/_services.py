@@ -21,7 +21,6 @@ from mesh.network.metrics import drop_family, message_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled, public_parts
 from schemas import InvalidMessage, encode, lighthouse_selector
 from schemas.keys import ORDER
-from schemas.messages import equal_terms
 from schemas.rpc import PairTaken
 from schemas.signing import Refusal
 from schemas.status import ALIVE, MarketStatus, Status
@@ -147,10 +146,7 @@ class PairService:
                 raise InvalidMessage("signature", "the pair is not signed by its maker")
             demand = await self._parts.channel.verified(request.demand.message())
             offer = await self._parts.channel.verified(request.offer.message())
-            if demand.signer != request.maker:
-                raise InvalidMessage("maker", "only the demand's maker can bind it to an offer")
-            if equal_terms(demand.message) != equal_terms(offer.message):
-                raise InvalidMessage("terms", "the demand and the offer don't agree")
+            request.check(demand, offer)
         except InvalidMessage as error:
             return PairTaken(error.reason, public_text(error))
         if not self._parts.queue.has_room_for(self._parts.chain.funds.worth(demand.message)):

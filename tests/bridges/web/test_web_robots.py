@@ -39,6 +39,15 @@ async def contract_of(browser: Any, order_hash: str) -> str:
     return str(await until_found(matched, what="a contract"))
 
 
+async def kinds_until_matched(socket: Any) -> set[str]:
+    """The kinds of the market's events, up to that of a contract."""
+    kinds = set[str]()
+    async with asyncio.timeout(30):
+        while "matched" not in kinds:
+            kinds |= {event["kind"] for event in json.loads((await socket.receive()).data)}
+    return kinds
+
+
 async def test_robots_present_themselves_and_say_what_they_want(place: Place, serve: Any) -> None:
     cheap = priced(place.agent("robot", **NAMED), 4)
     async with another(place) as declining, cheap, priced(declining, 1, only="closed-today"), serve() as browser:
@@ -88,11 +97,7 @@ async def test_an_order_for_one_robot_is_seen_by_nobody_else(place: Place, serve
             job = await browser.get(f"liabilities/{await contract_of(browser, posted['hash'])}")
             assert job["liability"]["promisor"] == robot.address
         assert heard == []
-        kinds = set[str]()
-        async with asyncio.timeout(30):
-            while "matched" not in kinds:
-                kinds |= {event["kind"] for event in json.loads((await socket.receive()).data)}
-        assert "order" not in kinds
+        assert "order" not in await kinds_until_matched(socket)
 
 
 async def demand_of(browser: Any, cost: int) -> Demand:
@@ -147,11 +152,7 @@ async def test_a_wallet_orders_from_one_robot_alone(place: Place, serve: Any) ->
         job = await browser.get(f"liabilities/{await contract_of(browser, order['hash'])}")
         assert (job["liability"]["promisor"], job["private"]) == (robot.address, True)
         assert heard == []
-        kinds = set[str]()
-        async with asyncio.timeout(30):
-            while "matched" not in kinds:
-                kinds |= {event["kind"] for event in json.loads((await socket.receive()).data)}
-        assert "order" not in kinds
+        assert "order" not in await kinds_until_matched(socket)
         await browser.post(
             "pairs", replace(pair, offer=replace(offer, signature="")).signed_by(signer).encode(), status=400
         )

@@ -11,12 +11,12 @@ import msgspec
 import pytest
 
 from mesh import Agent, ConfigurationError
-from mesh.agent._profile import INTERVAL, LARGEST_PICTURE
+from mesh.agent._profile import INTERVAL
 from mesh.agent.handlers import Job, JobFailed
 from mesh.network import Endpoints, Network
 from mesh.watching.robots import Robot, RobotDirectory
 from schemas import Empty, ProfileKey, cid_of_bytes
-from schemas.profiles import Profile
+from schemas.profiles import LARGEST_PICTURE, Profile
 from tests.mesh.agent.test_own_model import DRIVE, Move, driving
 from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import objective

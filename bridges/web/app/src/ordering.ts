@@ -178,7 +178,7 @@ export async function withdraw(order: Order, account: Account): Promise<void> {
   const { lighthouse } = order;
   const deadline = BigInt(order.deadline);
   const hash = withdrawalHash({ order: `0x${order.hash}`, lighthouse, deadline });
-  const signature = canonicalSignature(await personalSign(account.wallet.provider, hash, account.address));
+  const signature = await signed(hash, account);
   await postText("orders", encodeWire({ withdraws: order.hash, lighthouse, deadline, signature }));
   rememberOrder({ hash: order.hash, deadline: order.deadline, wire: "" });
 }

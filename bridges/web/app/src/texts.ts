@@ -84,7 +84,7 @@ export const texts = {
   search: "Search robots",
   byModel: "By what they do",
   noRobotsTitle: "No robot is here yet",
-  noRobotsHint: "Start one on this machine, and it appears here by itself:",
+  noRobotsHint: "A robot of this market appears here by itself. A market of your own, with a robot in it, takes one line:",
   noRobotsCommand: "aira new robot lamp && cd lamp && aira up --run lamp.py",
   noneFound: "No robot matches.",
   showAll: "Show all",

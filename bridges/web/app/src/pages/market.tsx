@@ -1,4 +1,4 @@
-import { useEffect, useRef, useState } from "preact/hooks";
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import uPlot from "uplot";
 import { formatUnits } from "viem";
 import { get, query } from "../api";
@@ -8,7 +8,7 @@ import { texts } from "../texts";
 import type { Order, PastJob, StreamEvent, Token } from "../types";
 import { Badge, Show } from "../ui";
 import { plotColors } from "../plot";
-import { ModelChip, robotsOf } from "./robots";
+import { ModelFilter, robotsOf } from "./robots";
 
 const SHOWN = 60;
 const FLUSH = 100;
@@ -35,31 +35,31 @@ export function MarketPage() {
   );
 }
 
+interface Past {
+  jobs: PastJob[];
+}
+
 /** What jobs have cost over time, by model, and how many there were. */
 function History() {
   const { agents, market } = useApp();
   const [model, setModel] = useState("");
-  const history = useData<{ jobs: PastJob[]; truncated: boolean }>(`market/history${query({ model })}`);
-  const all = useData<{ jobs: PastJob[] }>("market/history");
+  const all = useData<Past>("market/history");
+  const chosen = useData<Past>(model ? `market/history${query({ model })}` : null);
+  const history = model ? chosen : all;
   const refresh = useRef(0);
   useTopic("chain", () => {
     if (Date.now() - refresh.current < 5_000) return;
     refresh.current = Date.now();
-    history.reload();
     all.reload();
+    chosen.reload();
   });
   const models = [...new Set([...(all.data?.jobs ?? []).map((job) => job.model), ...robotsOf(agents?.agents).flatMap((robot) => robot.models)])].slice(0, 24);
-  const jobs = (history.data?.jobs ?? []).filter((job) => job.token.address === market.token.address);
+  const jobs = useMemo(() => (history.data?.jobs ?? []).filter((job) => job.token.address === market.token.address), [history.data, market.token.address]);
   const paid = jobs.filter((job) => job.state === "paid").map((job) => BigInt(job.cost)).sort((one, other) => (one < other ? -1 : 1));
   const here = robotsOf(agents?.agents).filter((robot) => !model || robot.models.includes(model));
   return (
     <section>
-      {models.length > 1 ? (
-        <div class="chips" role="group" aria-label={texts.byModel}>
-          <button type="button" class="chip" aria-pressed={!model} onClick={() => setModel("")}>{texts.all}</button>
-          {models.map((cid) => <ModelChip key={cid} cid={cid} chosen={cid === model} choose={setModel} />)}
-        </div>
-      ) : null}
+      <ModelFilter models={models} model={model} choose={setModel} />
       <dl class="figures">
         <div><dt>{texts.robotsHere}</dt><dd>{here.length}</dd></div>
         <div><dt>{texts.jobsDone}</dt><dd>{paid.length.toLocaleString("en")}</dd></div>
@@ -81,26 +81,15 @@ function share(jobs: PastJob[]): string {
 /** Each job as a point: when, and for how much. */
 function Prices({ jobs, token }: { jobs: PastJob[]; token: Token }) {
   const box = useRef<HTMLDivElement>(null);
-  const points = jobs.filter((job) => job.at !== null).map((job) => [job.at!, Number(formatUnits(BigInt(job.cost), token.decimals))]).reverse();
-  const shown = JSON.stringify(points);
+  const points = useMemo(() => jobs.filter((job) => job.at !== null).map((job) => [job.at!, Number(formatUnits(BigInt(job.cost), token.decimals))]).reverse(), [jobs]);
   useEffect(() => {
-    const frame = box.current;
-    if (!frame || points.length < 2) return;
-    const { ink, grid, lines } = plotColors(frame);
-    const axis = { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid } };
-    const measure = () => ({ width: Math.max(240, frame.clientWidth), height: 180 });
-    const plot = new uPlot({
-      ...measure(), cursor: { show: false }, legend: { show: false }, axes: [axis, { ...axis, size: 56 }],
+    if (!box.current || points.length < 2) return;
+    return chart(box.current, 180, ({ axis, line }) => ({
+      axes: [axis, { ...axis, size: 56 }],
       scales: { y: { range: (_, __, most) => [0, most * 1.15 || 1] } },
-      series: [{}, { stroke: lines[0], paths: () => null, points: { show: true, size: 7, fill: lines[0] } }],
-    }, [points.map(([at]) => at), points.map(([, price]) => price)], frame);
-    const resized = new ResizeObserver(() => plot.setSize(measure()));
-    resized.observe(frame);
-    return () => {
-      resized.disconnect();
-      plot.destroy();
-    };
-  }, [shown]);
+      series: [{}, { stroke: line, paths: () => null, points: { show: true, size: 7, fill: line } }],
+    }), [points.map(([at]) => at), points.map(([, price]) => price)]).stop;
+  }, [points]);
   if (points.length < 2) return <p class="quiet">{texts.noPrices}</p>;
   return (
     <>
@@ -206,25 +195,33 @@ function rowOf(event: StreamEvent, price: (order: Order) => string): Omit<Row, "
   }
 }
 
+type Look = (colors: { axis: uPlot.Axis; line: string }) => Omit<uPlot.Options, "width" | "height">;
+
+/** A plot as wide as its frame, in the colours of the page, until `stop`. */
+function chart(frame: HTMLElement, height: number, look: Look, data: uPlot.AlignedData): { plot: uPlot; stop: () => void } {
+  const { ink, grid, lines } = plotColors(frame);
+  const axis = { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid } };
+  const measure = () => ({ width: Math.max(240, frame.clientWidth), height });
+  const plot = new uPlot({ ...measure(), cursor: { show: false }, legend: { show: false }, ...look({ axis, line: lines[0] }) }, data, frame);
+  const resized = new ResizeObserver(() => plot.setSize(measure()));
+  resized.observe(frame);
+  const stop = () => {
+    resized.disconnect();
+    plot.destroy();
+  };
+  return { plot, stop };
+}
+
 /** Orders in each of the last sixty seconds. */
 function Rate(props: { perSecond: number[] }) {
   const box = useRef<HTMLDivElement>(null);
   useEffect(() => {
-    const { ink, grid, lines } = plotColors(box.current!);
     const seconds = Array.from({ length: SECONDS }, (_, place) => place - SECONDS + 1);
-    const axis = { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid } };
-    const frame = box.current!;
-    const measure = () => ({ width: Math.max(240, frame.clientWidth), height: 110 });
-    const plot = new uPlot({
-      ...measure(),
-      cursor: { show: false },
-      legend: { show: false },
+    const { plot, stop } = chart(box.current!, 110, ({ axis, line }) => ({
       scales: { x: { time: false }, y: { range: (_, __, most) => [0, Math.max(5, most)] } },
       axes: [{ ...axis, values: (_, ticks) => ticks.map((tick) => `${tick} s`) }, { ...axis, size: 44 }],
-      series: [{}, { stroke: lines[0], width: 1.5, points: { show: false } }],
-    }, [seconds, [...props.perSecond]], box.current!);
-    const resized = new ResizeObserver(() => plot.setSize(measure()));
-    resized.observe(box.current!);
+      series: [{}, { stroke: line, width: 1.5, points: { show: false } }],
+    }), [seconds, [...props.perSecond]]);
     const timer = setInterval(() => {
       plot.setData([seconds, [...props.perSecond]]);
       props.perSecond.shift();
@@ -232,8 +229,7 @@ function Rate(props: { perSecond: number[] }) {
     }, 1000);
     return () => {
       clearInterval(timer);
-      resized.disconnect();
-      plot.destroy();
+      stop();
     };
   }, []);
   return <div class="plot" ref={box} role="img" aria-label={texts.ordersPerSecond} />;

@@ -9,9 +9,8 @@ import { texts } from "../texts";
 import type { Agent, Entry, Liability, OwnerRules, Token } from "../types";
 import { Action, Dialog, Facts, Field, Name, NumberField, Picture, Show, Strange } from "../ui";
 import { JobTable } from "./account";
-import { LoginForm } from "./login";
 import { Doing, nameOf, priceOf } from "./robots";
-import { Health, Log } from "./services";
+import { Health, Log, OperatorLogin } from "./services";
 
 /** One robot: who it is, what it reads, what it did; and for its owner, how it is run. */
 export function RobotPage(props: { address: string }) {
@@ -67,18 +66,8 @@ function RobotView({ robot }: { robot: Agent }) {
         />
         <Health agent={robot} />
       </details>
-      {market.role === "operator" ? null : <OwnerLogin />}
+      {market.role === "operator" ? null : <OperatorLogin what={texts.yourRobot} hint={texts.operatorTokenHint} />}
     </>
-  );
-}
-
-function OwnerLogin() {
-  const { reloadMarket } = useApp();
-  return (
-    <details class="more">
-      <summary>{texts.yourRobot}</summary>
-      <LoginForm label={texts.operatorToken} hint={texts.operatorTokenHint} done={reloadMarket} />
-    </details>
   );
 }
 

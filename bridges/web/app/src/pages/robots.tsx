@@ -27,12 +27,7 @@ export function RobotsPage() {
       {robots.length > 1 ? (
         <div class="row find" role="search">
           <input type="search" aria-label={texts.search} placeholder={texts.search} value={search} onInput={(event) => setSearch(event.currentTarget.value)} />
-          {models.length > 1 ? (
-            <div class="chips" role="group" aria-label={texts.byModel}>
-              <button type="button" class="chip" aria-pressed={!model} onClick={() => setModel("")}>{texts.all}</button>
-              {models.map((cid) => <ModelChip key={cid} cid={cid} chosen={cid === model} choose={setModel} />)}
-            </div>
-          ) : null}
+          <ModelFilter models={models} model={model} choose={setModel} />
         </div>
       ) : null}
       {agents === null ? <p class="quiet" aria-busy="true">{texts.loading}</p> : null}
@@ -60,7 +55,18 @@ function matches(robot: Agent, search: string): boolean {
   return search.toLowerCase().split(/\s+/).every((word) => text.includes(word));
 }
 
-export function ModelChip(props: { cid: string; chosen: boolean; choose: (cid: string) => void }) {
+/** Buttons that leave only what is of one model; none where there is only one. */
+export function ModelFilter(props: { models: string[]; model: string; choose: (cid: string) => void }) {
+  if (props.models.length < 2) return null;
+  return (
+    <div class="chips" role="group" aria-label={texts.byModel}>
+      <button type="button" class="chip" aria-pressed={!props.model} onClick={() => props.choose("")}>{texts.all}</button>
+      {props.models.map((cid) => <ModelChip key={cid} cid={cid} chosen={cid === props.model} choose={props.choose} />)}
+    </div>
+  );
+}
+
+function ModelChip(props: { cid: string; chosen: boolean; choose: (cid: string) => void }) {
   const model = useModel(props.cid);
   return <button type="button" class="chip" aria-pressed={props.chosen} onClick={() => props.choose(props.cid)}><Strange text={model?.description?.title ?? texts.undescribed} most={40} /></button>;
 }

@@ -79,7 +79,7 @@ function AgentDetails({ agent }: { agent: Agent }) {
       <h3>{texts.jobs}</h3>
       <Show of={jobs}>{({ liabilities }) => <JobTable liabilities={liabilities} />}</Show>
       <Log address={agent.address} />
-      {market.role === "operator" ? <OperateByAddress robot={agent.address} /> : <OperatorLogin />}
+      {market.role === "operator" ? <OperateByAddress robot={agent.address} /> : <OperatorLogin what={texts.operatorsOnly} />}
     </section>
   );
 }
@@ -204,12 +204,13 @@ function OperateByAddress(props: { robot: Address }) {
   );
 }
 
-function OperatorLogin() {
+/** A login for operators, below words that say what for. */
+export function OperatorLogin(props: { what: string; hint?: string }) {
   const { reloadMarket } = useApp();
   return (
     <details class="more">
-      <summary>{texts.operatorsOnly}</summary>
-      <LoginForm label={texts.operatorToken} done={reloadMarket} />
+      <summary>{props.what}</summary>
+      <LoginForm label={texts.operatorToken} hint={props.hint} done={reloadMarket} />
     </details>
   );
 }
