@@ -1,10 +1,10 @@
 """A million agents in a hundred regions, simulated: the state of the core, and how long a match takes.
 
-The design is that of `docs/scale.md`. Each region is a Zenoh network of its own with a gateway process, which has one
-session in the region and one in the core, where it declares one subscription, one queryable and one token. Models are
-spread over the regions by hash; a model's market, with its order book, is in its home region, where its robots connect.
-Robots renew a lease in the book instead of declaring a token. A demand travels from its person's region through the
-core to the home region; the offer that answers it stays there.
+The design is that of `docs/explanation/scale.md`. Each region is a Zenoh network of its own with a gateway process,
+which has one session in the region and one in the core, where it declares one subscription, one queryable and one
+token. Models are spread over the regions by hash; a model's market, with its order book, is in its home region, where
+its robots connect. Robots renew a lease in the book instead of declaring a token. A demand travels from its person's
+region through the core to the home region; the offer that answers it stays there.
 
 Keys and messages are real: their lengths are those of this package's encodings. Times of routers and books are
 measured by `bench/scale.py` and `bench/messages.py`; delays of the network are assumed. Every router, gateway and book

@@ -127,8 +127,8 @@ def codes_of_raised() -> set[str]:
 
 
 def documented(heading: str) -> set[str]:
-    """The names in the first column of a table of docs/codes.md."""
-    section = (ROOT / "docs" / "codes.md").read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
+    """The names in the first column of a table of docs/reference/codes.md."""
+    section = (ROOT / "docs" / "reference" / "codes.md").read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
     return set(re.findall(r"^\| `([\w-]+)` \|", section, re.MULTILINE))
 
 
@@ -145,7 +145,7 @@ def test_the_documented_error_codes_are_those_of_the_source() -> None:
 
 def test_the_documented_error_classes_are_those_of_the_codes() -> None:
     classes = {code: name.rsplit(".", 1)[1] for name, code in codes_of_errors().items()}
-    section = (ROOT / "docs" / "codes.md").read_text().split("## Errors\n")[1].split("\n## ")[0]
+    section = (ROOT / "docs" / "reference" / "codes.md").read_text().split("## Errors\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| `([\w-]+)` \| `(\w+)` \|", section, re.MULTILINE)
 
     assert {code: name for code, name in rows if classes.get(code, name) != name} == {}

@@ -1,4 +1,4 @@
-"""Our own frames: the codec, to the byte as docs/frames.md specifies it, and the host's side of the protocol.
+"""Our own frames: the codec, to the byte as docs/reference/frames.md specifies it, and the host's side of the protocol.
 
 A frame is `kind << 4 | sequence`, an id, at most 96 bytes of payload, and a CRC-16/CCITT-FALSE of these (low byte
 first), stuffed by COBS so that a zero byte ends it and occurs nowhere else. Payloads are msgpack.

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Creates the site of the demonstration once: an authority, a certificate for each member, a roster, and the accounts of
 # the development chain, each with its own password. Each member has a folder with what it needs and sees nothing else.
-# The same commands create your own site; see docs/sites.md.
+# The same commands create your own site; see docs/guides/sites.md.
 #
 #   /site/authority  the site's certificate and key; not shared with anyone
 #   /site/MEMBER     ca.pem, identity.pem, identity.key; roster.toml of routers; account.json and password of who signs;

@@ -81,8 +81,9 @@ def command() -> None:
 def new(source: Path, out: Path | None, replace: bool, as_json: bool) -> None:
     """Write a description in canonical form, and print its CID.
 
-    SOURCE is a JSON file as people write it (docs/models.md explains the fields), or a Python program with an agent
-    (NAME.py). The program is run, but its agent is not: the types of its handlers' messages say what the model takes.
+    SOURCE is a JSON file as people write it (docs/reference/models.md explains the fields), or a Python program with an
+    agent (NAME.py). The program is run, but its agent is not: the types of its handlers' messages say what the model
+    takes.
     """
 
     path = out or source.with_name("model.json")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from mesh.errors import AiraError
 
-CODES = Path(__file__).parents[2] / "docs" / "codes.md"
+CODES = Path(__file__).parents[2] / "docs" / "reference" / "codes.md"
 AIRA = (sys.executable, "-m", "mesh")
 SECONDS = 200.0
 SOON = 40
@@ -94,7 +94,7 @@ def refused(
 
 @cache
 def documented() -> Mapping[str, tuple[str, int]]:
-    """The class and the exit code of each error, by its code, as docs/codes.md says."""
+    """The class and the exit code of each error, by its code, as docs/reference/codes.md says."""
     rows = re.findall(r"^\| `([\w-]+)` \| `(\w+)` \| (\d) \|", CODES.read_text(), re.MULTILINE)
     return {code: (name, int(number)) for code, name, number in rows}
 

@@ -262,7 +262,7 @@ class SessionChecks:
         return failed(
             f"the router is open to every client that can reach it: a write to {where} was forwarded",
             code="router-open",
-            hint="create a site with a roster and certificates (docs/sites.md): `aira identity site FOLDER`",
+            hint="create a site with a roster and certificates (docs/guides/sites.md): `aira identity site FOLDER`",
         )
 
     def _untried(self) -> CheckResult:

@@ -75,7 +75,7 @@ def from_error(error: AiraError) -> CheckResult:
     return failed(
         str(error),
         code=error.code,
-        hint=error.hint or "see docs/deploy.md; `aira settings` shows the effective settings",
+        hint=error.hint or "see docs/guides/deploy.md; `aira settings` shows the effective settings",
     )
 
 

@@ -1,4 +1,4 @@
-"""A hobbyist's own sketch, with an input and a PWM output, works for money; docs/devices.md shows how."""
+"""A hobbyist's own sketch, with an input and a PWM output, works for money; docs/guides/devices.md shows how."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ async def test_a_lamp_is_dimmed_for_money_and_a_button_ends_the_job(place: Place
 
 def test_the_sketch_and_the_robot_of_the_page_about_devices_are_complete(tmp_path: Path) -> None:
     firmware(DIMMER)  # skips the test where the tools are missing
-    text = (ROOT / "docs" / "devices.md").read_text()
+    text = (ROOT / "docs" / "guides" / "devices.md").read_text()
     [sketch], [robot] = (re.findall(f"```{kind}\n(.*?)```", text, re.DOTALL) for kind in ("cpp", "python"))
     for name, source in (("lamp/lamp.ino", sketch), ("robot.py", robot), ("model.md", "Dims a lamp")):
         (tmp_path / name).parent.mkdir(exist_ok=True)

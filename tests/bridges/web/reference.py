@@ -1,4 +1,4 @@
-"""Writes docs/api.md from openapi.json: `python -m tests.bridges.web.reference > docs/api.md`."""
+"""Writes docs/reference/http.md from openapi.json: `python -m tests.bridges.web.reference > docs/reference/http.md`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Errors have a fitting status and this body, with a code of [codes.md](codes.md):
 
 
 def reference() -> str:
-    """The text of docs/api.md."""
+    """The text of docs/reference/http.md."""
     document = decode_json(OPENAPI.read_text(encoding="utf-8"))
     return "\n".join((HEAD.format(description=document["info"]["description"]), *_paths(document), *_schemas(document)))
 

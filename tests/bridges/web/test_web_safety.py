@@ -149,4 +149,4 @@ async def test_every_route_is_documented(serve: Any) -> None:
 
 
 def test_the_reference_is_that_of_the_interface() -> None:
-    assert (Path(__file__).parents[3] / "docs" / "api.md").read_text() == reference()
+    assert (Path(__file__).parents[3] / "docs" / "reference" / "http.md").read_text() == reference()

@@ -134,14 +134,14 @@ def test_show_prints_the_description(described: Path) -> None:
 
 
 def test_the_schema_in_the_docs_is_that_of_the_source(tmp_path: Path) -> None:
-    documented = ROOT / "docs" / "model.schema.json"
+    documented = ROOT / "docs" / "reference" / "model.schema.json"
     assert model("schema", folder=tmp_path).stdout == documented.read_text(), (
-        "aira model schema > docs/model.schema.json"
+        "aira model schema > docs/reference/model.schema.json"
     )
 
 
 def test_the_description_in_the_docs_is_canonical() -> None:
-    (block,) = re.findall(r"```json\n(.*?)```", (ROOT / "docs" / "models.md").read_text(), re.DOTALL)
+    (block,) = re.findall(r"```json\n(.*?)```", (ROOT / "docs" / "reference" / "models.md").read_text(), re.DOTALL)
     assert read_description(block.encode()).title == "Blink with arguments"
 
 
@@ -209,7 +209,7 @@ def test_new_describes_an_agent_whose_model_is_the_file_to_write(tmp_path: Path)
 
 
 def test_new_describes_the_robot_of_the_docs(tmp_path: Path) -> None:
-    (text,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "models.md").read_text(), re.DOTALL)
+    (text,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "reference" / "models.md").read_text(), re.DOTALL)
     description = new_model(program(tmp_path, text))
     assert (description.title, description.price, description.seconds) == ("Rover", "5 XRT", 10)
     (topic,) = description.objective

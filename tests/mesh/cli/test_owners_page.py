@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tests.mesh.cli.served_chain import ServedChain
     from tests.support.routers import EmbeddedRouter
 
-PAGE: Final = (Path(__file__).parents[3] / "docs" / "owners.md").read_text()
+PAGE: Final = (Path(__file__).parents[3] / "docs" / "guides" / "owners.md").read_text()
 ROBOT: Final = """
 import asyncio
 from mesh import Agent

@@ -1,4 +1,4 @@
-"""What an author of a robot writes: as short as in docs/testing.md."""
+"""What an author of a robot writes: as short as in docs/guides/testing.md."""
 
 from mesh import Agent
 from mesh.testing import Market, assert_paid

@@ -1,4 +1,4 @@
-"""The programs in docs/testing.md, run by pytest as a reader's."""
+"""The programs in docs/guides/testing.md, run by pytest as a reader's."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from tests.support.commands import environment
 
-PAGE = Path(__file__).parents[3] / "docs" / "testing.md"
+PAGE = Path(__file__).parents[3] / "docs" / "guides" / "testing.md"
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import { parseExact } from "./numbers";
 import { texts } from "./texts";
 
-/** An answer with an error: `code` is one of docs/codes.md, `hint` says what to do. */
+/** An answer with an error: `code` is one of docs/reference/codes.md, `hint` says what to do. */
 export class ApiError extends Error {
   constructor(
     readonly code: string,

@@ -1,4 +1,4 @@
-// The board's side of AIRA's own frames; docs/frames.md of aira-mesh has them to the byte.
+// The board's side of AIRA's own frames; docs/reference/frames.md of aira-mesh has them to the byte.
 //
 //   void echo(aira::Call &call) { call.answer.raw(call.arguments.data(), call.arguments.size()); }
 //
