@@ -855,13 +855,16 @@ class WatchedContracts:
         """The contract at `address` (or name), read from the chain. Raises `NotALiability`."""
         address = await self._parts.chain.names.address(address)
         is_new = address not in self._watched
-        self._watch(address)  # before it is read: it may end in between
+        watched = self._watch(address)  # before it is read: it may end in between
         try:
-            return self.watch(await self._parts.chain.liabilities.get(address))
+            liability = await self._parts.chain.liabilities.get(address)
         except BaseException:
             if is_new:
                 self._watched.pop(address, None)
             raise
+        if watched.ended.done():
+            return Contract(liability, watched.ended, self._parts, self._reports)
+        return self.watch(liability)
 
     def watch(self, liability: Liability, *, order: str = "") -> Contract:
         """The contract of `liability`, which was created from our `order` (lasting hash), if from any."""

@@ -179,15 +179,20 @@ class TradedOrder:
         finally:
             self.on_progress.remove(listener)
 
-    async def contract(self, on_progress: OnProgress) -> Contract:
-        """Wait until it is a contract, and report rejections and declines meanwhile, those of before first."""
+    def expect_contract(self) -> asyncio.Future[Contract]:
+        """Somebody waits for its contract, from now on."""
         if self.created is None:
             self.created = asyncio.get_running_loop().create_future()
+        return self.created
+
+    async def contract(self, on_progress: OnProgress) -> Contract:
+        """Wait until it is a contract, and report rejections and declines meanwhile, those of before first."""
+        created = self.expect_contract()
         for said in (*map(stated, self.rejections.values()), *map(stated, self.declines.values())):
             report(on_progress, said)
         self.on_progress.append(on_progress)
         try:
-            return await asyncio.shield(self.created)
+            return await asyncio.shield(created)
         finally:
             self.on_progress.remove(on_progress)
 

@@ -470,6 +470,7 @@ class Trader(Lifecycle):
             raise ENDED() if order.is_open else order.why_closed
         else:
             heard = nothing if order.robot else on_progress
+            order.expect_contract()  # now: it may become one while the subscription opens
             async with seen_offers(self._parts, order.signed, heard):
                 contract = await order.contract(on_progress)
         promisor, address = contract.liability.promisor, contract.address

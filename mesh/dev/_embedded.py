@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from mesh.base.extras import needs_extra
@@ -12,7 +12,7 @@ from mesh.dev._rpc import CHANGES, LIMIT_EXCEEDED, RUNS, RpcError
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Iterator
     from typing import Self
 
     from mesh.dev._evm import Evm, Methods
@@ -66,6 +66,9 @@ class EmbeddedChain:
         self._evm: Evm | None = None
         self._methods: Methods | None = None
         self._clock: asyncio.Task[None] | None = None
+        self._listeners: list[Callable[[Any], None]] = []
+        self._pushed: Any = None
+        """The block that they were told last."""
         self._funded_keys: tuple[bytes, ...] = ()
         self.provider = EmbeddedProvider(self)
 
@@ -108,6 +111,20 @@ class EmbeddedChain:
         """Mine that many empty blocks."""
         await self.request("evm_mine", [blocks])
 
+    @contextmanager
+    def pushed(self, on_head: Callable[[Any], None]) -> Iterator[None]:
+        """Meanwhile call `on_head` with each new block (JSON), before whoever changed the chain gets its answer.
+
+        First it is called with the latest, and then in a thread of the chain's; now and then again with the same one.
+        """
+        if self._pushed is not None:
+            on_head(self._pushed)
+        self._listeners.append(on_head)
+        try:
+            yield
+        finally:
+            self._listeners.remove(on_head)
+
     async def request(self, method: str, params: Any) -> Any:
         """The result of a JSON-RPC method. Raises `RpcError` for what the node refuses."""
         if self._requests >= self._max_requests:
@@ -115,7 +132,7 @@ class EmbeddedChain:
         self._requests += 1
         try:
             does = "changes" if method in CHANGES else "runs" if method in RUNS else "reads"
-            return await self._in_thread(does, lambda: self._opened().answer(method, params))
+            return await self._in_thread(does, lambda: self._answer(does, method, params))
         finally:
             self._requests -= 1
 
@@ -131,6 +148,18 @@ class EmbeddedChain:
         if self._evm is not None and self._evm.head == 0:
             self._start(HISTORY)
 
+    def _answer(self, does: str, method: str, params: Any) -> Any:
+        try:
+            return self._opened().answer(method, params)
+        finally:
+            if does == "changes":
+                self._push()
+
+    def _push(self) -> None:
+        self._pushed = self._opened().answer("eth_getBlockByNumber", ["latest"])
+        for listener in tuple(self._listeners):
+            listener(self._pushed)
+
     def _opened(self) -> Methods:
         if self._methods is None:
             raise ClosedError("the embedded chain is closed")
@@ -144,10 +173,15 @@ class EmbeddedChain:
     async def _mine_by_time(self, seconds: float) -> None:
         while True:
             await asyncio.sleep(seconds)
-            if seconds < 1 or self._evm is None:
+            if seconds < 1:
                 await self.mine()
             else:
-                await self._in_thread("changes", self._evm.mine_on_time)
+                await self._in_thread("changes", self._mine_on_time)
+
+    def _mine_on_time(self) -> None:
+        if self._evm is not None:
+            self._evm.mine_on_time()
+            self._push()
 
 
 class EmbeddedProvider:

@@ -7,7 +7,8 @@ import dataclasses
 import logging
 import shutil
 import tempfile
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -16,7 +17,7 @@ import msgspec
 
 from mesh.agent.agent import Agent
 from mesh.agent.ledger import Phase
-from mesh.base.background import Background
+from mesh.base.background import Background, call_in_loop
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.base.retry import RetryPolicy
@@ -62,17 +63,41 @@ ANY_MODEL: Final = cid_of_bytes(b"what a robot of a test does that names no mode
 
 
 class _NodeLine:
-    """The way to the node of a market."""
+    """The way of one client to the node of a market, which pushes each block at once: nobody has to poll."""
 
-    def __init__(self, node: EmbeddedChain) -> None:
-        self._node = node
-        self.is_down = False
+    def __init__(self, chain: MarketChain) -> None:
+        self._chain = chain
+        self._on_head: Callable[[Any], None] | None = None
+        self._pushes = ExitStack()
 
     async def make_request(self, method: str, params: Any) -> Any:
         """The node's response. Raises `ConnectionRefusedError` while the node is down."""
-        if self.is_down:
+        if self._chain.is_down:
             raise ConnectionRefusedError("the node is down")
-        return await self._node.provider.make_request(method, params)
+        return await self._chain.node.provider.make_request(method, params)
+
+    def push_heads(self, on_head: Callable[[Any], None] | None) -> None:
+        """See `PushingTransport`."""
+        if on_head is None:
+            self._on_head = None
+            self._pushes.close()
+        elif self._on_head is None and not self._chain.is_down:
+            self._on_head = on_head
+            push = partial(call_in_loop, asyncio.get_running_loop(), self._push)
+            self._pushes.enter_context(self._chain.node.pushed(push))
+            self._chain.lines.add(self)
+            self._pushes.callback(self._chain.lines.discard, self)
+
+    def cut(self) -> None:
+        """The node goes down: it pushes no more."""
+        on_head = self._on_head
+        self.push_heads(None)
+        if on_head is not None:
+            on_head(None)
+
+    def _push(self, head: Any) -> None:
+        if self._on_head is not None:
+            self._on_head(head)
 
     def __str__(self) -> str:
         return "the node of the market"
@@ -89,7 +114,10 @@ class MarketChain(Lifecycle):
 
     def __init__(self) -> None:
         self.node = EmbeddedChain()
-        self._line = _NodeLine(self.node)
+        self.is_down = False
+        """Whether the node answers nobody."""
+        self.lines: Final[set[_NodeLine]] = set()
+        """The ways to it on which it pushes blocks."""
         self._market: DevelopmentMarket | None = None
         self._numbers = count(1)
 
@@ -109,7 +137,7 @@ class MarketChain(Lifecycle):
 
     def chain(self, account: Account) -> Chain:
         """The chain for an account, not yet open."""
-        return Chain(self._line, account=account, ens=self.market.deployment.ens, timing=TIMING)
+        return Chain(_NodeLine(self), account=account, ens=self.market.deployment.ens, timing=TIMING)
 
     def new_account(self) -> Account:
         """An account that was never used; the accounts of each run are the same, in the same order."""
@@ -122,7 +150,7 @@ class MarketChain(Lifecycle):
     async def fund(self, chain: Chain, *addresses: str) -> None:
         """Give accounts `ALLOWANCE` and `ETHER`; `chain` is that of the bank."""
         for address in addresses:
-            transfer = {"from": self._bank.address, "to": address, "value": hex(ETHER)}
+            transfer = {"from": self._ether, "to": address, "value": hex(ETHER)}
             await self.node.request("eth_sendTransaction", [transfer])
             await chain.tokens.transfer(address, ALLOWANCE)
 
@@ -133,6 +161,11 @@ class MarketChain(Lifecycle):
     @property
     def _bank(self) -> Account:
         return Account(self.node.funded_keys[3])
+
+    @property
+    def _ether(self) -> str:
+        """The account that gives everyone ether: another one, so that nobody else uses the nonces of the bank."""
+        return Account(self.node.funded_keys[4]).address
 
 
 class Market(Lifecycle):
@@ -347,11 +380,13 @@ class Market(Lifecycle):
     @asynccontextmanager
     async def node_down(self) -> AsyncIterator[None]:
         """Meanwhile no node answers, neither the robots and people nor the provider; `mine` and `reorg` still work."""
-        self.chain._line.is_down = True
+        self.chain.is_down = True
+        for line in tuple(self.chain.lines):
+            line.cut()
         try:
             yield
         finally:
-            self.chain._line.is_down = False
+            self.chain.is_down = False
 
     async def _default_customer(self) -> Agent:
         if self._customer is None:
