@@ -278,7 +278,7 @@ class Api(Lifecycle):
 
     async def _read_facts(self) -> dict[str, Any]:
         parts, chain, settings = self._parts, self._parts.chain, self._parts.settings
-        block_time = await chain.node.heads.block_time(100)
+        block_time = await chain.node.contract_blocks.seconds(100)
         return {
             "lighthouse": {"name": parts.channel.lighthouse, "address": parts.lighthouse},
             "chainId": chain.chain_id,

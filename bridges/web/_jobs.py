@@ -293,7 +293,7 @@ class Views:
                 "record": records.get(peer.address, AccountRecord()).json(),
             }
             listed.append(facts)
-        alerts = alerts_of({peer.address: status for peer, status in found.items()}, market.head)
+        alerts = alerts_of({peer.address: status for peer, status in found.items()}, parts.chain_head.head)
         return {"agents": listed, "unlisted": max(0, len(peers) - AGENTS), "alerts": alerts}
 
     def _offers(self) -> dict[str, list[SeenOrder]]:
