@@ -24,7 +24,7 @@ from schemas.messages import MESSAGE_TYPES
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-PUBLIC: Final = ("mesh", "mesh.testing", "bridges.serial", "bridges.ros2")
+PUBLIC: Final = ("mesh", "mesh.testing", "bridges.serial", "bridges.ros1", "bridges.ros2")
 """The packages that users import from."""
 PAGES: Final = {
     "mesh.testing": ("testing", "Tests"),
@@ -44,6 +44,7 @@ PAGES: Final = {
     "mesh.amounts": ("messages", "Messages"),
     "mesh.settings": ("settings", "Settings of a program"),
     "bridges.serial": ("devices", "Devices"),
+    "bridges.ros1": ("ros1", "ROS 1"),
     "bridges.ros2": ("ros2", "ROS 2"),
 }
 """Where names are described: the first entry whose module or package defines them. Errors have a page of their own."""
