@@ -571,7 +571,8 @@ class AgentRuntime(Lifecycle):
         if asked.paused:
             await self.trader.take_back_offers("its owner has paused it")
         self.profile.changed()
-        return replace(self.rules.control, stopped=stopped)
+        notifier = self.notifier
+        return replace(self.rules.control, stopped=stopped, notify=notifier.targets(), events=tuple(notifier.recent))
 
     async def _ask(self, asked: LocalRequest) -> LocalAnswer:
         if asked.control is None:
