@@ -24,12 +24,12 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 import msgspec
-import zenoh
 
 from mesh.base.background import Background, call_in_loop
 from mesh.base.lifecycle import Lifecycle
@@ -38,7 +38,7 @@ from mesh.base.retry import Backoff, RetryPolicy
 from mesh.errors import ConfigurationError
 from mesh.market.transactions import LEAST_GAS
 from mesh.network import NetworkChange
-from mesh.network.services import declared
+from mesh.network.presence import PresenceWatch
 from schemas.decoding import InvalidData, first_line
 from schemas.keys import PRESENT, DeviceTopicKey, device_selector, parse_agent_key
 from schemas.records import NotifyTarget, RobotEvent
@@ -296,13 +296,11 @@ class OwnerWatch:
         loop, session = asyncio.get_running_loop(), self._parts.network.session
         selector = device_selector(self._parts.signer.address, topic=PRESENT)
 
-        def changed(sample: zenoh.Sample) -> None:
-            is_present = sample.kind == zenoh.SampleKind.PUT
-            call_in_loop(loop, self._device_changed, str(sample.key_expr), is_present)
-
-        subscriber = session.liveliness().declare_subscriber(selector, changed, history=True)
-        with declared(session, subscriber):
+        watch = PresenceWatch(session, selector, partial(call_in_loop, loop, self._device_changed))
+        try:
             await asyncio.Event().wait()
+        finally:
+            watch.end()
 
     def _device_changed(self, key: str, is_present: bool) -> None:
         parsed = parse_agent_key(key)
