@@ -22,7 +22,7 @@ COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 RERUNS := --reruns 1 --max-suite-reruns 3 --rerun-show-tracebacks
 
 .PHONY: help setup demo test simulate simulate-mutants compose-test crash-test lint peers bench contracts contracts-check \
-	page page-check slither firmware docs lock release clean
+	page page-check slither firmware docs lock release upgrade-sample clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -136,6 +136,9 @@ lock: ## update the locked versions (needs uv)
 
 release: $(INSTALLED) ## wheel, sdist, SBOM, notes and checksums in dist/, built twice and tried; ARGS=--no-try builds only
 	@$(BIN)/python .ci/release $(ARGS)
+
+upgrade-sample: $(INSTALLED) ## what this version keeps, for the upgrade test of later ones, in tests/upgrade
+	@$(BIN)/python -m tests.upgrade.make
 
 clean: ## remove what the targets above have made here; the peers' cache stays
 	@rm -rf .venv build dist *.egg-info .coverage .coverage.* htmlcov \
