@@ -143,7 +143,7 @@ def test_an_owner_changes_the_price_sees_the_notification_and_its_job_and_downlo
         browser.type("Price of a job", "3")
         browser.click("#set-price")
         browser.until(lambda: browser.find(".hero .price-tag").text == "3 XRT", "the new price")
-        browser.until(lambda: "Was paid" in browser.find(".events li").text, "the notification")
+        browser.until(lambda: "Job paid" in browser.find(".events li").text, "the notification")
         browser.sees("They are sent to 127.0.0.1.")
         browser.until(lambda: told[1] and told[1][-1]["type"] == "aira.job-paid", "the owner's event")
         assert job.endswith(told[1][-1]["subject"])
@@ -151,11 +151,11 @@ def test_an_owner_changes_the_price_sees_the_notification_and_its_job_and_downlo
         browser.sees("the robot was paid")
         assert browser.driver.current_url == job
         browser.driver.back()
-        browser.type("Works for no less than", "3")
+        browser.type("Lowest price it accepts", "3")
         browser.click("#set-least")
         browser.sees("Saved.")
         browser.click("#pause")
-        browser.sees("It finishes what it has, and takes nothing new.")
+        browser.sees("It finishes its jobs and takes no new ones.")
         browser.sees("takes no jobs now")
         browser.until(lambda: "2.5 XRT" in browser.find(".owner .lead").text, "the income")
         for look, size, dark in LOOKS:
