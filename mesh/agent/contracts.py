@@ -480,7 +480,8 @@ class ContractReports(Lifecycle):
             while changed.is_set():
                 changed.clear()
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(changed.wait(), 0 if judged.is_split else self.silence)
+                    async with asyncio.timeout(0 if judged.is_split else self.silence):
+                        await changed.wait()
             with suppress(AiraError):  # the node is away: the next state is said
                 await self.of(judged.liability)
                 if judged.is_judged:

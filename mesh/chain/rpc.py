@@ -61,11 +61,14 @@ class Transport(Protocol):
 class PushingTransport(Transport, Protocol):
     """A transport whose node pushes new blocks."""
 
-    def push_heads(self, on_head: Callable[[Any], None] | None) -> None:
-        """Call `on_head` with each new block, as JSON, and with None when none is pushed any more; None ends that.
+    def push_heads(self, on_head: Callable[[Any], None]) -> None:
+        """Call `on_head` with each new block, as JSON, and with None when none is pushed any more.
 
-        It is called again and again, and the first function counts.
+        It is called in this event loop, until `end_pushes`. This may be called again and again.
         """
+
+    def end_pushes(self, on_head: Callable[[Any], None]) -> None:
+        """Call it no more. Unknown ones are ignored."""
 
 
 class _Transport:
@@ -126,14 +129,17 @@ class WebSocketTransport(_Transport):
         if self._on_head is not None:
             self._on_head(None)
 
-    def push_heads(self, on_head: Callable[[Any], None] | None) -> None:
+    def push_heads(self, on_head: Callable[[Any], None]) -> None:
         """See `PushingTransport`. A node that has no such subscription is not asked again."""
-        if on_head is None:
-            self._on_head = None
-        elif self._on_head is None:
+        if self._on_head is None:
             self._on_head = on_head
             if self._socket is not None and not self._socket.closed:
                 self._subscribing = asyncio.create_task(self._subscribe(), name="aira-chain-heads")
+
+    def end_pushes(self, on_head: Callable[[Any], None]) -> None:
+        """See `PushingTransport`."""
+        if self._on_head is on_head:
+            self._on_head = None
 
     async def make_request(self, method: str, params: Any) -> Any:
         """The node's response, with a result or an error."""
@@ -295,6 +301,8 @@ class Upstream:
         self.owned = owned
         self.pushing = transport if isinstance(transport, PushingTransport) else None
         """The same, if its node may push new blocks."""
+        self.on_head: Callable[[Any], None] | None = None
+        """What it calls with them."""
         self._transport = transport
         self._secrets = secrets_in(endpoint)
         self.is_on_chain = False
@@ -393,7 +401,8 @@ class RpcClient:
         self._on_head = on_head
         first = self._upstreams[0]
         if first.pushing is not None:
-            first.pushing.push_heads(partial(self._take_head, first))
+            first.on_head = first.on_head or partial(self._take_head, first)
+            first.pushing.push_heads(first.on_head)
 
     def _take_head(self, upstream: Upstream, pushed: Any) -> None:
         if upstream is not self._upstreams[0] or self._on_head is None:
@@ -523,8 +532,8 @@ class RpcClient:
         """Close the connections that this side opened; further requests raise `ClosedError`."""
         self._is_open = False
         for upstream in self._upstreams:
-            if upstream.pushing is not None:
-                upstream.pushing.push_heads(None)
+            if upstream.pushing is not None and upstream.on_head is not None:
+                upstream.pushing.end_pushes(upstream.on_head)
             if upstream.owned is not None:
                 await upstream.owned.close()
 

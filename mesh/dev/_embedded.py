@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import asynccontextmanager, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from mesh.base.background import call_in_loop
 from mesh.base.extras import needs_extra
 from mesh.dev._rpc import CHANGES, LIMIT_EXCEEDED, RUNS, RpcError
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator
+    from collections.abc import AsyncIterator, Callable
     from typing import Self
 
     from mesh.dev._evm import Evm, Methods
@@ -66,7 +68,8 @@ class EmbeddedChain:
         self._evm: Evm | None = None
         self._methods: Methods | None = None
         self._clock: asyncio.Task[None] | None = None
-        self._listeners: list[Callable[[Any], None]] = []
+        self._listeners: dict[Callable[[Any], None], Callable[[Any], None]] = {}
+        """Who is told of each new block, and how, from any thread."""
         self._pushed: Any = None
         """The block that they were told last."""
         self._funded_keys: tuple[bytes, ...] = ()
@@ -111,19 +114,19 @@ class EmbeddedChain:
         """Mine that many empty blocks."""
         await self.request("evm_mine", [blocks])
 
-    @contextmanager
-    def pushed(self, on_head: Callable[[Any], None]) -> Iterator[None]:
-        """Meanwhile call `on_head` with each new block (JSON), before whoever changed the chain gets its answer.
+    def push_heads(self, on_head: Callable[[Any], None]) -> None:
+        """From now on call `on_head` in this event loop with each new block (JSON), and first with the latest.
 
-        First it is called with the latest, and then in a thread of the chain's; now and then again with the same one.
+        It is called before who changed the chain has the answer, and now and then again with the same block.
         """
-        if self._pushed is not None:
-            on_head(self._pushed)
-        self._listeners.append(on_head)
-        try:
-            yield
-        finally:
-            self._listeners.remove(on_head)
+        if on_head not in self._listeners:
+            push = self._listeners[on_head] = partial(call_in_loop, asyncio.get_running_loop(), on_head)
+            if self._pushed is not None:
+                push(self._pushed)
+
+    def end_pushes(self, on_head: Callable[[Any], None]) -> None:
+        """Call it no more."""
+        self._listeners.pop(on_head, None)
 
     async def request(self, method: str, params: Any) -> Any:
         """The result of a JSON-RPC method. Raises `RpcError` for what the node refuses."""
@@ -157,8 +160,8 @@ class EmbeddedChain:
 
     def _push(self) -> None:
         self._pushed = self._opened().answer("eth_getBlockByNumber", ["latest"])
-        for listener in tuple(self._listeners):
-            listener(self._pushed)
+        for push in tuple(self._listeners.values()):
+            push(self._pushed)
 
     def _opened(self) -> Methods:
         if self._methods is None:
@@ -185,11 +188,13 @@ class EmbeddedChain:
 
 
 class EmbeddedProvider:
-    """The transport of requests to an `EmbeddedChain`."""
+    """The transport of requests to an `EmbeddedChain`, which pushes each block at once."""
 
     def __init__(self, chain: EmbeddedChain) -> None:
         self._chain = chain
         self.in_the_past = chain.in_the_past
+        self.push_heads = chain.push_heads
+        self.end_pushes = chain.end_pushes
 
     async def make_request(self, method: str, params: Any) -> Any:
         """A JSON-RPC response with the result or the error."""

@@ -7,8 +7,7 @@ import dataclasses
 import logging
 import shutil
 import tempfile
-from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
-from functools import partial
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -17,7 +16,7 @@ import msgspec
 
 from mesh.agent.agent import Agent
 from mesh.agent.ledger import Phase
-from mesh.base.background import Background, call_in_loop
+from mesh.base.background import Background
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.base.retry import RetryPolicy
@@ -63,41 +62,42 @@ ANY_MODEL: Final = cid_of_bytes(b"what a robot of a test does that names no mode
 
 
 class _NodeLine:
-    """The way of one client to the node of a market, which pushes each block at once: nobody has to poll."""
+    """The way to the node of a market."""
 
-    def __init__(self, chain: MarketChain) -> None:
-        self._chain = chain
-        self._on_head: Callable[[Any], None] | None = None
-        self._pushes = ExitStack()
+    def __init__(self, node: EmbeddedChain) -> None:
+        self._node = node
+        self._told: set[Callable[[Any], None]] = set()
+        """Who is told of new blocks."""
+        self._is_down = False
 
     async def make_request(self, method: str, params: Any) -> Any:
         """The node's response. Raises `ConnectionRefusedError` while the node is down."""
-        if self._chain.is_down:
+        if self._is_down:
             raise ConnectionRefusedError("the node is down")
-        return await self._chain.node.provider.make_request(method, params)
+        return await self._node.provider.make_request(method, params)
 
-    def push_heads(self, on_head: Callable[[Any], None] | None) -> None:
+    def push_heads(self, on_head: Callable[[Any], None]) -> None:
         """See `PushingTransport`."""
-        if on_head is None:
-            self._on_head = None
-            self._pushes.close()
-        elif self._on_head is None and not self._chain.is_down:
-            self._on_head = on_head
-            push = partial(call_in_loop, asyncio.get_running_loop(), self._push)
-            self._pushes.enter_context(self._chain.node.pushed(push))
-            self._chain.lines.add(self)
-            self._pushes.callback(self._chain.lines.discard, self)
+        if not self._is_down:
+            self._told.add(on_head)
+            self._node.push_heads(on_head)
 
-    def cut(self) -> None:
-        """The node goes down: it pushes no more."""
-        on_head = self._on_head
-        self.push_heads(None)
-        if on_head is not None:
+    def end_pushes(self, on_head: Callable[[Any], None]) -> None:
+        """See `PushingTransport`."""
+        self._told.discard(on_head)
+        self._node.end_pushes(on_head)
+
+    @contextmanager
+    def down(self) -> Iterator[None]:
+        """Meanwhile the node answers nobody."""
+        self._is_down = True
+        for on_head in tuple(self._told):
+            self.end_pushes(on_head)
             on_head(None)
-
-    def _push(self, head: Any) -> None:
-        if self._on_head is not None:
-            self._on_head(head)
+        try:
+            yield
+        finally:
+            self._is_down = False
 
     def __str__(self) -> str:
         return "the node of the market"
@@ -114,10 +114,8 @@ class MarketChain(Lifecycle):
 
     def __init__(self) -> None:
         self.node = EmbeddedChain()
-        self.is_down = False
-        """Whether the node answers nobody."""
-        self.lines: Final[set[_NodeLine]] = set()
-        """The ways to it on which it pushes blocks."""
+        self.line: Final = _NodeLine(self.node)
+        """The way of all programs to it."""
         self._market: DevelopmentMarket | None = None
         self._numbers = count(1)
 
@@ -137,7 +135,7 @@ class MarketChain(Lifecycle):
 
     def chain(self, account: Account) -> Chain:
         """The chain for an account, not yet open."""
-        return Chain(_NodeLine(self), account=account, ens=self.market.deployment.ens, timing=TIMING)
+        return Chain(self.line, account=account, ens=self.market.deployment.ens, timing=TIMING)
 
     def new_account(self) -> Account:
         """An account that was never used; the accounts of each run are the same, in the same order."""
@@ -380,13 +378,8 @@ class Market(Lifecycle):
     @asynccontextmanager
     async def node_down(self) -> AsyncIterator[None]:
         """Meanwhile no node answers, neither the robots and people nor the provider; `mine` and `reorg` still work."""
-        self.chain.is_down = True
-        for line in tuple(self.chain.lines):
-            line.cut()
-        try:
+        with self.chain.line.down():
             yield
-        finally:
-            self.chain.is_down = False
 
     async def _default_customer(self) -> Agent:
         if self._customer is None:

@@ -161,16 +161,19 @@ async def test_each_block_is_pushed_before_its_transaction_is_answered(node: Emb
     def push(head: Any) -> None:
         heads.append(int(head["number"], 16))
 
-    with node.pushed(push):
-        await node.mine(2)
-        assert heads == [2]
-        await node.request("eth_sendTransaction", [{"from": Account(node.funded_keys[0]).address}])
-        assert heads == [2, 3]
-        await node.request("eth_blockNumber", [])
+    node.push_heads(push)
+    await node.mine(2)
+    assert heads == [2]
+    await node.request("eth_sendTransaction", [{"from": Account(node.funded_keys[0]).address}])
+    assert heads == [2, 3]
+    node.push_heads(push)
+    await node.request("eth_blockNumber", [])
+    node.end_pushes(push)
     await node.mine()
     assert heads == [2, 3]
-    with node.pushed(push):
-        assert heads == [2, 3, 4]
+    node.push_heads(push)
+    await node.request("eth_blockNumber", [])
+    assert heads == [2, 3, 4]
 
 
 async def test_blocks_are_mined_with_a_block_time() -> None:
