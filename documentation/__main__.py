@@ -36,7 +36,8 @@ def put_together(build: Path) -> None:
         (pages / name).parent.mkdir(parents=True, exist_ok=True)
         (pages / name).write_text(text, encoding="utf-8")
     own = ROOT / "documentation"
-    shutil.copy(own / "extra.css", pages / "extra.css")
+    shutil.copy(own / "extra.css", pages)
+    shutil.copy(ROOT / "bridges" / "web" / "app" / "public" / "icon.svg", pages)
     configuration = (own / "zensical.toml").read_text(encoding="utf-8")
     before, heading, rest = configuration.partition("[project]\n")
     (build / "zensical.toml").write_text(f"{before}{heading}nav = {navigation(pages)}\n{rest}", encoding="utf-8")

@@ -36,10 +36,10 @@ def navigation(pages: Path) -> str:
 def _section(pages: Path, folder: str, ranks: dict[str, int]) -> str:
     names = [f"{folder}/{path.name}" for path in sorted((pages / folder).glob("*.md"))]
     names.sort(key=lambda name: (not name.endswith("/index.md"), ranks.get(name, len(ranks)), name))
-    inner = (below for below in SECTIONS if below.startswith(f"{folder}/") and (pages / below).is_dir())
-    return _named(
-        SECTIONS[folder], [*(json.dumps(name) for name in names), *(_section(pages, below, ranks) for below in inner)]
-    )
+    inner = [below for below in SECTIONS if below.startswith(f"{folder}/") and (pages / below).is_dir()]
+    items = [*(_section(pages, below, ranks) for below in inner), *map(json.dumps, names)]
+    items.sort(key=lambda item: not item.endswith('/index.md"'))
+    return _named(SECTIONS[folder], items)
 
 
 def _named(title: str, items: list[str]) -> str:

@@ -16,6 +16,7 @@ from documentation.commands import command_pages
 from documentation.http import http_api
 from documentation.markdown import escaped
 from documentation.metrics import metrics
+from documentation.performance import performance
 from mesh.settings import MEANING, Settings
 from schemas import keys
 from schemas.errors import AiraError
@@ -61,7 +62,7 @@ def reference() -> dict[str, str]:
         "metrics.md": metrics(),
         "settings.md": _settings(),
     }
-    return {f"reference/{name}": text for name, text in made.items()}
+    return {"explanation/performance.md": performance(), **{f"reference/{name}": text for name, text in made.items()}}
 
 
 def _python() -> dict[str, str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from typing import TYPE_CHECKING
 
 import click
@@ -9,11 +11,13 @@ import pytest
 
 from documentation.checks import problems
 from documentation.navigation import navigation
+from documentation.performance import BARS, constants, performance
 from documentation.reference import reference
-from documentation.staging import places, relinked
+from documentation.staging import ROOT, places, relinked
 from mesh.cli import main
 from mesh.settings import OPTIONS
 from schemas import keys
+from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -107,3 +111,19 @@ def test_every_key_is_listed() -> None:
     patterns = [kind.pattern for kind in kinds if hasattr(kind, "pattern")]
     assert len(patterns) > 20
     assert [pattern for pattern in patterns if f"`{pattern}`" not in text] == []
+
+
+def test_performance_is_what_was_measured_with_the_bars_of_the_benchmarks() -> None:
+    text = performance()
+    results = decode_json((ROOT / "bench" / "results.json").read_bytes())
+    assert [name for name in results if not (ROOT / "bench" / f"{name}.py").is_file()] == []
+    assert len(re.findall(r"^\d{4}-\d\d-\d\d, commit `\w+", text, re.MULTILINE)) == len(results)
+    figures = results["messages"]["measured"]
+    assert f"| verified per second | {figures['verified_per_second']:,} |  |" in text
+    assert f"| ratio | {figures['ratio']} | at least 0.7 |" in text
+
+
+def test_every_bar_is_a_number_of_its_benchmark() -> None:
+    for name, bars in BARS.items():
+        known = constants(ast.parse((ROOT / "bench" / f"{name}.py").read_text()))
+        assert [bar for bar in bars.values() if re.split(r"[: \[]+", bar)[2] not in known] == []
