@@ -156,9 +156,8 @@ class LegacyGraph(Lifecycle):
             *((CHANNEL, f"/liability/infochan/incoming/{kind}", _type_of(kind)) for kind in KINDS),
             *((SIGNER, f"/liability/infochan/eth/sending/{kind}", _type_of(kind)) for kind in KINDS),
         ):
-            versions = message_types()[type]
-            default = versions[md5_of(type, self._generation)]
-            self._topics[topic] = await self._nodes[node].advertise(topic, default, versions.values())
+            default = md5_of(type, self._generation)
+            self._topics[topic] = await self._nodes[node].advertise(topic, message_types()[type], default)
         for kind in KINDS:
             for node, topic, service in (
                 (SIGNER, "eth/signing", "sign"),
@@ -203,9 +202,7 @@ class LegacyGraph(Lifecycle):
             (TOKEN, "/eth/erc20_allowance_of", own_allowed, self._eth("xrt_allowance")),
         ]
         for node, name, type, handler in handlers:
-            versions = service_types()[type]
-            default = versions[md5_of(type, self._generation)]
-            await self._nodes[node].serve(name, default, handler, versions.values())
+            await self._nodes[node].serve(name, service_types()[type], md5_of(type, self._generation), handler)
 
     def _handle_event(self, key: str, payload: bytes) -> None:
         """A job has come to a phase."""

@@ -77,9 +77,7 @@ class LegacyFiles(Lifecycle):
             (self._player, "/rosbagplayer/start", "robonomics_liability/StartRosbagPlayer", self._start),
             (self._player, "/rosbagplayer/stop", "robonomics_liability/StopRosbagPlayer", self._stop),
         ):
-            versions = service_types()[type]
-            default = versions[md5_of(type, self._options.generation)]
-            await node.serve(name, default, handler, versions.values())
+            await node.serve(name, service_types()[type], md5_of(type, self._options.generation), handler)
 
     def _checked(self, text: str) -> Path:
         """A path below one of the folders. Raises `InputError`."""

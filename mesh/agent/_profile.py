@@ -205,8 +205,7 @@ class OwnProfile:
                     self._parts.channel.put(key, self._signed(*doing).encode())
             await asyncio.sleep(INTERVAL)
             with suppress(TimeoutError):
-                async with asyncio.timeout(LOOK):
-                    await self._changed.wait()
+                await asyncio.wait_for(self._changed.wait(), LOOK)
 
 
 def _text(payload: bytes, kind: PayloadType) -> str:

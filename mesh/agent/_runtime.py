@@ -180,18 +180,18 @@ class LateResults:
         """Look at the unsettled Results after each block, until cancelled."""
         head = self._parts.chain_head
         while True:
-            unsettled = await self._parts.ledger.outbox(head=head.contract_block)
+            unsettled = await self._parts.ledger.outbox(head=head.head)
             results = [decode(one.payload) for one in unsettled if one.kind == Result.kind]
             waiting = {result.liability: result for result in results if isinstance(result, Result)}
             self._late_from = {address: block for address, block in self._late_from.items() if address in waiting}
-            self._since = {address: self._since.get(address, head.contract_block) for address in waiting}
+            self._since = {address: self._since.get(address, head.head) for address in waiting}
             for address, result in waiting.items():
                 with liability_context(address):
                     await self._finalize_if_late(result)
             await head.reached(head.head + 1)
 
     async def _finalize_if_late(self, result: Result) -> None:
-        address, head = result.liability, self._parts.chain_head.contract_block
+        address, head = result.liability, self._parts.chain_head.head
         try:
             if address not in self._late_from:
                 if head - self._since[address] < SOON:
@@ -347,11 +347,11 @@ class AgentRuntime(Lifecycle):
                 liability, orders = created
                 with liability_context(event.liability):
                     if self._account in (liability.promisor, liability.promisee):
-                        await self.new_liability(liability, demand_hash=orders[0], offer_hash=orders[1])
+                        await self.new_liability(liability, demand_hash=orders[0], offer_hash=orders[1], created=block)
                     if self._account != liability.promisor:
                         await self.trader.taken(liability, orders[0])
             case Finalized():
-                await self.finalized(event.liability, success=event.success, result=event.result)
+                await self.finalized(event.liability, success=event.success, result=event.result, ended=block)
             case Transfer() | Approval():
                 self.token_events.publish(event)
 
@@ -371,8 +371,8 @@ class AgentRuntime(Lifecycle):
 
     async def on_head(self, block: int) -> None:
         """All of `block` has been handled. After a reorganisation it may be lower than before."""
-        await self.parts.outbox.expire(self.parts.chain_head.contract_block)
-        await self.trader.new_head(self.parts.chain_head.contract_block)
+        await self.parts.outbox.expire(block)
+        await self.trader.new_head(block)
 
     async def finalize_ended(self) -> None:
         """Finalize the jobs that ended while the agent was away, before any of them is played to the device again."""
@@ -414,8 +414,10 @@ class AgentRuntime(Lifecycle):
         return self._account in (promisee, promisor) or promisee in self.trader.answered
 
     @with_liability_context
-    async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
-        """A contract was created that names this account: as promisee, as promisor, or as both."""
+    async def new_liability(
+        self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes, created: int | None = None
+    ) -> None:
+        """A contract was created, in the block `created`, that names this account: as promisee, promisor, or both."""
         does_jobs = self.parts.settings.enable_executor
         if does_jobs and liability.promisor == self._account and not liability.is_finalized:
             self.executor.at_hand.add(liability.address)  # before the offer is none any more
@@ -435,6 +437,8 @@ class AgentRuntime(Lifecycle):
         job = await self.parts.ledger.job(address)
         # Another program of the account may have added it, and left it to this one.
         if job is None or (is_known and (job.phase is not Phase.INCOMING or address in self.executor.preparing)):
+            if created is not None and address in self.executor.created_in:  # again, after a reorganisation
+                self.executor.created_in[address] = created
             if job is None or job.phase not in TO_BE_DONE:
                 self.executor.at_hand.discard(address)
             return
@@ -445,7 +449,7 @@ class AgentRuntime(Lifecycle):
         facts = log_event("job-accepted", model=liability.model, objective=liability.objective, cost=liability.cost)
         log.info("new job, model %s, objective %s", liability.model, liability.objective, extra=facts)
         await self._on_phase(Phase.INCOMING, liability)
-        self.executor.prepare(liability)
+        self.executor.prepare(liability, created=created)
 
     @with_liability_context
     async def liability_reverted(self, address: str) -> None:
@@ -458,8 +462,8 @@ class AgentRuntime(Lifecycle):
         await self.trader.liability_reverted(address)
 
     @with_liability_context
-    async def finalized(self, address: str, *, success: bool, result: str) -> None:
-        """A contract has paid (`success`) or refunded. `result` is the CID of its recording."""
+    async def finalized(self, address: str, *, success: bool, result: str, ended: int | None = None) -> None:
+        """A contract has paid (`success`) or refunded, in the block `ended`. `result` is the CID of its recording."""
         async with self.executor.halted(address) as job:
             # In this order: after a crash in between, the block is handled again and finds the job unfinished.
             await self.parts.outbox.settle(result_identity(address))  # also one that was signed by request
@@ -468,13 +472,16 @@ class AgentRuntime(Lifecycle):
         if job is not None and job.phase is not Phase.FINALIZED:
             facts = log_event("job-finalized", success=success)
             log.info("finalized, %s", "paid" if success else "refunded", extra=facts)
-            ended = replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
-            await self._on_phase(Phase.FINALIZED, ended)
-        self.trader.contracts.finalized(address, Outcome(success=success, result=result))
+            paid = replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
+            await self._on_phase(Phase.FINALIZED, paid)
+        outcome = Outcome(success=success, result=result)
+        self.trader.contracts.finalized(address, outcome, self.parts.chain_head.head if ended is None else ended)
+        await self.trader.contracts.settle()
 
     @with_liability_context
     async def finalization_reverted(self, address: str) -> None:
         """A reorganisation reverted the end of a contract: the Result of its job, if it has one, is sent again."""
+        self.trader.contracts.end_reverted(address)
         async with self.executor.halted(address) as job:
             if job is not None and job.result is not None:
                 log.warning("the finalization was reverted", extra=log_event("finalization-reverted"))
@@ -571,8 +578,7 @@ class AgentRuntime(Lifecycle):
         if asked.paused:
             await self.trader.take_back_offers("its owner has paused it")
         self.profile.changed()
-        notifier = self.notifier
-        return replace(self.rules.control, stopped=stopped, notify=notifier.targets(), events=tuple(notifier.recent))
+        return replace(self.rules.control, stopped=stopped)
 
     async def _ask(self, asked: LocalRequest) -> LocalAnswer:
         if asked.control is None:

@@ -480,8 +480,7 @@ class ContractReports(Lifecycle):
             while changed.is_set():
                 changed.clear()
                 with suppress(TimeoutError):
-                    async with asyncio.timeout(0 if judged.is_split else self.silence):
-                        await changed.wait()
+                    await asyncio.wait_for(changed.wait(), 0 if judged.is_split else self.silence)
             with suppress(AiraError):  # the node is away: the next state is said
                 await self.of(judged.liability)
                 if judged.is_judged:
@@ -834,6 +833,10 @@ class _WatchedContract:
     order: str = ""
     """The order of ours (hash) that it was created from, if any, and what those hold who waited for it."""
     contract: Contract | None = None
+    outcome: Outcome | None = None
+    """How it has ended, while the block of its end does not count yet."""
+    ended_in: int = 0
+    """That block."""
     reverted_until: int | None = None
     """While a reorganisation has reverted it: the block by which it must be created again."""
 
@@ -856,16 +859,15 @@ class WatchedContracts:
         """The contract at `address` (or name), read from the chain. Raises `NotALiability`."""
         address = await self._parts.chain.names.address(address)
         is_new = address not in self._watched
-        watched = self._watch(address)  # before it is read: it may end in between
+        self._watch(address)  # before it is read: it may end in between
         try:
-            liability = await self._parts.chain.liabilities.get(address)
+            contract = self.watch(await self._parts.chain.liabilities.get(address))
+            await self.settle()
+            return contract
         except BaseException:
             if is_new:
                 self._watched.pop(address, None)
             raise
-        if watched.ended.done():
-            return Contract(liability, watched.ended, self._parts, self._reports)
-        return self.watch(liability)
 
     def watch(self, liability: Liability, *, order: str = "") -> Contract:
         """The contract of `liability`, which was created from our `order` (lasting hash), if from any."""
@@ -875,7 +877,8 @@ class WatchedContracts:
         if order:
             watched.order, watched.contract = order, contract
         if liability.is_finalized:
-            self.finalized(liability.address, Outcome(success=liability.is_success, result=liability.result))
+            outcome = Outcome(success=liability.is_success, result=liability.result)
+            self.finalized(liability.address, outcome, self._parts.chain_head.head)
         return contract
 
     def created(self, liability: Liability, order: str) -> Contract | None:
@@ -899,13 +902,34 @@ class WatchedContracts:
         if address in self._watched:
             self._watched[address].reverted_until = deadline
 
-    def finalized(self, address: str, outcome: Outcome) -> None:
-        """The contract at `address` has ended."""
-        watched = self._watched.pop(address, None)
-        if watched is not None and not watched.ended.done():
-            facts = log_event("contract-ended", success=outcome.success, result=outcome.result)
-            log.info("the contract has ended, %s", "paid" if outcome.success else "refunded", extra=facts)
-            watched.ended.set_result(outcome)
+    def finalized(self, address: str, outcome: Outcome, block: int) -> None:
+        """The contract at `address` has ended in a block: `settle` tells it when that counts."""
+        if address in self._watched:
+            self._watched[address].outcome, self._watched[address].ended_in = outcome, block
+
+    def end_reverted(self, address: str) -> None:
+        """A reorganisation reverted the end of the contract at `address`."""
+        if address in self._watched:
+            self._watched[address].outcome = None
+
+    async def settle(self) -> None:
+        """Tell those who wait of the ends that count by now. Raises `NodeUnreachable`."""
+        for address, watched in list(self._watched.items()):
+            if watched.outcome is None or not await self._parts.chain.node.counts(watched.ended_in):
+                continue
+            outcome = self._taken_end(address)  # it may have been taken back meanwhile
+            if outcome is not None and not watched.ended.done():
+                facts = log_event("contract-ended", success=outcome.success, result=outcome.result)
+                log.info("the contract has ended, %s", "paid" if outcome.success else "refunded", extra=facts)
+                watched.ended.set_result(outcome)
+
+    def _taken_end(self, address: str) -> Outcome | None:
+        """How a contract has ended, which is not watched any more then."""
+        watched = self._watched.get(address)
+        if watched is None or watched.outcome is None:
+            return None
+        del self._watched[address]
+        return watched.outcome
 
     def expire(self, block: int) -> None:
         """The chain has `block`: reverted contracts whose orders' deadline has passed are given up."""

@@ -40,7 +40,6 @@ from mesh.base.extras import needs_extra
 from mesh.base.log_context import liability_context, log_event, with_liability_context
 from mesh.base.private_files import make_private_folder, sync_directory
 from mesh.errors import AiraError, ClosedError, ContentError, InputError, public_text
-from mesh.network.presence import present_keys
 from mesh.recording import (
     GENEROUS,
     NOTE_TOPIC,
@@ -196,11 +195,12 @@ def stop_devices(session: zenoh.Session, agent: str, why: str) -> tuple[DeviceSt
                 with contextlib.suppress(InvalidRecord):
                     answer = DeviceStop.decode(reply.ok.payload.to_bytes())
                     answers[answer.device] = answer
-        for text in present_keys(session, device_selector(agent, topic=PRESENT), timeout=ASK_SECONDS):
-            key = parse_agent_key(text)
-            if isinstance(key, DeviceTopicKey) and key.device not in answers:
-                detail = f"it did not confirm the stop within {HEARING_SECONDS:g} s"
-                answers[key.device] = DeviceStop(device=key.device, heard=False, detail=detail)
+        for reply in session.liveliness().get(device_selector(agent, topic=PRESENT), timeout=ASK_SECONDS):
+            if reply.ok is not None:
+                key = parse_agent_key(str(reply.ok.key_expr))
+                if isinstance(key, DeviceTopicKey) and key.device not in answers:
+                    detail = f"it did not confirm the stop within {HEARING_SECONDS:g} s"
+                    answers[key.device] = DeviceStop(device=key.device, heard=False, detail=detail)
     return tuple(answers[device] for device in sorted(answers))
 
 
@@ -395,7 +395,7 @@ class JobRun(Job):
         """Return when the devices that are present are idle; False if none is present."""
         with contextlib.suppress(zenoh.ZError):
             present = device_selector(self._agent, topic=PRESENT)
-            if not present_keys(self._session, present, timeout=ASK_SECONDS):
+            if not any(reply.ok is not None for reply in self._session.liveliness().get(present, timeout=ASK_SECONDS)):
                 return False
             idle = device_selector(self._agent, topic=IDLE)
             target, consolidation = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
@@ -564,6 +564,7 @@ class Executor:
         self.parallel = parallel
         self._ledger, self._outbox, self._store, self._signer = parts.ledger, parts.outbox, parts.store, parts.signer
         self._session = parts.network.session
+        self._chain, self._head, self._outages = parts.chain, parts.chain_head, parts.outages
         self._objectives = objectives
         self._handlers = handlers
         self._on_phase = on_phase
@@ -586,6 +587,8 @@ class Executor:
         """The open runs, by the address of the job."""
         self.at_hand: Final[set[str]] = set()
         """The jobs whose work is not done, by address: those that are fetched, wait, or run."""
+        self.created_in: Final[dict[str, int]] = {}
+        """The blocks with the contracts of the jobs that are not ready yet."""
         self._playing: dict[str, asyncio.Task[None]] = {}
         """The tasks that play them."""
         self._stopping: dict[str, asyncio.Event] = {}
@@ -629,9 +632,13 @@ class Executor:
         """Return when `run` has taken up the jobs of the ledger."""
         await self._opened.wait()
 
-    def prepare(self, liability: Liability) -> None:
-        """Fetch and check a job's objective in a task. Then the job is ready, or complete without success."""
+    def prepare(self, liability: Liability, *, created: int | None = None) -> None:
+        """Fetch and check a job's objective in a task. Then the job is ready, or complete without success.
+
+        It is ready when the block in which its contract was `created` counts, by default the last that was handled.
+        """
         address = liability.address
+        self.created_in[address] = self._head.head if created is None else created
         self.at_hand.add(address)
         task = self._task_group().create_task(self._fetch(liability), name=f"prepare {address}")
         _keep_task(self.preparing, address, task)
@@ -848,9 +855,11 @@ class Executor:
             await asyncio.to_thread(self._store.pin, liability.objective, address, sync=False)
             objective = await self._objectives.examine(liability.objective)
         except (ContentError, InputError) as error:
+            self.created_in.pop(address, None)
             log.warning("the objective is refused: %s", error, extra=log_event("objective-refused", code=error.code))
             await self._unless_ended(self.finish(address, success=False, note=note_of(error)))
             return
+        await self._until_counted(address)
         async with self._changing:
             job = await self._ledger.job(address)
             if job is None or job.phase not in TO_BE_DONE or await self._ledger.stopped(address) is not None:
@@ -862,6 +871,20 @@ class Executor:
             log.info("ready, %d messages to play", objective.count, extra=log_event("job-ready", count=objective.count))
             await self._on_phase(Phase.READY, liability)
         self._ready.put_nowait(address)
+
+    async def _until_counted(self, address: str) -> None:
+        """Return when the block with the contract of a job counts; one that was ready has counted before."""
+        job, is_told = await self._ledger.job(address), False
+        while job is not None and job.phase is Phase.INCOMING:
+            block = self.created_in[address]
+            if await self._chain.retrying(partial(self._chain.node.counts, block), outages=self._outages):
+                break
+            if not is_told:
+                is_told, facts = True, log_event("job-waits", block=block)
+                log.info("the job waits until its contract in block %d counts", block, extra=facts)
+            await asyncio.sleep(self._chain.node.timing.poll_interval)
+            job = await self._ledger.job(address)
+        self.created_in.pop(address, None)
 
     async def _serve(self) -> None:
         """Do ready jobs, one after the other. Without handlers, others start them."""

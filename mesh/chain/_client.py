@@ -20,6 +20,7 @@ from mesh.chain.liabilities import Liabilities
 from mesh.chain.metrics import CachedMetrics
 from mesh.chain.transactions import TransactionSender
 from mesh.errors import ClosedError
+from mesh.settings.chains import ANY
 from mesh.telemetry.metrics import gauge
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from mesh.chain.following import BlockEvents, Choose, History
     from mesh.chain.rpc import Endpoint
     from mesh.errors import AiraError
+    from mesh.settings.chains import ChainProfile
     from mesh.telemetry.metrics import MetricFamily
 
 T = TypeVar("T")
@@ -48,8 +50,8 @@ class Chain:
     `contracts` says whether they are this project's (`"mesh"`, which read both generations of orders) or the
     originals (`"original"`) of a `generation`; the generation also names the root under which names are looked up.
     `ens` is the address of the ENS registry (empty: the public or a development chain's); `factory` and `xrt` are
-    names or addresses, empty for those under that root. `timing`, `fees` and `transactions` are for the node (see
-    `Node`), unless a node is given.
+    names or addresses, empty for those under that root. `timing`, `fees`, `transactions` and `profile` are for the node
+    (see `Node`), unless a node is given.
 
     Amounts are ints: wei for ETH, wn for XRT, a token's smallest unit otherwise. Addresses are EIP-55; an ENS name
     works wherever a lighthouse, token or account is expected.
@@ -76,6 +78,7 @@ class Chain:
         fees: FeePolicy | None = None,
         transactions: Path | None = None,
         known_validators: Sequence[str] = (),
+        profile: ChainProfile = ANY,
     ) -> None:
         self.account = account
         self._known_validators = known_validators
@@ -84,7 +87,7 @@ class Chain:
         self.node = (
             endpoint
             if isinstance(endpoint, Node)
-            else Node(endpoint, timing=timing, fees=fees, transactions=transactions)
+            else Node(endpoint, timing=timing, fees=fees, transactions=transactions, profile=profile)
         )
         self._ens = ens
         self._factory_name = factory or f"factory.{generation}.robonomics.eth"
@@ -188,10 +191,6 @@ class Chain:
     async def block_number(self) -> int:
         """Number of the latest block."""
         return await self.node.block_number()
-
-    async def contract_block(self) -> int:
-        """The contracts' number of the latest block, which deadlines and refunds count: on Arbitrum, Ethereum's."""
-        return await self.node.contract_block()
 
     async def history_at(self, block_number: int) -> History:
         """The history of a consumer that has read nothing yet and begins after a block: see `following`."""

@@ -36,14 +36,17 @@ from mesh.chain.answers import (
 )
 from mesh.chain.errors import (
     METHOD_NOT_FOUND,
+    FinalityNotOffered,
     NoContracts,
     NodeUnreachable,
     RequestRefused,
     Reverted,
+    WrongChain,
 )
 from mesh.chain.metrics import NodeMetrics
 from mesh.chain.rpc import RpcClient
 from mesh.errors import ClosedError, ConfigurationError
+from mesh.settings.chains import ANY
 from schemas.address import address_bytes
 
 if TYPE_CHECKING:
@@ -52,9 +55,11 @@ if TYPE_CHECKING:
     from typing import Self
 
     from mesh.chain._abi import ContractCall
+    from mesh.chain._policy import Finality
     from mesh.chain.answers import Log, MinedTransaction
     from mesh.chain.rpc import Endpoint
     from mesh.errors import AiraError
+    from mesh.settings.chains import ChainProfile
 
     Call: TypeAlias = tuple[str, bytes]
     "An address and data."
@@ -275,75 +280,6 @@ class Heads:
         return asyncio.get_running_loop().time()
 
 
-RUN_NUMBER: Final = bytes.fromhex("4360005260206000f3")
-"""Creation code that returns the number of the block it runs in, instead of code: NUMBER, then MSTORE and RETURN."""
-CHECK_AGAIN: Final = 3600.0
-"""Seconds after which it is checked again whose blocks contracts count."""
-CHECK_REFUSED: Final = 60.0
-"""The same if the node did not say."""
-ETHEREUM_SLOT: Final = 12.0
-"""Seconds between two blocks of Ethereum, which the contracts of some other chains count."""
-
-
-class ContractBlocks:
-    """How far blocks have come by the count of contracts, their `block.number`: deadlines, refunds and turns go by it.
-
-    On most chains that is the number of the block. On Arbitrum it is about that of Ethereum's latest block: far from
-    the chain's own numbers, the same for many blocks, and then one or several more. So the node is asked to run NUMBER,
-    in code that is never deployed, which sees what contracts of any kind see: once, and again rarely, where both are
-    the same; elsewhere each `interval` (seconds) at most. `run` runs it at a block; `heads` are the chain's own.
-    """
-
-    def __init__(self, heads: Heads, run: Callable[[int | str], Awaitable[int | None]], *, interval: float) -> None:
-        self._heads = heads
-        self._run = run
-        self._interval = interval
-        self._are_own = True
-        self._check_at = float("-inf")
-        self._seen = 0
-        self._ask_at = float("-inf")
-        self._asking = asyncio.Lock()
-
-    async def last(self, head: int) -> int:
-        """The contracts' number of the latest block, by which those after it are higher; `head` is the chain's own.
-
-        Where contracts count other blocks, it is one below the number that they see now: the next transaction may see
-        the same again.
-        """
-        return head if await self.are_own() else await self._ask()
-
-    async def seconds(self, blocks: int) -> float | None:
-        """Seconds between two of the blocks that contracts count, by the last `blocks`; None if it is not known."""
-        return await self._heads.block_time(blocks) if await self.are_own() else ETHEREUM_SLOT
-
-    async def are_own(self) -> bool:
-        """Whether contracts count the chain's own blocks."""
-        if self._now() >= self._check_at:
-            async with self._asking:
-                if self._now() >= self._check_at:
-                    await self._check()
-        return self._are_own
-
-    async def _check(self) -> None:
-        head = (await self._heads.recent()).number
-        number = await self._run(head)
-        if number is not None:
-            self._are_own = number in (head, head + 1)  # some nodes run calls in the block after
-        self._check_at = self._now() + (CHECK_REFUSED if number is None else CHECK_AGAIN)
-
-    async def _ask(self) -> int:
-        async with self._asking:
-            if self._now() >= self._ask_at:
-                number = await self._run("latest")
-                self._seen = max(self._seen, (number or 0) - 1)  # another machine of the node may be behind
-                self._ask_at = self._now() + self._interval
-        return self._seen
-
-    @staticmethod
-    def _now() -> float:
-        return asyncio.get_running_loop().time()
-
-
 log = logging.getLogger(__name__)
 
 READ_ATTEMPTS: Final = 3
@@ -393,6 +329,11 @@ def decode_answers(returned: bytes, *, number: int) -> list[bytes | None]:
     return answers
 
 
+def is_answered(error: NodeUnreachable | RequestRefused) -> bool:
+    """Whether a node answers, and only lacks what was asked for, as a block or the state of an old one."""
+    return isinstance(error, RequestRefused) or isinstance(error.__cause__, SpoiledAnswer)
+
+
 LOGS_REFUSED: Final = 5
 """Refusals of `eth_getLogs` for blocks whose receipts the node has, after which only receipts are asked for."""
 
@@ -405,6 +346,9 @@ LONGEST_QUANTITY: Final = 66
 USUAL_PRIORITY: Final = GWEI
 """The priority fee where the node suggests none in any way, wei."""
 
+FINALITY_LOOKS: Final = 30
+"""How often the final block is asked for in the time that it is behind the latest one."""
+
 PRIORITY_SECONDS: Final = 60.0
 """How long the priority fee that the node suggests is used; the base fee is that of the latest block."""
 
@@ -415,11 +359,13 @@ class Node:
     Several endpoints (a sequence, or one text with commas) are nodes of one chain: when one does not answer, the next
     is asked, and stays in use until it fails in turn.
 
-    `fees` is what its accounts pay at most. Transactions are recorded in the folder `transactions`, if given: then
-    several processes of one account never use the same nonce, and one that is restarted continues what it began.
+    `profile` is the chain that it must be of, by default any. `fees` is what its accounts pay at most. Transactions are
+    recorded in the folder `transactions`, if given: then several processes of one account never use the same nonce, and
+    one that is restarted continues what it began.
 
     Used with `async with`, which connects: raises `NodeUnreachable` when nobody answers, `ConfigurationError` when one
-    of several is on another chain. Creating it raises `ConfigurationError` for a text that is not an endpoint. Its
+    of several is on another chain, `WrongChain` when all are, and `FinalityNotOffered` when they don't say which blocks
+    are final although the timing wants that. Creating it raises `ConfigurationError` for what is no endpoint. Its
     methods raise `NodeUnreachable` when the node is lost, after bounded retries, and `RequestRefused`.
     """
 
@@ -430,7 +376,9 @@ class Node:
         timing: Timing | None = None,
         fees: FeePolicy | None = None,
         transactions: Path | None = None,
+        profile: ChainProfile = ANY,
     ) -> None:
+        self.profile = profile
         self.timing = timing or Timing()
         self.fees = fees or FeePolicy()
         self.metrics = NodeMetrics()
@@ -442,8 +390,6 @@ class Node:
             self._ask_latest, self.header, interval=self.timing.poll_interval, request_pushes=self._request_pushes
         )
         """The latest block, for all who wait for the next one."""
-        self.contract_blocks = ContractBlocks(self.heads, self._run_number, interval=self.timing.poll_interval)
-        """The blocks as contracts count them."""
         self._logs_refused = 0
         self._doubted = b"", 0
         """The block of the last empty answer that could not be proven, and how many there were for it."""
@@ -451,6 +397,10 @@ class Node:
         self._has_block_receipts = True
         self._has_pending = True
         self._priority = 0.0, 0
+        self._final = -1
+        """The last block that the node has called final, in the sense of the timing."""
+        self._final_until = 0.0
+        """Until when it is not asked again, on the monotonic clock."""
         self._chain_id: int | None = None
         self._pending: dict[str, PendingTransactions] = {}
 
@@ -472,6 +422,10 @@ class Node:
         try:
             self._chain_id = int(await self._ask("eth_chainId"))
             await self.rpc.check_chains(self._chain_id)
+            if self.profile.chain_id not in (0, self._chain_id):
+                raise WrongChain(self.endpoint, self._chain_id, self.profile)
+            if self.timing.finality != "latest":
+                await self._find_final(self.timing.finality)
             if self._transactions is not None:  # a development chain that was restarted has another first block
                 self._chain_folder = self._transactions / f"{self._chain_id}-{(await self.block_hash(0)).hex()[:16]}"
         except BaseException:
@@ -501,24 +455,53 @@ class Node:
         """Number of the latest block."""
         return int(await self._ask("eth_blockNumber"))
 
-    async def contract_block(self) -> int:
-        """The contracts' number of the latest block, which deadlines and refunds count: see `ContractBlocks.last`."""
-        return await self.contract_blocks.last(await self.block_number())
-
-    async def _run_number(self, block: int | str) -> int | None:
-        """The number that a contract sees in the state after a block; None if the node does not run such code."""
-        try:
-            return int.from_bytes(await self.call({"data": "0x" + RUN_NUMBER.hex()}, block=block))
-        except (RequestRefused, Reverted) as error:
-            log.debug("the number of blocks that contracts see can't be asked: %s", error)
-            return None
-
     async def header(self, block: int | str) -> BlockHeader | None:
         """A block, by its number or `latest`; None if the chain does not have it."""
         header: BlockHeader | None = await self._ask("eth_getBlockByNumber", _block(block), False)
         if header is not None and block not in ("latest", header.number):
             raise InvalidAnswer(f"eth_getBlockByNumber for {block}", f"it is block {header.number}")
         return header
+
+    async def counted(self, head: int) -> int:
+        """The last block that counts, of a chain that was read up to block `head`: see `Timing.finality`.
+
+        Below 0 if none does. A node that says what is final is asked at times only. Raises `NodeUnreachable`.
+        """
+        tag = self.timing.finality
+        if tag == "latest":
+            return head - self.timing.confirmations + 1
+        if self._final < head and time.monotonic() >= self._final_until:
+            try:
+                await self._find_final(tag)
+            except FinalityNotOffered as error:  # it did at the start: one of its machines is behind
+                log.debug("%s", error)
+        return min(self._final, head)
+
+    async def counts(self, block: int) -> bool:
+        """Whether what happened in a block counts. Raises `NodeUnreachable`."""
+        return await self.counted((await self.heads.recent()).number) >= block
+
+    async def until_counts(self, block: int) -> None:
+        """Return when what happened in a block counts. Raises `NodeUnreachable`."""
+        while True:
+            if await self.counts(block):
+                return
+            await asyncio.sleep(self.timing.poll_interval)
+
+    async def _find_final(self, tag: Finality) -> None:
+        """Ask for the last block that is final. The further it is behind, the less often it changes."""
+        try:
+            final: BlockHeader | None = await self._ask("eth_getBlockByNumber", tag, False)
+        except (RequestRefused, NodeUnreachable) as error:
+            if not is_answered(error):
+                raise
+            why = error.detail if isinstance(error, RequestRefused) else error.why
+            raise FinalityNotOffered(self.endpoint, tag, why) from None
+        if final is None:
+            raise FinalityNotOffered(self.endpoint, tag, "it answers none")
+        behind = (await self.heads.recent()).timestamp - final.timestamp
+        pause = max(self.timing.poll_interval, min(behind / FINALITY_LOOKS, SILENCE))
+        self._final, self._final_until = max(self._final, final.number), time.monotonic() + pause
 
     async def _ask_latest(self) -> BlockHeader:
         """A null is asked again like any other spoiled answer: every chain has a latest block."""
@@ -817,7 +800,7 @@ class Node:
             try:
                 return await self._ask(method, *params, block)
             except (RequestRefused, NodeUnreachable) as error:
-                if isinstance(error, NodeUnreachable) and not isinstance(error.__cause__, SpoiledAnswer):
+                if not is_answered(error):
                     raise
                 refused = error
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 from mesh.base.retry import RetryPolicy
 from mesh.chain.errors import FeeTooHigh
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 REORG_DEPTH: Final = 12
 """Blocks behind the head that are remembered by default; public chains reorganise one or two."""
+
+Finality: TypeAlias = Literal["latest", "safe", "finalized"]
 
 GWEI: Final = 10**9
 """Wei."""
@@ -35,6 +37,9 @@ class Timing:
     """How long a sent transaction is waited for."""
     confirmations: int = 1
     """Blocks, not seconds: how many a transaction needs, its own included, to count as mined."""
+    finality: Finality = "latest"
+    """Which blocks count where others may still take something back: those with `confirmations`, or those that the
+    node calls safe or finalized. For one's own transactions it is the confirmations that count."""
     replace_after: float = 30.0
     """After how long a transaction that is not mined is sent again with higher fees, each time."""
     repeat_within: float = 600.0

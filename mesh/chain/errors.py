@@ -6,10 +6,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from mesh.amounts import ETH
-from mesh.errors import ChainError
+from mesh.errors import ChainError, ConfigurationError
+from mesh.settings.chains import profile_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from mesh.settings.chains import ChainProfile
 
 METHOD_NOT_FOUND: Final = -32601
 """The JSON-RPC code of a method that the node does not have."""
@@ -71,6 +74,30 @@ class RequestRefused(ChainError, code="request-refused"):
         self.method = method
         self.rpc_code = rpc_code
         self.detail = detail
+
+
+class WrongChain(ConfigurationError, code="wrong-chain"):
+    """The node is on another chain than the one that the settings name."""
+
+    def __init__(self, endpoint: str, found: int, wanted: ChainProfile) -> None:
+        known = profile_of(found)
+        on = f"the chain {found}" if known is None else f"{known.title} ({found})"
+        other = f" or set chain to {known.name}" if known else ""
+        super().__init__(
+            f"the node {endpoint} is on {on}, not on {wanted.title} ({wanted.chain_id})",
+            hint=f"name a node of {wanted.title} with web3_http_provider{other}",
+        )
+        self.found, self.wanted = found, wanted.chain_id
+
+
+class FinalityNotOffered(ChainError, code="finality-not-offered"):
+    """The node does not say which block is safe, or finalized."""
+
+    def __init__(self, endpoint: str, tag: str, why: str) -> None:
+        super().__init__(
+            f"the node {endpoint} does not say which block is {tag}: {why}",
+            hint="name a node that does with web3_http_provider, or set finality to latest and count confirmations",
+        )
 
 
 class NoContracts(ChainError, code="no-contracts"):

@@ -220,9 +220,6 @@ def _layouts() -> dict[bytes, _Layout]:
     return layouts
 
 
-MAX_RANGE: Final = 2_000
-"""Blocks in one request. Halved each time a node refuses, and grown by a quarter each time it answers."""
-
 RECENT: Final = 256
 """Blocks up to the head that are read one by one, by their hashes; a machine of the node may lack them."""
 
@@ -307,7 +304,8 @@ class RangeReader:
     def __init__(self, node: Node, read: ReadRange) -> None:
         self._node = node
         self._read = read
-        self._span = MAX_RANGE
+        self._most = self._span = node.profile.log_range
+        """Blocks in one request: halved each time a node refuses, and grown by a quarter each time it answers."""
 
     async def read_to(self, first: int, head: BlockHeader) -> AsyncGenerator[SeenBlock, None]:
         """The blocks with events from `first` to the head, and the last block of each request.
@@ -338,7 +336,7 @@ class RangeReader:
             for block in blocks:
                 yield block
             first = last + 1
-            self._span = min(MAX_RANGE, self._span + max(1, self._span // 4))
+            self._span = min(self._most, self._span + max(1, self._span // 4))
 
     async def _read_singly(self, first: int, last: int, head: BlockHeader) -> AsyncGenerator[SeenBlock, None]:
         """The blocks with events from `first` to `last`, at most `AT_ONCE` of them, and `last` itself."""

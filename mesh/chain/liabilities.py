@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Final
 from msgspec.structs import replace
 
 from mesh.chain._contracts import result_arguments
-from mesh.chain._node import getters
+from mesh.chain._node import getters, is_answered
 from mesh.chain.answers import LIABILITY_GETTERS, liability_record
-from mesh.chain.errors import NoContracts, NodeUnreachable, NotALiability, OrderAlreadyUsed, Reverted
+from mesh.chain.errors import NoContracts, NodeUnreachable, NotALiability, OrderAlreadyUsed, RequestRefused, Reverted
 from mesh.chain.following import (
-    MAX_RANGE,
     EventSources,
     Finalized,
     NewLiability,
@@ -100,10 +99,10 @@ class GasPaid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefundState:
-    """Whether a liability can be refunded. Blocks are as contracts count them: the last one is `contract_block`."""
+    """Whether a liability can be refunded, as of the block `block_number`."""
 
     liability: str
-    contract_block: int
+    block_number: int
     refundable_from: int
     """The first block in which anybody may refund it, if it has not ended by then."""
     is_finalized: bool
@@ -111,7 +110,7 @@ class RefundState:
     @property
     def is_refundable(self) -> bool:
         """Whether a transaction in the next block could refund it."""
-        return not self.is_finalized and self.contract_block + 1 >= self.refundable_from
+        return not self.is_finalized and self.block_number + 1 >= self.refundable_from
 
 
 class Liabilities:
@@ -225,7 +224,7 @@ class Liabilities:
         They are looked for backwards, in longer and longer ranges: most are a short while old when they end.
         """
         found: dict[str, tuple[str, int]] = {}
-        read, span = partial(read_created, self._node, self._contracts.factory), MAX_RANGE
+        read, span = partial(read_created, self._node, self._contracts.factory), self._node.profile.log_range
         while block > 0 and len(found) < len(wanted):
             first = max(0, block - span)
             for seen in await list_blocks(self._node, read, first, block - 1):
@@ -285,8 +284,8 @@ class Liabilities:
     async def watch(self, address: str) -> Liability:
         """Wait until a liability has ended; its record then.
 
-        The end needs `Timing.confirmations`. Outages of the node are survived, except at the start.
-        Raises `NotALiability`, `NodeUnreachable`.
+        The end must be in a block that counts (`Timing.finality`). Outages of the node are survived, except at the
+        start. Raises `NotALiability`, `NodeUnreachable`.
         """
         address = await self._recognised(address)
         while True:
@@ -377,7 +376,7 @@ class Liabilities:
         block = await self._node.block_number()
         return RefundState(
             liability=address,
-            contract_block=await self._node.contract_blocks.last(block),
+            block_number=block,
             refundable_from=await self.refundable_from(address),
             is_finalized=await self._is_finalized(address, block),
         )
@@ -434,14 +433,27 @@ class Liabilities:
         return address
 
     async def _ended(self, address: str) -> Liability | None:
-        """The record of a liability if its end is confirmed."""
-        block = await self._node.block_number() - self._node.timing.confirmations + 1
+        """The record of a liability if its end counts."""
+        block = await self._node.counted(await self._node.block_number())
         try:
             if block < 0 or not await self._is_finalized(address, block):
                 return None
             return (await _read_all(self._node, [address], block=block))[0][0]
         except NoContracts:  # not created yet in that block
             return None
+        except (RequestRefused, NodeUnreachable) as error:
+            if self._node.timing.finality == "latest" or not is_answered(error):
+                raise
+            return await self._ended_by_now(address)
+
+    async def _ended_by_now(self, address: str) -> Liability | None:
+        """The same from a node that keeps no state of blocks as old as the final ones: wait for the one that has it."""
+        head = await self._node.heads.look()
+        record = (await _read_all(self._node, [address], block=head.number))[0][0]
+        if not record.is_finalized:
+            return None
+        await self._node.until_counts(head.number)
+        return record if await self._node.block_hash(head.number) == head.hash else None
 
     async def _is_finalized(self, address: str, block: int) -> bool:
         functions = self._node.contract("Liability", address)

@@ -54,6 +54,7 @@ SECONDS: Final = FiniteRange(0, 366 * 86_400, min_open=True)
 """A time of at most a year."""
 
 CHAIN_SETTINGS: Final = (
+    "chain",
     "web3_http_provider",
     "ens_contract",
     "factory_contract",

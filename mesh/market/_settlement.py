@@ -1,9 +1,10 @@
 """Settlement: creates liabilities from matching orders, and finalizes them by results.
 
 Other providers do the same, and the chain may replace its last blocks, so a receipt settles nothing. A match or result
-stays under settlement until its event was read on the followed chain and is `Timing.confirmations` deep; if the event
-vanishes, it is settled again (`mesh.market._orders` has the states). A message that leaves for another reason (a
-contract refused it, another provider was first) is forgotten by its subscription, so that the next copy gets through.
+stays under settlement until its event was read on the followed chain, in a block that counts (`Timing.finality`); if
+the event vanishes, it is settled again (`mesh.market._orders` has the states). A message that leaves for another reason
+(a contract refused it, another provider was first) is forgotten by its subscription, so that the next copy gets
+through.
 
 An order whose maker can't pay must not be matched: its match would take an honest order out of the book, and a turn of
 the lighthouse, to learn that from the contracts. It stays in the book, unmatched, and is tried again.
@@ -250,25 +251,23 @@ class LiabilityEvents:
             self._settle_again(message)
         self._parts.store.settle_sent(self._parts.orders.versions.expire(block), block)
         self._parts.orders.confirm(block)
-        contract_block = self._parts.head.contract_block
-        self._parts.withdrawals.expire(contract_block - self._parts.chain.node.timing.reorg_depth)
-        for order in self._parts.orders.book.expire(contract_block):
+        self._parts.withdrawals.expire(block - self._parts.chain.node.timing.reorg_depth)
+        for order in self._parts.orders.book.expire(block):
             self._parts.forget(order)  # its deadline may be later than the book's limit
             facts = {"order": order.hash.hex(), "signer": order.signer}
             log.info("expired order %(order)s of %(signer)s", facts, extra=log_event("order-expired", **facts))
         await self._count_transactions(block)
 
     async def is_confirmed(self, messages: Sequence[Verified[Any]], tx: str) -> bool:
-        """Wait until the event that used the messages has its confirmations; False if their transaction vanished."""
-        timing, missing = self._parts.chain.node.timing, 0
-        has_mined = partial(self._parts.chain.node.has_mined, tx)
+        """Wait until the event that used the messages counts; False if their transaction vanished."""
+        node, missing = self._parts.chain.node, 0
+        has_mined = partial(node.has_mined, tx)
         while missing < MISSING_CHECKS:
-            if all(
-                self._parts.orders.is_read(one, until=self._parts.head.head - timing.confirmations + 1)
-                for one in messages
-            ):
+            counted = partial(node.counted, self._parts.head.head)
+            until = await self._parts.chain.retrying(counted, outages=self._parts.lookups)
+            if all(self._parts.orders.is_read(one, until=until) for one in messages):
                 return True
-            await asyncio.sleep(timing.poll_interval)
+            await asyncio.sleep(node.timing.poll_interval)
             is_there = all(self._parts.orders.is_read(one, until=self._parts.head.head) for one in messages)
             missing = (
                 0

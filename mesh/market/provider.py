@@ -223,11 +223,10 @@ class Provider(Role):
     async def _open(self, stack: AsyncExitStack) -> None:
         timing, options = self._chain.node.timing, self._options
         address, latest = await self._chain.names.address(self._lighthouse), await self._chain.block_number()
-        start = max(latest - timing.reorg_depth, 0)  # blocks that may be replaced are read again
-        head = self.head = await ChainHead.at(self._chain, start)
+        head = self.head = ChainHead(max(latest - timing.reorg_depth, 0))  # blocks that may be replaced are read again
         stack.enter_context(self._store)
         stack.enter_context(self.withdrawals)
-        self.withdrawals.expire(head.contract_block)
+        self.withdrawals.expire(head.head)
         self.orders = Orders(
             address,
             depth=timing.reorg_depth,
@@ -235,7 +234,7 @@ class Provider(Role):
             limit=options.limit,
             deadline_limit=options.deadline_limit,
         )
-        self.book.expire(head.contract_block)
+        self.book.expire(head.head)
         await self._restore(latest)
         self.free = FreeContracts(
             self.address,
@@ -249,7 +248,7 @@ class Provider(Role):
         self.queue = TransactionQueue(
             self._chain,
             address,
-            head=lambda: head.contract_block,
+            head=lambda: head.head,
             earnings=self.ledger,
             lookups=lookups,
             retry=options.retry,
@@ -262,7 +261,7 @@ class Provider(Role):
                 address=address,
                 resolver=self._chain.names.address,
                 validators=self._chain.validators.settled,
-                head=lambda: head.contract_block,
+                head=lambda: head.head,
                 blocked=options.blocked,
                 drops=self.drops,
             )

@@ -87,7 +87,7 @@ async def open_parts(
     directory = await state_folder(settings, chain, account.address)
     opened = ledger(directory)
     await enter(opened)
-    head = await ChainHead.at(chain, await first_position(opened, chain, lookback=lookback))
+    head = ChainHead(await first_position(opened, chain, lookback=lookback))
     network, channel = await enter(connected(settings, chain, head, drops))
     store = await open_store(stack, settings, directory.parent / "content", limit=settings.objective_expanded_limit)
     return RoleParts(
@@ -132,7 +132,7 @@ async def connected(
             address=await chain.names.address(settings.lighthouse_contract),
             resolver=chain.names.address,
             validators=chain.validators,
-            head=lambda: head.contract_block,
+            head=lambda: head.head,
             blocked=blocklist_at(settings.blocked_signers),
             drops=drops,
             answer_timeout=settings.answer_timeout,
@@ -169,12 +169,14 @@ def chain_of(settings: ChainSettings, account: Account | None, *, attempts: int 
         timing=Timing(
             poll_interval=settings.poll_interval,
             confirmations=settings.confirmations,
+            finality=settings.finality,
             reorg_depth=settings.reorg_depth,
             attempts=attempts,
         ),
         fees=FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI)),
         transactions=settings.state_directory / "transactions",
         known_validators=settings.known_validators,
+        profile=settings.profile,
     )
 
 

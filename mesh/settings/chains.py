@@ -79,10 +79,11 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 name="base",
                 title="Base",
                 chain_id=8453,
-                block_seconds=2.0,
-                confirmations=2,
-                reorg_depth=30,
+                block_seconds=0.2,
+                confirmations=5,
+                reorg_depth=300,
                 poll_interval=1.0,
+                log_range=10_000,
                 explorer="https://basescan.org",
                 coin="ETH",
                 tokens={"USDC": "0x833589fCD6eDb6E08f4c7C32D4f71b54bdA02913"},
@@ -190,6 +191,21 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
 """The profiles by name."""
 
 
+ANY: Final = ChainProfile(
+    name="",
+    title="any chain",
+    chain_id=0,
+    block_seconds=12.0,
+    confirmations=1,
+    reorg_depth=12,
+    poll_interval=1.0,
+    explorer="",
+    coin="ETH",
+    finalized="whatever the node answers",
+)
+"""What holds where no chain is named: blocks as slow as those of Ethereum, and nothing is waited for."""
+
+
 def profile_of(chain_id: int) -> ChainProfile | None:
     """The profile of a chain by its number (EIP-155), if it is known."""
-    return next((one for one in CHAINS.values() if one.chain_id == chain_id), None)
+    return next((one for one in CHAINS.values() if one.chain_id == chain_id != 0), None)

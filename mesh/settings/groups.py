@@ -22,11 +22,12 @@ from mesh.settings._options import (
     Sentence,
     option,
 )
+from mesh.settings.chains import ANY, CHAINS, FILLED, ChainProfile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-DEADLINE_LIMIT: Final = 7200
+DEADLINE_LIMIT: Final = ANY.deadline_limit
 """Blocks, about a day where one takes 12 seconds."""
 
 
@@ -95,8 +96,16 @@ class StorageSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ChainSettings(StorageSettings):
-    """Which chain is used, and how."""
+    """Which chain is used, and how.
 
+    What is 0 here is the chain's, which `Settings` fills in.
+    """
+
+    chain: Literal["", "base", "optimism", "arbitrum", "gnosis", "polygon", "ethereum", "sepolia", "local"] = option(
+        "",
+        "the chain by name: base, optimism, arbitrum, gnosis, polygon, ethereum, sepolia or local; it sets what is not"
+        " given of the next five, and other chains are refused (empty: any chain)",
+    )
     web3_http_provider: str = option(
         "http://127.0.0.1:8545", "JSON-RPC of the EVM node; separate several nodes of one chain (http or ws) by commas"
     )
@@ -115,14 +124,28 @@ class ChainSettings(StorageSettings):
         "mesh", "which contracts are deployed: this project's (mesh), or the originals of the generation (original)"
     )
     max_fee_gwei: Gwei = option(500.0, "highest gas price to pay, gwei; nothing is sent while gas costs more")
-    confirmations: PositiveInt = option(1, "blocks until a transaction counts as mined, its own block included")
-    reorg_depth: PositiveInt = option(12, "how many blocks behind the head a reorganisation is still detected")
-    poll_interval: Interval = option(1.0, "seconds between polls for new blocks")
+    confirmations: PositiveInt = option(
+        0, "blocks until what happened in one counts, its own block included [the chain's, else 1]"
+    )
+    finality: Literal["latest", "safe", "finalized"] = option(
+        "latest",
+        "which blocks count before a robot begins a job, a provider is done with one, and a demand is paid: those with"
+        " confirmations (latest), or those that the node calls safe or finalized",
+    )
+    reorg_depth: PositiveInt = option(
+        0, "how many blocks behind the head a reorganisation is still detected [the chain's, else 12]"
+    )
+    poll_interval: Interval = option(0.0, "seconds between polls for new blocks [the chain's, else 1]")
     known_validators: tuple[str, ...] = option(
         (),
         "names or addresses of further contracts that your orders may name as validators; juries of this project and"
         " accounts that have sent a transaction need no entry",
     )
+
+    @property
+    def profile(self) -> ChainProfile:
+        """What is known of the chain that is named."""
+        return CHAINS.get(self.chain, ANY)
 
     @property
     def node(self) -> str:
@@ -172,8 +195,9 @@ class MarketSettings:
         (), "addresses whose orders a provider always makes contracts of, also if these don't cover its gas"
     )
     deadline_limit: PositiveInt = option(
-        DEADLINE_LIMIT,
-        "blocks after which a provider drops an order, and an agent's offer for a demand ends, before its deadline",
+        0,
+        "blocks after which a provider drops an order, and an agent's offer for a demand ends, before its deadline"
+        " [a day of the chain's, else 7200]",
     )
     accepted_validators: str = option(
         "any",
@@ -363,10 +387,13 @@ class Settings(
     """Every option of the mesh, with its default."""
 
     def __post_init__(self) -> None:
-        """Contract names that are not given are those of the generation."""
+        """Contract names that are not given are those of the generation; other options are those of the chain."""
         for name, template in CONTRACT_NAMES.items():
             if not getattr(self, name):
                 object.__setattr__(self, name, template.format(self.generation))
+        for name in FILLED:
+            if not getattr(self, name):
+                object.__setattr__(self, name, getattr(self.profile, name))
 
 
 def options_of(group: type) -> tuple[str, ...]:

@@ -68,9 +68,12 @@ class Place:
     `node` is the address by which they reach the chain, if not directly.
     """
 
-    def __init__(self, founded: Founded, endpoint: str, folder: Path, *, node: str = "") -> None:
+    def __init__(
+        self, founded: Founded, endpoint: str, folder: Path, *, node: str = "", timing: Timing = QUICK
+    ) -> None:
         self.founded = founded
         self._url = node
+        self._timing = timing
         self.node = founded.node
         self.market = founded.market
         self.endpoint = endpoint
@@ -98,7 +101,7 @@ class Place:
             ens=self.market.deployment.ens,
             generation=generation,
             contracts=self.founded.contracts,
-            timing=QUICK,
+            timing=self._timing,
         )
 
     def address(self, role: str) -> str:

@@ -35,7 +35,6 @@ async function tests() {
     bundle: true,
     platform: "node",
     format: "esm",
-    external: ["esbuild"],
     outdir: "node_modules/.tests",
     outExtension: { ".js": ".mjs" },
     jsx: "automatic",

@@ -61,11 +61,13 @@ class RecordingListener(AgentRuntime):
     async def run(self) -> None:
         await self._follow_chain()
 
-    async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
+    async def new_liability(
+        self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes, created: int | None = None
+    ) -> None:
         self.liabilities.append((liability, demand_hash, offer_hash))
         await self.parts.ledger.add_job(liability)
 
-    async def finalized(self, address: str, *, success: bool, result: str) -> None:
+    async def finalized(self, address: str, *, success: bool, result: str, ended: int | None = None) -> None:
         self.ends.append((address, success, result))
 
     async def finalization_reverted(self, address: str) -> None:

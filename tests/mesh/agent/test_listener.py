@@ -126,7 +126,9 @@ async def test_events_during_a_downtime_are_read_afterwards(place: Place, ledger
 
 async def test_a_block_that_was_not_handled_to_its_end_is_handled_again(place: Place, ledger: Ledger) -> None:
     class Crashing(RecordingListener):
-        async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
+        async def new_liability(
+            self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes, created: int | None = None
+        ) -> None:
             raise ZeroDivisionError
 
     async with opened(place, ledger, kind=Crashing) as listener:

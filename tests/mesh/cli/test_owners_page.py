@@ -1,4 +1,4 @@
-"""The pages for owners: their commands run as printed, their settings load, and their tables are complete."""
+"""The page for owners: its commands run as printed, its settings load, and its tables are complete."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from tests.mesh.cli.served_chain import ServedChain
     from tests.support.routers import EmbeddedRouter
 
-GUIDES: Final = Path(__file__).parents[3] / "docs" / "guides"
-PAGE: Final = "".join((GUIDES / f"{name}.md").read_text() for name in ("owners", "robot-control", "notifications"))
+PAGE: Final = (Path(__file__).parents[3] / "docs" / "guides" / "owners.md").read_text()
 ROBOT: Final = """
 import asyncio
 from mesh import Agent

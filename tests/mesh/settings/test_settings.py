@@ -12,6 +12,7 @@ import pytest
 
 from mesh.errors import ConfigurationError
 from mesh.settings import MEANING, NOT_OPTIONS, OPTIONS, ChainSettings, Settings, load, options_of
+from mesh.settings.chains import ANY, CHAINS
 from tests.support.log_events import logged_facts
 from tests.support.raising import raises_with
 
@@ -53,6 +54,33 @@ def test_configured_names_are_kept_in_every_generation() -> None:
 
     assert (settings.factory_contract, settings.lighthouse_contract) == tuple(given.values())
     assert (settings.erc20_token, settings.xrt_contract) == ("dai.test", "xrt.5.robonomics.eth")
+
+
+def test_a_named_chain_sets_what_is_not_given() -> None:
+    known = CHAINS["base"]
+
+    settings = load(environ={"AIRA_CHAIN": "base", "AIRA_REORG_DEPTH": "77"}, flags={"confirmations": 9})
+
+    assert settings.profile is known
+    assert (settings.confirmations, settings.reorg_depth) == (9, 77), "what is given is kept"
+    assert (settings.poll_interval, settings.deadline_limit) == (known.poll_interval, 432_000)
+    assert load(environ={"AIRA_CHAIN": "base"}).confirmations == known.confirmations
+
+
+def test_without_a_chain_everything_is_as_on_any() -> None:
+    settings = load(environ=NOTHING)
+
+    assert settings.profile is ANY
+    assert (settings.confirmations, settings.reorg_depth, settings.poll_interval) == (1, 12, 1.0)
+    assert (settings.deadline_limit, settings.finality) == (7200, "latest")
+
+
+def test_each_known_chain_can_be_set_and_no_other() -> None:
+    for name in CHAINS:
+        assert load(environ={"AIRA_CHAIN": name}).profile.name == name
+    with raises_with(ConfigurationError, code="invalid-option") as error:
+        load(environ={"AIRA_CHAIN": "bas"})
+    assert all(name in error.value.hint for name in CHAINS)
 
 
 def test_an_empty_name_means_the_default() -> None:

@@ -152,16 +152,7 @@ export interface Quote {
   detail: string;
 }
 
-/** What has happened to a robot, for its owner. */
-export interface RobotEvent {
-  event: string;
-  time: number;
-  /** A contract's address, or an order's hash; may be empty. */
-  about: string;
-  detail: string;
-}
-
-/** What an owner may change while the robot works; and who is told of what. */
+/** What an owner may change while the robot works. */
 export interface OwnerRules {
   price: string;
   paused: boolean;
@@ -169,8 +160,6 @@ export interface OwnerRules {
   leastPrice: string;
   held: boolean;
   here: boolean;
-  notify: { target: string; waiting: number }[];
-  events: RobotEvent[];
 }
 
 /** A contract in the account's statement: amounts in the smallest unit. */
@@ -206,19 +195,16 @@ export interface PastJob {
 export interface Agent {
   role: string;
   address: Address;
-  health: "alive" | "degraded" | "silent" | "away";
+  health: "alive" | "degraded" | "silent";
   status: AgentStatus | null;
   models: string[];
   offers: Order[];
   record: JobRecord;
   profile: Profile | null;
-  /** When it was here last; only if it is away. */
-  since?: number;
 }
 
 export interface Agents {
   agents: Agent[];
-  away: (Pick<Agent, "address" | "models" | "record" | "profile"> & { since: number })[];
   unlisted: number;
   alerts: { agent: Address; code: string; detail: string }[];
 }

@@ -1,1 +1,0 @@
-"""The documentation as a site: `make docs` makes it of docs/, docstrings and definitions."""
