@@ -12,8 +12,7 @@ BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE
 INSTALLED := .venv/.installed
 LOCK := requirements/lock.txt
-TYPED := schemas mesh bridges peers tests bench examples
-BENCHES := $(shell grep -l __main__ bench/*.py)
+TYPED := schemas mesh bridges peers tests bench examples documentation
 # Processes that run the tests. They wait more than they compute, so there are two for each core; 0 runs all in one.
 JOBS ?= $(shell echo $$((2 * $$(getconf _NPROCESSORS_ONLN))))
 # CI measures coverage, which takes time.
@@ -22,7 +21,7 @@ COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 RERUNS := --reruns 1 --max-suite-reruns 3 --rerun-show-tracebacks
 
 .PHONY: help setup demo test simulate simulate-mutants compose-test crash-test lint peers bench contracts contracts-check \
-	page page-check slither firmware lock release clean
+	page page-check slither firmware docs lock release upgrade-sample clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -78,9 +77,8 @@ peers: ## the real programs that some tests run against
 	@$(NEEDS_PYTHON)
 	@$(PYTHON) -m peers.install
 
-bench: $(INSTALLED) ## what the mesh and the contracts can do on this machine; fails where a bar is missed
-	@missed=; for bench in $(BENCHES); do $(BIN)/python $$bench $(ARGS) || missed="$$missed $$bench"; done; \
-		[ -z "$$missed" ] || { echo "bars missed in:$$missed" >&2; exit 1; }
+bench: $(INSTALLED) ## what the mesh and the contracts can do here; ARGS="book rpc" chooses; fails where a bar is missed
+	@$(BIN)/python bench/record.py $(ARGS)
 
 contracts/node_modules/.package-lock.json: contracts/package-lock.json
 	@npm --prefix contracts ci --no-audit --no-fund
@@ -109,8 +107,22 @@ slither: contracts/node_modules/.package-lock.json ## look for weaknesses in the
 firmware: $(INSTALLED) ## compile the sketches of the examples into build/firmware (`make peers` installs the AVR tools)
 	@$(BIN)/python -m bridges.serial.firmware examples/*/*_frames examples/*/*_rosserial -o build/firmware -L examples/firmware
 
-COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes --upgrade --quiet \
+# What builds the site has an environment of its own: no program here needs any of it.
+DOCS_TOOLS := build/docs-tools/.installed
+
+$(DOCS_TOOLS): requirements/docs.txt
+	@$(NEEDS_PYTHON)
+	@rm -rf $(@D)
+	@$(PYTHON) -m venv $(@D)
+	@$(@D)/bin/pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $<
+	@touch $@
+
+docs: $(INSTALLED) $(DOCS_TOOLS) ## the documentation as a site, in build/docs/site; a warning or a broken link fails
+	@$(BIN)/python -m documentation
+
+COMPILE_FLAGS := --universal --python-version 3.11 --generate-hashes --upgrade --quiet \
 	--no-header --no-annotate --no-emit-index-url --no-emit-find-links
+COMPILE := uv pip compile pyproject.toml $(COMPILE_FLAGS)
 
 # Of the same versions, what the images need.
 lock: ## update the locked versions (needs uv)
@@ -118,9 +130,13 @@ lock: ## update the locked versions (needs uv)
 	@$(COMPILE) --constraint $(LOCK) --extra serial --extra metrics --output-file requirements/edge.txt
 	@$(COMPILE) --constraint $(LOCK) --extra chain --extra identity --extra ipfs --extra metrics --extra web \
 		--output-file requirements/server.txt
+	@uv pip compile --group pyproject.toml:docs $(COMPILE_FLAGS) --output-file requirements/docs.txt
 
 release: $(INSTALLED) ## wheel, sdist, SBOM, notes and checksums in dist/, built twice and tried; ARGS=--no-try builds only
 	@$(BIN)/python .ci/release $(ARGS)
+
+upgrade-sample: $(INSTALLED) ## what this version keeps, for the upgrade test of later ones, in tests/upgrade
+	@$(BIN)/python -m tests.upgrade.make
 
 clean: ## remove what the targets above have made here; the peers' cache stays
 	@rm -rf .venv build dist *.egg-info .coverage .coverage.* htmlcov \

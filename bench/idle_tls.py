@@ -3,7 +3,7 @@
 A router with a roster is a process of its own. `count` connections from 127.0.0.2 are opened and left alone; meanwhile,
 until Zenoh's handshake time is over, a member connects from 127.0.0.1 again and again. `admitted_s` is the longest time
 that took, `quiet_s` the same without idle connections. There is no bar: Zenoh 1.10 has no setting that helps. With
-`--firewall docs` the rules in docs/guides/sites.md apply, for which root runs it in a network of its own:
+`--firewall docs` the rules in docs/guides/floods.md apply, for which root runs it in a network of its own:
 
     unshare -n sh -c 'ip link set lo up; python bench/idle_tls.py --count 1200 --firewall docs'
 """
@@ -34,7 +34,7 @@ HANDSHAKE: Final = 10.0
 """Seconds after which Zenoh ends a TLS handshake, by default."""
 LONGEST: Final = 200.0
 FLOODER: Final = "127.0.0.2"
-SITES: Final = Path(__file__).resolve().parents[1] / "docs" / "guides" / "sites.md"
+RULES: Final = Path(__file__).resolve().parents[1] / "docs" / "guides" / "floods.md"
 MEMBER: Final = "0x" + "01" * 20
 
 
@@ -59,7 +59,7 @@ def admitted(config: Any) -> float:
 
 def rules(port: int) -> str:
     """The rules of the documentation, for this port."""
-    found = re.search(r"^    table inet aira \{\n.*?^    \}\n", SITES.read_text(), re.MULTILINE | re.DOTALL)
+    found = re.search(r"^    table inet aira \{\n.*?^    \}\n", RULES.read_text(), re.MULTILINE | re.DOTALL)
     assert found is not None
     return found[0].replace("7447", str(port))
 

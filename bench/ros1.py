@@ -90,7 +90,7 @@ async def _measure(pings: int, messages: int) -> dict[str, Any]:
     async with RosMaster("127.0.0.1", 0, drops) as master:
         graph = Ros1Graph(master.uri, drops=drops)
         async with Ros1Node(graph, "/ours") as node:
-            back = await node.advertise("/back", {TEXT.md5: TEXT}, TEXT.md5)
+            back = await node.advertise("/back", TEXT)
             await node.subscribe("/there_and", TEXT.name, lambda payload, _: back.publish(payload))
             ours = float(await _said(graph, "ping", pings, "/there_and"))
             await back.close()
@@ -109,7 +109,7 @@ async def _measure(pings: int, messages: int) -> dict[str, Any]:
 
 async def _out(graph: Ros1Graph, node: Ros1Node, count: int) -> float:
     """Messages a second from us to a node of rospy, until it has heard them all."""
-    publisher = await node.advertise("/fast", {TEXT.md5: TEXT}, TEXT.md5)
+    publisher = await node.advertise("/fast", TEXT)
     payload = TEXT.encode({"data": "x" * SIZE})
     with _running(graph, "hear", count) as hearing:
         await publisher.wait_for_subscriber(20)

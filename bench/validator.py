@@ -1,7 +1,7 @@
 """Validators: what of tampered and honest recordings is paid, how long judging takes, and what it costs on the chain.
 
 Exits with 1 if a tampered recording is paid, an honest one is not, or judging takes too long. The recordings are those
-of the tests (`docs/guides/validators.md` has the tables), the gas is that of `bench/gas.py`. With `--chain` the
+of the tests (`docs/reference/tampered-recordings.md` lists them), the gas is that of `bench/gas.py`. With `--chain` the
 tampered ones are also handed in for contracts on a chain, by jobs with router, provider and validator.
 """
 

@@ -78,10 +78,34 @@ class ControlRobot(Record, frozen=True, kw_only=True, rename="camel", omit_defau
     release: bool = False
 
 
+class NotifyTarget(Record, frozen=True):
+    """Who is told what happens to a robot: the host of a URL, or the name of a program.
+
+    `waiting` events have not reached it yet.
+    """
+
+    target: str
+    waiting: int
+
+
+class RobotEvent(Record, frozen=True, kw_only=True):
+    """What has happened to a robot, for its owner: `event` is one of `notify_events`, `time` is Unix seconds.
+
+    `about` is the order's hash or the contract's address, if there is one. `detail` says why a job failed, which part
+    can't be reached, or how much gas is left (wei).
+    """
+
+    event: str
+    time: float
+    about: str
+    detail: str
+
+
 class RobotControl(Record, frozen=True, kw_only=True, rename="camel"):
     """What is in effect on a robot: as in `ControlRobot`. While it is `held`, it takes and begins no job.
 
-    `stopped` says, for people, what a stop has done.
+    `stopped` says, for people, what a stop has done. `notify` is told what happens to it; `events` are the latest ones
+    since it was started, oldest first, also if nobody is told.
     """
 
     price: str
@@ -90,6 +114,8 @@ class RobotControl(Record, frozen=True, kw_only=True, rename="camel"):
     least_price: str
     held: bool
     stopped: str = ""
+    notify: tuple[NotifyTarget, ...] = ()
+    events: tuple[RobotEvent, ...] = ()
 
 
 class Liability(Record, frozen=True, kw_only=True, rename="camel"):

@@ -8,7 +8,7 @@ from importlib import import_module
 
 import pytest
 
-LAZY = ["schemas", "mesh", "mesh.network", "mesh.testing", "bridges.serial"]
+LAZY = ["schemas", "mesh", "mesh.network", "mesh.testing", "bridges.ros1", "bridges.ros2", "bridges.serial"]
 
 
 @pytest.mark.parametrize("package", LAZY)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 ROOT: Final = Path(__file__).parents[1]
+REFERENCE: Final = ROOT / "docs" / "reference"
 PACKAGES: Final = ("schemas", "mesh", "bridges")
 SHARED: Final = {
     "Log": "the name that Ethereum gives an entry of a receipt, and Foxglove a line of a log",
@@ -126,10 +127,13 @@ def codes_of_raised() -> set[str]:
     }
 
 
-def documented(heading: str) -> set[str]:
-    """The names in the first column of a table of docs/reference/codes.md."""
-    section = (ROOT / "docs" / "reference" / "codes.md").read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
-    return set(re.findall(r"^\| `([\w-]+)` \|", section, re.MULTILINE))
+def documented(page: str, heading: str) -> set[str]:
+    """The names in the first column of a table of a page in docs/reference."""
+    return set(re.findall(r"^\| `([\w-]+)` \|", section(page, heading), re.MULTILINE))
+
+
+def section(page: str, heading: str) -> str:
+    return re.split(rf"^#+ {heading}\n", (REFERENCE / page).read_text(), flags=re.MULTILINE)[1].split("\n## ")[0]
 
 
 def test_every_error_class_has_a_code_of_its_own() -> None:
@@ -140,13 +144,12 @@ def test_every_error_class_has_a_code_of_its_own() -> None:
 
 
 def test_the_documented_error_codes_are_those_of_the_source() -> None:
-    assert documented("Errors") == set(codes_of_errors().values()) | codes_of_raised()
+    assert documented("codes.md", "Errors") == set(codes_of_errors().values()) | codes_of_raised()
 
 
 def test_the_documented_error_classes_are_those_of_the_codes() -> None:
     classes = {code: name.rsplit(".", 1)[1] for name, code in codes_of_errors().items()}
-    section = (ROOT / "docs" / "reference" / "codes.md").read_text().split("## Errors\n")[1].split("\n## ")[0]
-    rows = re.findall(r"^\| `([\w-]+)` \| `(\w+)` \|", section, re.MULTILINE)
+    rows = re.findall(r"^\| `([\w-]+)` \| `(\w+)` \|", section("codes.md", "Errors"), re.MULTILINE)
 
     assert {code: name for code, name in rows if classes.get(code, name) != name} == {}
     assert {name for _, name in rows} <= {"AiraError", *classes.values()}
@@ -164,7 +167,7 @@ def test_the_documented_log_events_are_those_of_the_source() -> None:
                 case ast.Call(func=ast.Name(id="OutageLog"), args=[_, ast.Constant(value=str(name))]):
                     names |= {f"{name}-outage", f"{name}-recovered"}
 
-    assert documented("Log events") == names
+    assert documented("log-events.md", "Log events") == names
 
 
 def test_the_documented_codes_of_the_doctor_are_those_of_the_source() -> None:
@@ -179,7 +182,7 @@ def test_the_documented_codes_of_the_doctor_are_those_of_the_source() -> None:
                     parts = [part for code in given for part in ast.walk(code)]
                     codes |= {str(part.value) for part in parts if isinstance(part, ast.Constant)}
 
-    assert documented("Doctor") == codes
+    assert documented("checks.md", "Doctor") == codes
 
 
 def test_every_log_event_has_a_stable_name() -> None:

@@ -11,7 +11,6 @@ some; otherwise the longest-running one is first, so a new one takes over nothin
 
 from __future__ import annotations
 
-import fcntl
 import os
 import time
 from collections import Counter, OrderedDict
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 from bridges.ipfs._messages import RelayMessage
 from mesh.base.database import DISK_ERRORS, SyncedDatabase
+from mesh.base.file_locks import try_lock
 from mesh.base.flood import BoundedDict
 from mesh.base.private_files import make_private_folder, open_private
 from mesh.base.retry import RetryPolicy
@@ -226,12 +226,10 @@ class RelayJournal:
         return [(Side(side), RelayMessage(*message)) for *message, side in rows]
 
     def _open(self) -> None:
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not try_lock(self._lock):
             raise ConfigurationError(
                 f"another bridge uses {self._path}", hint="give this bridge a folder of its own with --data-dir"
-            ) from None
+            )
         try:
             self._database.open()
             self.prune()

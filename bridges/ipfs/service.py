@@ -113,7 +113,7 @@ class ChainView:
     async def _read(self, chain: Chain) -> None:
         """Read the head and unknown addresses. After an outage of the node, its client reconnects by itself."""
         try:
-            self.head = await chain.block_number()
+            self.head = await chain.contract_block()
             for name, rules in self.rules.items():
                 if rules.address is None:
                     rules.address = await chain.names.address(name)

@@ -108,9 +108,8 @@ class Ros1Bridge(Role):
     async def _serve_rosout(self, stack: AsyncExitStack) -> None:
         """The node that collects the logs of a graph: they go to our log, and to `/rosout_agg`."""
         node = await stack.enter_async_context(Ros1Node(self._graph, ROSOUT))
-        versions = message_types()[LOG]
-        everything = await node.advertise("/rosout_agg", versions, md5_of(LOG, "3"))
-        kind = versions[md5_of(LOG, "3")]
+        kind = message_types()[LOG][md5_of(LOG, "3")]
+        everything = await node.advertise("/rosout_agg", kind)
 
         def received(payload: bytes, _header: Mapping[str, str]) -> None:
             everything.publish(payload)

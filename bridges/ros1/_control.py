@@ -156,8 +156,9 @@ class LegacyGraph(Lifecycle):
             *((CHANNEL, f"/liability/infochan/incoming/{kind}", _type_of(kind)) for kind in KINDS),
             *((SIGNER, f"/liability/infochan/eth/sending/{kind}", _type_of(kind)) for kind in KINDS),
         ):
-            default = md5_of(type, self._generation)
-            self._topics[topic] = await self._nodes[node].advertise(topic, message_types()[type], default)
+            versions = message_types()[type]
+            default = versions[md5_of(type, self._generation)]
+            self._topics[topic] = await self._nodes[node].advertise(topic, default, versions.values())
         for kind in KINDS:
             for node, topic, service in (
                 (SIGNER, "eth/signing", "sign"),
@@ -202,7 +203,9 @@ class LegacyGraph(Lifecycle):
             (TOKEN, "/eth/erc20_allowance_of", own_allowed, self._eth("xrt_allowance")),
         ]
         for node, name, type, handler in handlers:
-            await self._nodes[node].serve(name, service_types()[type], md5_of(type, self._generation), handler)
+            versions = service_types()[type]
+            default = versions[md5_of(type, self._generation)]
+            await self._nodes[node].serve(name, default, handler, versions.values())
 
     def _handle_event(self, key: str, payload: bytes) -> None:
         """A job has come to a phase."""

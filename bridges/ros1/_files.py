@@ -77,7 +77,9 @@ class LegacyFiles(Lifecycle):
             (self._player, "/rosbagplayer/start", "robonomics_liability/StartRosbagPlayer", self._start),
             (self._player, "/rosbagplayer/stop", "robonomics_liability/StopRosbagPlayer", self._stop),
         ):
-            await node.serve(name, service_types()[type], md5_of(type, self._options.generation), handler)
+            versions = service_types()[type]
+            default = versions[md5_of(type, self._options.generation)]
+            await node.serve(name, default, handler, versions.values())
 
     def _checked(self, text: str) -> Path:
         """A path below one of the folders. Raises `InputError`."""

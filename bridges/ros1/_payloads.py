@@ -33,8 +33,7 @@ def type_in(header: Mapping[str, str]) -> PayloadType:
 
 async def advertise(node: Ros1Node, topic: str, kind: PayloadType) -> Ros1Publisher:
     """Publish a topic of messages that are encoded already. Raises `InvalidPayload`, `InvalidGraphName`."""
-    type = Ros1Type(kind.schema_name, kind.schema_data.decode(errors="replace"))
-    return await node.advertise(topic, {type.md5: type}, type.md5)
+    return await node.advertise(topic, Ros1Type(kind.schema_name, kind.schema_data.decode(errors="replace")))
 
 
 class RosPayloads:

@@ -64,7 +64,7 @@ WITHOUT_MEANING: Final = frozenset(
         "/liability/player_service/master_check_interval",
     }
 )
-"""The parameters of the legacy stack's nodes that nothing here needs; docs/explanation/legacy.md says why."""
+"""The parameters of the legacy stack's nodes that nothing here needs; docs/reference/ros1.md says why."""
 PRIVATE: Final = frozenset({"keyfile", "keyfile_password_file", "web3_http_provider", "web3_ws_provider"})
 """Settings that are read from the parameter server and never written to it: paths, and URLs of nodes."""
 OURS: Final = "/liability/executor/aira_parameters"

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any, Final
 from bridges.ros1._wire import ERROR, FAILURE, SUCCESS, InvalidGraphName, Ros1Error, resolve
 from bridges.ros1.node import Ros1Server, call_api
 from mesh.base.background import Background
+from mesh.base.flood import Drops
 from mesh.base.lifecycle import Lifecycle
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from contextlib import AsyncExitStack
-
-    from mesh.base.flood import Drops
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +42,8 @@ class RosMaster(Lifecycle):
 
     title = "ROS 1 master"
 
-    def __init__(self, host: str, port: int, drops: Drops) -> None:
-        self._server = Ros1Server(host, port, self._dispatch, None, drops)
+    def __init__(self, host: str, port: int, drops: Drops | None = None) -> None:
+        self._server = Ros1Server(host, port, self._dispatch, None, Drops() if drops is None else drops)
         self._nodes: dict[str, str] = {}
         self._registered: dict[str, dict[str, dict[str, str]]] = {"publisher": {}, "subscriber": {}, "parameter": {}}
         """By kind, then name of the topic or parameter: the nodes with their addresses."""

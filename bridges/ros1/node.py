@@ -221,17 +221,17 @@ class Link:
 
 
 class Ros1Publisher:
-    """A topic that a node publishes, in all `versions` of its type (by MD5 sum) at the same time.
+    """A topic that a node publishes, in all `versions` of its type at the same time.
 
     `default` is the version for those who take any. Messages in `kept`, by any key, are sent to each new subscriber.
     """
 
-    def __init__(self, node: Ros1Node, topic: str, versions: Mapping[str, Ros1Type], default: str) -> None:
+    def __init__(self, node: Ros1Node, topic: str, default: Ros1Type, versions: Iterable[Ros1Type]) -> None:
         self._node = node
         self.topic: Final = topic
-        self._versions = versions
-        self._default = versions[default]
-        self.type: Final = self._default.name
+        self._versions = {kind.md5: kind for kind in (default, *versions)}
+        self._default = default
+        self.type: Final = default.name
         self.links: set[Link] = set()
         self.kept: dict[str, Mapping[str, Any] | bytes] = {}
         self._linked = asyncio.Event()
@@ -396,21 +396,21 @@ class Ros1Service:
     """A service of a node, in all `versions` of its type (by MD5 sum)."""
 
     name: str
+    default: Ros1ServiceType
     versions: Mapping[str, Ros1ServiceType]
-    default: str
     handler: Handler
 
     @property
     def type(self) -> str:
         """The name of its type."""
-        return self.versions[self.default].name
+        return self.default.name
 
     async def serve(
         self, node: Ros1Node, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, header: Mapping[str, str]
     ) -> None:
         """Answer one request, or all of a caller that stays connected."""
         md5 = header.get("md5sum", ANY)
-        kind = self.versions.get(self.default if md5 == ANY else md5)
+        kind = self.default if md5 == ANY else self.versions.get(md5)
         if kind is None:
             writer.write(encode_header({"error": f"{self.name} is {self.type}, of another version: {md5}"}))
             return
@@ -514,10 +514,10 @@ class Ros1Node(Lifecycle):
         stack.callback(self.graph.nodes.remove, self)
         stack.push_async_callback(self._leave)
 
-    async def advertise(self, topic: str, versions: Mapping[str, Ros1Type], default: str) -> Ros1Publisher:
-        """Publish a topic. Without the master, it is registered once that answers."""
+    async def advertise(self, topic: str, type: Ros1Type, versions: Iterable[Ros1Type] = ()) -> Ros1Publisher:
+        """Publish a topic, also in other `versions` of its type. Without the master, it is registered later."""
         name = resolve(topic, self.name)
-        publisher = Ros1Publisher(self, name, versions, default)
+        publisher = Ros1Publisher(self, name, type, versions)
         self._topics[name] = publisher
         await self._register(publisher)
         return publisher
@@ -529,9 +529,15 @@ class Ros1Node(Lifecycle):
         await self._register(subscription)
         return subscription
 
-    async def serve(self, name: str, versions: Mapping[str, Ros1ServiceType], default: str, handler: Handler) -> None:
-        """Offer a service. `handler` gets the fields of a request and the caller's name; its `AiraError` fails it."""
-        service = Ros1Service(resolve(name, self.name), versions, default, handler)
+    async def serve(
+        self, name: str, type: Ros1ServiceType, handler: Handler, versions: Iterable[Ros1ServiceType] = ()
+    ) -> None:
+        """Offer a service, also in other `versions` of its type.
+
+        `handler` gets the fields of a request and the caller's name; its `AiraError` fails the request.
+        """
+        known = {kind.md5: kind for kind in (type, *versions)}
+        service = Ros1Service(resolve(name, self.name), type, known, handler)
         self._services[service.name] = service
         await self._register(service)
 

@@ -23,6 +23,7 @@ from bridges.serial.dialect import (
 )
 from mesh.errors import RemoteError
 from mesh.network import Pump
+from mesh.network.presence import present_keys
 from schemas import DeviceTopicKey, LiabilityTopicKey, payload_type
 from schemas.decoding import InvalidData, decode_json
 from schemas.errors import InvalidKey, InvalidPayload
@@ -104,8 +105,7 @@ class Device:
                     raise
 
     async def is_present(self) -> bool:
-        asked = partial(self._session.liveliness().get, self._key(PRESENT), timeout=GRACE)
-        return await asyncio.to_thread(lambda: any(reply.ok is not None for reply in asked()))
+        return bool(await asyncio.to_thread(present_keys, self._session, self._key(PRESENT), timeout=GRACE))
 
     def listen(self, topic: str) -> DeviceMessages:
         """What the device publishes on a topic, in jobs and outside: `async with device.listen("/x") as messages`.

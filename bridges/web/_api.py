@@ -111,7 +111,9 @@ class Form(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 OPENAPI: Final = Path(__file__).with_name("openapi.json")
 AGENTS_INTERVAL: Final = 3.0
-"""Seconds between two lists of agents on the stream."""
+"""Seconds between two lists of agents on the stream, …"""
+UNSEEN_INTERVAL: Final = 60.0
+"""… and between two looks at who is here while nobody asks, so that it is known who is away."""
 LISTED: Final = 500
 """Things in one list."""
 
@@ -278,7 +280,7 @@ class Api(Lifecycle):
 
     async def _read_facts(self) -> dict[str, Any]:
         parts, chain, settings = self._parts, self._parts.chain, self._parts.settings
-        block_time = await chain.node.heads.block_time(100)
+        block_time = await chain.node.contract_blocks.seconds(100)
         return {
             "lighthouse": {"name": parts.channel.lighthouse, "address": parts.lighthouse},
             "chainId": chain.chain_id,
@@ -547,12 +549,13 @@ class Api(Lifecycle):
 
     async def _show_agents(self) -> None:
         """Publish the agents while somebody looks at them."""
-        last: bytes = b""
+        last, asked = b"", float("-inf")
         while True:
             await asyncio.sleep(AGENTS_INTERVAL)
             await self.has_chain()
-            if not self.stream.has_subscribers("agents"):
+            if not self.stream.has_subscribers("agents") and time.monotonic() - asked < UNSEEN_INTERVAL:
                 continue
+            asked = time.monotonic()
             try:
                 agents = await self._views.agents()
             except AiraError as error:

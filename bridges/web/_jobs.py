@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from bridges.web._market import liability_json, result_json
-from bridges.web._robots import profile_json
+from bridges.web._robots import LastSeen, profile_json
 from mesh.agent.contracts import refusal
 from mesh.agent.jobs import ROBOT_STOPPED, STOPPED, read_reason
 from mesh.base.flood import BoundedDict
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from bridges.web._files import Files
     from bridges.web._market import Market, SeenJob, SeenOrder
     from bridges.web.components import WebComponents
-    from mesh.watching import RoleStatus
+    from mesh.watching import Robot, RoleStatus
     from schemas import Liability
 
 
@@ -106,6 +106,7 @@ class Views:
         self._market = market
         self._files = files
         self._on_stops: BoundedDict[str, tuple[str, float]] = BoundedDict(1024)  # models whose `onStop` is known
+        self._last_seen = LastSeen(components, market)
         self._asking = asyncio.Lock()
         self._agents: dict[str, Any] | None = None
         self._agents_at = float("-inf")
@@ -257,7 +258,7 @@ class Views:
         }
 
     async def agents(self) -> dict[str, Any]:
-        """Who is present, with status, offers and record; a few seconds old at most."""
+        """Who is present, with status, offers and record, and which robots are away; a few seconds old at most."""
         loop = asyncio.get_running_loop()
         async with self._asking:
             # Seconds for which a list of agents is used.
@@ -274,27 +275,27 @@ class Views:
             parts.robots.present(timeout=2.0),
         )
         profiles = {robot.address: robot for robot in robots}
+        self._last_seen.saw(robots)
+        away = await self._last_seen.away({peer.address for peer in peers if peer.role == "agent"})
         records = records_of(list(market.jobs.values()), parts.token)
         offers, models = self._offers(), self._models()
         listed = []
         for peer, status in found.items():
             profile = profiles.get(peer.address) if peer.role == "agent" else None
             own = models.get(peer.address, set()) | _own_model(status) if peer.role == "agent" else set()
-            if profile is not None and profile.model:
-                own = own | {profile.model}
             facts = {
                 "role": peer.role,
-                "address": peer.address,
                 "health": _health(status),
                 "status": None if status is None else decode_json(status.encode()),
-                "profile": None if profile is None else profile_json(profile),
-                "models": sorted(own),
                 "offers": [order.json() for order in offers.get(peer.address, ())][:LISTED],
-                "record": records.get(peer.address, AccountRecord()).json(),
             }
-            listed.append(facts)
-        alerts = alerts_of({peer.address: status for peer, status in found.items()}, market.head)
-        return {"agents": listed, "unlisted": max(0, len(peers) - AGENTS), "alerts": alerts}
+            listed.append(facts | _robot_json(peer.address, profile, own, records))
+        gone = [
+            {"since": since} | _robot_json(address, profile, models.get(address, set()), records)
+            for address, (profile, since) in away.items()
+        ]
+        alerts = alerts_of({peer.address: status for peer, status in found.items()}, parts.chain_head.head)
+        return {"agents": listed, "away": gone, "unlisted": max(0, len(peers) - AGENTS), "alerts": alerts}
 
     def _offers(self) -> dict[str, list[SeenOrder]]:
         found: dict[str, list[SeenOrder]] = {}
@@ -352,6 +353,19 @@ class AccountRecord(msgspec.Struct):
             "open": self.open,
             "earned": str(self.earned),
         }
+
+
+def _robot_json(
+    address: str, profile: Robot | None, models: set[str], records: Mapping[str, AccountRecord]
+) -> dict[str, Any]:
+    """What is the same of robots that are here and that are away."""
+    own = {profile.model} if profile is not None and profile.model else set()
+    return {
+        "address": address,
+        "profile": None if profile is None else profile_json(profile),
+        "models": sorted(models | own),
+        "record": records.get(address, AccountRecord()).json(),
+    }
 
 
 def records_of(jobs: list[SeenJob], token: str) -> dict[str, AccountRecord]:

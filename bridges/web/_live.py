@@ -1,7 +1,8 @@
 """What robots and their devices publish now: the topics of jobs, and readings outside of jobs, as samples for the page.
 
-Subscribed to is what somebody asks for, and the jobs of the local account from their contracts on. What is kept, and
-how much comes of one robot, is bounded: what is too much is dropped.
+Jobs are followed from the first question on, those of the local account from their contracts on; the readings of all
+robots always, so that a robot's page has a past. What is kept, and how much comes of one robot, is bounded: what is too
+much is dropped.
 """
 
 from __future__ import annotations
@@ -40,18 +41,26 @@ if TYPE_CHECKING:
 
 JOBS: Final = 16
 """Jobs that are followed, or of which samples are kept."""
-ROBOTS: Final = 32
-"""Robots whose readings are followed."""
 SAMPLES: Final = 2_000
 """Samples of one job that are kept, …"""
 BYTES: Final = 4 << 20
 """… and their bytes as JSON."""
+ROBOTS: Final = 256
+"""Robots whose readings are kept."""
+TOPICS: Final = 16
+"""Topics of one robot whose readings are kept."""
 READINGS: Final = 500
 """Readings on one topic that are kept, …"""
 READING_BYTES: Final = 128 << 10
-"""… and their bytes as JSON."""
-TOPICS: Final = 16
-"""Topics of one robot whose readings are kept."""
+"""… their bytes, …"""
+READING_SECONDS: Final = 600.0
+"""… and how old they may be; the last one may be older."""
+READING_INTERVAL: Final = 5.0
+"""Seconds between two readings on one topic that are kept while nobody looks at the robot."""
+ALL_READING_BYTES: Final = 48 << 20
+"""Bytes of the readings of all robots."""
+OVERHEAD: Final = 256
+"""Bytes that a reading takes in memory beside its payload."""
 MESSAGES: Final = Rate(per_second=400.0, burst=400)
 """Messages of one job, or of one robot's readings, that are shown."""
 PICTURES: Final = Rate(per_second=4.0, burst=4)
@@ -85,8 +94,74 @@ class Samples:
         return iter(self._kept)
 
 
+class TopicReadings(deque[Played]):
+    """The latest readings on one topic, and always the last one."""
+
+    size = 0
+    """Their bytes in memory."""
+
+    def add(self, reading: Played, *, interval: float) -> None:
+        """Add the newest one. The one before it stays if it came `interval` seconds after its own predecessor."""
+        if len(self) > 1 and _seconds(self[-1]) - _seconds(self[-2]) < interval:
+            self._forget(self.pop())
+        self.append(reading)
+        self.size += len(reading.payload) + OVERHEAD
+        oldest = _seconds(reading) - READING_SECONDS
+        while len(self) > 1 and (len(self) > READINGS or self.size > READING_BYTES or _seconds(self[0]) < oldest):
+            self._forget(self.popleft())
+
+    def _forget(self, reading: Played) -> None:
+        self.size -= len(reading.payload) + OVERHEAD
+
+
+class Readings:
+    """What robots have published lately outside of jobs, whether somebody looks at them or not.
+
+    It is bounded by topic, by robot and in all. `is_viewed` says whether somebody looks at a robot (address) now.
+    """
+
+    def __init__(self, is_viewed: Callable[[str], bool]) -> None:
+        self._is_viewed = is_viewed
+        self._robots: dict[str, dict[str, TopicReadings]] = {}
+        """By address and topic; who was heard longest ago comes first."""
+        self.size = 0
+        """Bytes of all of them in memory."""
+
+    def add(self, robot: str, reading: Played) -> None:
+        topics = self._robots.pop(robot, {})
+        self._robots[robot] = topics
+        if reading.topic not in topics and len(topics) >= TOPICS:
+            return
+        kept = topics.setdefault(reading.topic, TopicReadings())
+        before = kept.size
+        kept.add(reading, interval=0.0 if self._is_viewed(robot) else READING_INTERVAL)
+        self.size += kept.size - before
+        if len(self._robots) > ROBOTS:
+            self._forget(next((one for one in self._robots if not self._is_viewed(one)), next(iter(self._robots))))
+        while self.size > ALL_READING_BYTES and len(self._robots) > 1:
+            self._forget(max(self._robots, key=lambda one: (not self._is_viewed(one), self._size_of(one))))
+
+    def of(self, robot: str) -> dict[str, list[Played]]:
+        """The readings of a robot (address) by topic, oldest first."""
+        return {topic: list(kept) for topic, kept in self._robots.get(robot, {}).items()}
+
+    def _size_of(self, robot: str) -> int:
+        return sum(kept.size for kept in self._robots[robot].values())
+
+    def _forget(self, robot: str) -> None:
+        self.size -= self._size_of(robot)
+        del self._robots[robot]
+
+
+def _seconds(message: Played) -> float:
+    return message.log_time_ns / 1e9
+
+
 class Followed:
-    """One job, or the readings of one robot: `run` subscribes until it is cancelled, and keeps what comes."""
+    """What is published on `selector`, with the agent (address) that it is of: `run` subscribes until it is cancelled.
+
+    `keep` gets each message. What is too much of one agent is dropped before.
+    """
 
     def __init__(
         self,
@@ -94,7 +169,7 @@ class Followed:
         selector: str,
         *,
         is_own: bool = False,
-        keep: Callable[[str, msgspec.Raw], object],
+        keep: Callable[[str, Played], object],
     ) -> None:
         self._parts = components
         self._selector = selector
@@ -126,34 +201,34 @@ class Followed:
         try:
             async with pump:
                 self.is_open.set()
-                async for topic, sample in pump:
-                    self._keep(topic, sample)
+                async for agent, message in pump:
+                    self._keep(agent, message)
         finally:
             self.is_open.set()
 
-    def _read(self, sample: zenoh.Sample) -> tuple[str, msgspec.Raw] | None:
-        """The topic of a sample and the sample as JSON; None for what is not shown. On the pump's thread."""
+    def _read(self, sample: zenoh.Sample) -> tuple[str, Played] | None:
+        """The agent of a sample, and the message; None for what is not shown. On the pump's thread."""
         try:
             key = parse_key(str(sample.key_expr))
+            if not isinstance(key, ObjectiveTopicKey | LiabilityTopicKey | ReadingKey):
+                return None
+            agent = parse_address(key.agent)
         except AiraError:
             return None
-        if not isinstance(key, ObjectiveTopicKey | LiabilityTopicKey | ReadingKey):
+        if not self._messages.allow(agent):
+            self._parts.drops.count("live-overflow", agent)
             return None
-        if not self._messages.allow(""):
-            self._parts.drops.count("live-overflow", key.agent)
-            return None
-        now, kind = time.time(), payload_type(str(sample.encoding))
+        now, kind = time.time_ns(), payload_type(str(sample.encoding))
         role = "objective" if isinstance(key, ObjectiveTopicKey) else "device"
-        message = Played(key.topic, sample.payload.to_bytes(), int(now * 1e9), int(now * 1e9), 0, kind, role)
-        picture = picture_in(message)
-        if picture is not None and not self._pictures.allow(""):
+        message = Played(key.topic, sample.payload.to_bytes(), now, now, 0, kind, role)
+        if picture_in(message) is not None and not self._pictures.allow(agent):
             return None
-        return key.topic, msgspec.Raw(msgspec.json.encode(sample_json(message, picture, at=now)))
+        return agent, message
 
 
-def sample_json(message: Played, picture: tuple[bytes, str] | None, *, at: float) -> dict[str, Any]:
-    """A message as a sample; `at` is when it came (Unix time)."""
-    image, is_cut, value = None, False, None
+def sample_json(message: Played) -> dict[str, Any]:
+    """A message as a sample."""
+    picture, image, is_cut, value = picture_in(message), None, False, None
     if picture is None:
         value, is_cut = shown_value(message)
     elif len(picture[0]) <= LARGEST_PICTURE:
@@ -164,7 +239,7 @@ def sample_json(message: Played, picture: tuple[bytes, str] | None, *, at: float
     return {
         "topic": message.topic,
         "role": message.role,
-        "at": at,
+        "at": _seconds(message),
         "value": value,
         "numbers": [[name[:200], number] for name, number in numbers if math.isfinite(number)] if not picture else [],
         "image": image,
@@ -183,11 +258,14 @@ class Live(Lifecycle):
         self._market = market
         self._stream = stream
         self._jobs: dict[str, tuple[Followed, Samples]] = {}
-        self._robots: dict[str, tuple[Followed, dict[str, Samples]]] = {}
+        self._readings = Readings(lambda robot: stream.has_subscribers(f"readings/{robot}"))
 
     async def _open(self, stack: AsyncExitStack) -> None:
         self._tasks = await stack.enter_async_context(Background())
         self._tasks.start(self._end_jobs(), "page: live jobs")
+        readings = Followed(self._parts, reading_selector(), keep=self._take_reading)
+        self._start(readings, "readings")
+        await readings.is_open.wait()
         self._market.on_contract = self._take_contract
         self._stream.on_subscribe = self._subscribed
 
@@ -204,12 +282,15 @@ class Live(Lifecycle):
         await followed.is_open.wait()
         return list(samples)
 
-    async def readings(self, robot: str) -> dict[str, list[msgspec.Raw]]:
-        """The readings of a robot (address) that are kept, by topic, oldest first; it is followed from now on."""
-        self._follow_robot(robot)
-        followed, topics = self._robots[robot]
-        await followed.is_open.wait()
-        return {topic: list(samples) for topic, samples in topics.items()}
+    async def readings(self, robot: str) -> dict[str, list[dict[str, Any]]]:
+        """The readings of a robot (address) that are kept, by topic, oldest first."""
+        topics = self._readings.of(robot)
+        return await asyncio.to_thread(lambda: {topic: [*map(sample_json, kept)] for topic, kept in topics.items()})
+
+    def _take_reading(self, robot: str, reading: Played) -> None:
+        self._readings.add(robot, reading)
+        if self._stream.has_subscribers(topic := f"readings/{robot}"):
+            self._stream.publish(topic, "message", sample_json(reading))
 
     def _take_contract(self, job: SeenJob) -> None:
         agent = self._parts.agent
@@ -217,13 +298,11 @@ class Live(Lifecycle):
             self._follow_job(job, is_own=True)
 
     def _subscribed(self, topics: frozenset[str]) -> None:
-        """Follow what a browser has subscribed to: jobs that are known already, and readings."""
+        """Follow the jobs that a browser has subscribed to, if they are known already."""
         for topic in topics:
             kind, _, named = topic.partition("/")
             if kind == "live" and (job := self._market.jobs.get(named)) is not None:
                 self._follow_job(job)
-            elif kind == "readings" and _is_address(named):
-                self._follow_robot(named)
 
     def _follow_job(self, job: SeenJob, *, is_own: bool = False) -> None:
         address, liability = job.liability.address, job.liability
@@ -232,51 +311,32 @@ class Live(Lifecycle):
         elif not liability.is_finalized:
             samples = Samples(SAMPLES, BYTES)
 
-            def keep(_topic: str, sample: msgspec.Raw) -> None:
+            def keep(_agent: str, message: Played) -> None:
+                sample = msgspec.Raw(msgspec.json.encode(sample_json(message)))
                 samples.add(sample)
-                self._publish(f"live/{address}", sample)
+                if self._stream.has_subscribers(topic := f"live/{address}"):
+                    self._stream.publish(topic, "message", sample)
 
             selector = job_selector(liability.promisor, address)
             followed = Followed(self._parts, selector, is_own=is_own, keep=keep)
             self._jobs[address] = followed, samples
             self._start(followed, f"live {address}")
-            self._drop_beyond(self._jobs, JOBS, "live")
-
-    def _follow_robot(self, robot: str) -> None:
-        if (known := self._robots.get(robot)) is not None:
-            known[0].asked_at = time.monotonic()
-            return
-        topics: dict[str, Samples] = {}
-
-        def keep(topic: str, sample: msgspec.Raw) -> None:
-            if topic not in topics and len(topics) >= TOPICS:
-                return
-            topics.setdefault(topic, Samples(READINGS, READING_BYTES)).add(sample)
-            self._publish(f"readings/{robot}", sample)
-
-        followed = Followed(self._parts, reading_selector(robot), keep=keep)
-        self._robots[robot] = followed, topics
-        self._start(followed, f"readings {robot}")
-        self._drop_beyond(self._robots, ROBOTS, "readings")
+            self._forget_jobs()
 
     def _start(self, followed: Followed, name: str) -> None:
         followed.task = self._tasks.start(followed.run(), f"page: {name}")
 
-    def _drop_beyond(self, known: dict[str, tuple[Followed, Any]], most: int, kind: str) -> None:
+    def _forget_jobs(self) -> None:
         """Forget what nobody looks at, and was asked for longest ago; jobs of the local account last."""
 
         def worth(address: str) -> tuple[bool, bool, float]:
-            followed = known[address][0]
-            return followed.is_own, self._stream.has_subscribers(f"{kind}/{address}"), followed.asked_at
+            followed, _ = self._jobs[address]
+            return followed.is_own, self._stream.has_subscribers(f"live/{address}"), followed.asked_at
 
-        *others, _newest = known
-        if len(known) > most:
-            followed, _ = known.pop(min(others, key=worth))
+        *others, _newest = self._jobs
+        if len(self._jobs) > JOBS:
+            followed, _ = self._jobs.pop(min(others, key=worth))
             followed.stop()
-
-    def _publish(self, topic: str, sample: msgspec.Raw) -> None:
-        if self._stream.has_subscribers(topic):
-            self._stream.publish(topic, "message", sample)
 
     async def _end_jobs(self) -> None:
         """End the subscriptions of jobs a while after their end; what was kept of them stays."""
@@ -293,10 +353,3 @@ class Live(Lifecycle):
                     ended.pop(address, None)
             for address in [address for address in ended if address not in self._jobs]:
                 del ended[address]
-
-
-def _is_address(text: str) -> bool:
-    try:
-        return parse_address(text) == text
-    except AiraError:
-        return False

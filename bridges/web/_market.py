@@ -253,7 +253,8 @@ class Market(Lifecycle):
 
     @property
     def head(self) -> int:
-        return self._parts.chain_head.head
+        """The latest block that was read, as contracts count it, which deadlines and refunds go by."""
+        return self._parts.chain_head.contract_block
 
     async def _open(self, stack: AsyncExitStack) -> None:
         session, enter = self._parts.network.session, stack.enter_async_context
@@ -468,9 +469,11 @@ class Market(Lifecycle):
                         case Finalized():
                             self._read_soon(event.liability, "ended", block.block_number, event.tx)
                 if block.block_number >= self._start:
-                    self._parts.chain_head.advance_to(block.block_number)
-                    self._stream.publish("chain", "block", {"number": block.block_number, "at": self._clock()})
-                    self._new_head(block.block_number)
+                    count = partial(self._parts.chain.node.contract_blocks.last, block.block_number)
+                    contract_block = await self._parts.chain.retrying(count)
+                    self._parts.chain_head.advance_to(block.block_number, contract_block)
+                    self._stream.publish("chain", "block", {"number": contract_block, "at": self._clock()})
+                    self._new_head(contract_block)
 
     def _revert(self, event: object, block: int) -> None:
         if isinstance(event, NewLiability):

@@ -1,21 +1,24 @@
-"""What robots say of themselves, and what they ask for a job. All of it is their word."""
+"""What robots say of themselves, and what they ask for a job: all of it is their word. And which of them are away."""
 
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from bridges.web.access import WebError
 from mesh.agent.hiring import asked_offer
-from mesh.base.flood import Rate, RateLimiter
+from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.errors import public_text
 from mesh.watching.quotes import QUOTE_TIMEOUT, asked_quotes
 from schemas import InvalidAddress, InvalidMessage, parse_address
 
 if TYPE_CHECKING:
-    from bridges.web._market import Labels
+    from collections.abc import Collection, Iterable
+
+    from bridges.web._market import Labels, Market
     from bridges.web.components import WebComponents
     from mesh.watching import Robot
     from schemas.rpc import AcceptDemand, Accepted, Quote
@@ -24,12 +27,55 @@ QUESTIONS: Final = Rate(per_second=1.0, burst=16)
 """Questions for quotes or offers that one person may ask."""
 LONGEST: Final = 200
 """Characters of why a robot declines."""
+AWAY: Final = 32
+"""Robots that are listed as away: those that have had jobs, then those that were here last, …"""
+AWAY_SECONDS: Final = 30 * 86_400.0
+"""… and for how long."""
+REMEMBERED: Final = 256
+"""Robots of which it is remembered how they presented themselves."""
 
 
 def profile_json(robot: Robot) -> dict[str, Any]:
     """How a robot presents itself, with neither its address nor what the chain says of it."""
     facts = msgspec.to_builtins(robot)
     return {name: facts[name] for name in facts if name not in ("address", "model", "paid", "refunded")}
+
+
+class LastSeen:
+    """Robots that were here: how each presented itself last, and when; and when those were last heard that have had
+    jobs."""
+
+    def __init__(self, components: WebComponents, market: Market) -> None:
+        self._parts = components
+        self._market = market
+        self._robots: BoundedDict[str, tuple[Robot, float]] = BoundedDict(REMEMBERED)
+
+    def saw(self, robots: Iterable[Robot]) -> None:
+        """These robots are here now."""
+        for robot in robots:
+            self._robots[robot.address] = robot, time.time()
+
+    async def away(self, present: Collection[str]) -> dict[str, tuple[Robot | None, float]]:
+        """The robots (addresses) that are not `present`: their profiles, if known, and since when they are away."""
+        jobs = await self._last_jobs(present)
+        found: dict[str, tuple[Robot | None, float]] = {address: (None, at) for address, at in jobs.items()}
+        for address, (robot, at) in self._robots.items():
+            if address not in present:
+                found[address] = robot, max(at, jobs.get(address, 0.0))
+        oldest = time.time() - AWAY_SECONDS
+        recent = [address for address, (_, since) in found.items() if since > oldest]
+        recent.sort(key=lambda address: (address in jobs, found[address][1]), reverse=True)
+        return {address: found[address] for address in recent[:AWAY]}
+
+    async def _last_jobs(self, present: Collection[str]) -> dict[str, float]:
+        """When the latest job of each robot that is not `present` took its last step."""
+        steps: dict[str, dict[str, Any]] = {}
+        for job in reversed(self._market.jobs.values()):
+            robot, is_ours = job.liability.promisor, job.liability.lighthouse == self._parts.lighthouse
+            if is_ours and job.steps and robot not in present and len(steps) < AWAY:
+                steps.setdefault(robot, job.steps[-1])
+        times = [step["at"] or await self._market.time_of(step["block"] or 0) or 0.0 for step in steps.values()]
+        return dict(zip(steps, times, strict=True))
 
 
 class Questions:

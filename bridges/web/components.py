@@ -65,10 +65,11 @@ async def opened(
         if agent is not None:
             parts = agent.parts
             network, channel, store, exchange = parts.network, parts.channel, parts.store, parts.exchange
-            opened_chain, head, drops = parts.chain, ChainHead(await parts.chain.block_number()), parts.drops
+            opened_chain, drops = parts.chain, parts.drops
+            head = await ChainHead.at(opened_chain, await opened_chain.block_number())
         else:
             opened_chain = await enter(chain_of(settings, None)) if chain is None else chain
-            head = ChainHead(await opened_chain.block_number())
+            head = await ChainHead.at(opened_chain, await opened_chain.block_number())
             network, channel = await enter(connected(settings, opened_chain, head, drops))
             folder, limit = settings.state_directory / "content", settings.objective_expanded_limit
             store = await open_store(stack, settings, folder, limit=limit)

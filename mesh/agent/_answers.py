@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent.orders import lifetime_of, withdrawal_of
+from mesh.agent.orders import deadline_in, lifetime_of, withdrawal_of
 from mesh.base.background import Background
 from mesh.base.flood import FairQueue
 from mesh.base.retry import Backoff, RetryPolicy
@@ -123,7 +123,7 @@ class Question:
         """Publish the demand again and again; a new one each time, as a robot takes each only once."""
         backoff, chain = Backoff(RetryPolicy(initial=2.0, ceiling=10.0)), self._parts.chain
         while True:
-            deadline = (await chain.node.heads.recent()).number + await lifetime_of(chain, self._seconds)
+            deadline = await deadline_in(chain, await lifetime_of(chain, self._seconds))
             demand = await self._writer.sign(Demand, {**terms, "deadline": deadline}, validator_fee=0)
             assert isinstance(demand, Demand)
             before, self._open = self._open, [*self._open, demand]

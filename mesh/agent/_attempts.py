@@ -212,7 +212,7 @@ class Attempts:
         return True
 
     async def _order(self, besides: Collection[str]) -> Order:
-        left = self._deadline - await self._parts.chain.block_number()
+        left = self._deadline - await self._parts.chain.contract_block()
         if left <= 0:
             raise OrderExpired(self.number, self._deadline)
         lifetime = min(left, self._parts.settings.deadline_limit)  # the default lifetime may be above it

@@ -24,12 +24,12 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 import msgspec
-import zenoh
 
 from mesh.base.background import Background, call_in_loop
 from mesh.base.lifecycle import Lifecycle
@@ -38,9 +38,10 @@ from mesh.base.retry import Backoff, RetryPolicy
 from mesh.errors import ConfigurationError
 from mesh.market.transactions import LEAST_GAS
 from mesh.network import NetworkChange
-from mesh.network.services import declared
+from mesh.network.presence import PresenceWatch
 from schemas.decoding import InvalidData, first_line
 from schemas.keys import PRESENT, DeviceTopicKey, device_selector, parse_agent_key
+from schemas.records import NotifyTarget, RobotEvent
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator, Mapping
@@ -52,6 +53,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+RECENT: Final = 20
+"""Events that are remembered for the owner, who may look at them later."""
+LONGEST_DETAIL: Final = 200
+"""Characters of what is remembered of an event."""
 QUEUED: Final = 1_000
 """Events that wait for a target; more push out the oldest."""
 RETRY: Final = RetryPolicy(initial=1.0, ceiling=600.0, attempts=20)
@@ -161,8 +166,10 @@ class Notifier(Lifecycle):
 
     def __init__(self, settings: NotificationSettings, address: str, *, retry: RetryPolicy = RETRY) -> None:
         secret = _secret(settings.notify_secret_file) if settings.notify_secret_file else b""
-        self.wanted: Final = frozenset(settings.notify_events if settings.notify else ())
-        """The events that are delivered."""
+        self.wanted: Final = frozenset(settings.notify_events)
+        """The events that are remembered, and delivered."""
+        self.recent: Final = deque[RobotEvent](maxlen=RECENT)
+        """The latest events, oldest first, also if there are no targets."""
         self._source = f"/aira/agent/{address}"
         self._retry = retry
         self._outboxes = [_Outbox(_target(text, secret)) for text in settings.notify]
@@ -173,14 +180,21 @@ class Notifier(Lifecycle):
             tasks.start(outbox.run(self._retry), f"notify {outbox.target}")
         stack.push_async_callback(self._drain)
 
+    def targets(self) -> tuple[NotifyTarget, ...]:
+        """Who is told, without what may be secret."""
+        return tuple(NotifyTarget(str(outbox.target), len(outbox)) for outbox in self._outboxes)
+
     def notify(self, event: OwnerEvent, data: Mapping[str, str], *, about: str = "") -> None:
-        """Tell the targets of an event, if it is wanted. Returns at once.
+        """Remember an event, if it is wanted, and tell the targets. Returns at once.
 
         `about` is what it is about, such as a contract's address; the same event about the same has the same id.
         """
         if event not in self.wanted:
             return
-        now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        at = datetime.now(UTC)
+        detail = next((data[name] for name in ("reason", "part", "balance") if data.get(name)), "")
+        self.recent.append(RobotEvent(event=event, time=at.timestamp(), about=about, detail=detail[:LONGEST_DETAIL]))
+        now = at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         identity = f"{event}-{about or secrets.token_hex(8)}"
         envelope = {"specversion": "1.0", "id": identity, "source": self._source, "type": f"aira.{event}", "time": now}
         envelope |= {"subject": about} if about else {}
@@ -206,6 +220,9 @@ class _Outbox:
         self._waiting: deque[Notification] = deque()
         self._filled = asyncio.Event()
         self._pushed_out = 0
+
+    def __len__(self) -> int:
+        return len(self._waiting)
 
     def put(self, event: Notification) -> None:
         self._waiting.append(event)
@@ -279,13 +296,11 @@ class OwnerWatch:
         loop, session = asyncio.get_running_loop(), self._parts.network.session
         selector = device_selector(self._parts.signer.address, topic=PRESENT)
 
-        def changed(sample: zenoh.Sample) -> None:
-            is_present = sample.kind == zenoh.SampleKind.PUT
-            call_in_loop(loop, self._device_changed, str(sample.key_expr), is_present)
-
-        subscriber = session.liveliness().declare_subscriber(selector, changed, history=True)
-        with declared(session, subscriber):
+        watch = PresenceWatch(session, selector, partial(call_in_loop, loop, self._device_changed))
+        try:
             await asyncio.Event().wait()
+        finally:
+            watch.end()
 
     def _device_changed(self, key: str, is_present: bool) -> None:
         parsed = parse_agent_key(key)

@@ -205,7 +205,8 @@ class OwnProfile:
                     self._parts.channel.put(key, self._signed(*doing).encode())
             await asyncio.sleep(INTERVAL)
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), LOOK)
+                async with asyncio.timeout(LOOK):
+                    await self._changed.wait()
 
 
 def _text(payload: bytes, kind: PayloadType) -> str:

@@ -110,5 +110,5 @@ class Quoting:
             token=paid_in,
             start=float(wait),
             seconds=self._seconds,
-            until=parts.chain_head.head + FEWEST_BLOCKS,
+            until=parts.chain_head.contract_block + FEWEST_BLOCKS,
         )

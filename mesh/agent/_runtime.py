@@ -180,18 +180,18 @@ class LateResults:
         """Look at the unsettled Results after each block, until cancelled."""
         head = self._parts.chain_head
         while True:
-            unsettled = await self._parts.ledger.outbox(head=head.head)
+            unsettled = await self._parts.ledger.outbox(head=head.contract_block)
             results = [decode(one.payload) for one in unsettled if one.kind == Result.kind]
             waiting = {result.liability: result for result in results if isinstance(result, Result)}
             self._late_from = {address: block for address, block in self._late_from.items() if address in waiting}
-            self._since = {address: self._since.get(address, head.head) for address in waiting}
+            self._since = {address: self._since.get(address, head.contract_block) for address in waiting}
             for address, result in waiting.items():
                 with liability_context(address):
                     await self._finalize_if_late(result)
             await head.reached(head.head + 1)
 
     async def _finalize_if_late(self, result: Result) -> None:
-        address, head = result.liability, self._parts.chain_head.head
+        address, head = result.liability, self._parts.chain_head.contract_block
         try:
             if address not in self._late_from:
                 if head - self._since[address] < SOON:
@@ -371,8 +371,8 @@ class AgentRuntime(Lifecycle):
 
     async def on_head(self, block: int) -> None:
         """All of `block` has been handled. After a reorganisation it may be lower than before."""
-        await self.parts.outbox.expire(block)
-        await self.trader.new_head(block)
+        await self.parts.outbox.expire(self.parts.chain_head.contract_block)
+        await self.trader.new_head(self.parts.chain_head.contract_block)
 
     async def finalize_ended(self) -> None:
         """Finalize the jobs that ended while the agent was away, before any of them is played to the device again."""
@@ -578,7 +578,8 @@ class AgentRuntime(Lifecycle):
         if asked.paused:
             await self.trader.take_back_offers("its owner has paused it")
         self.profile.changed()
-        return replace(self.rules.control, stopped=stopped)
+        notifier = self.notifier
+        return replace(self.rules.control, stopped=stopped, notify=notifier.targets(), events=tuple(notifier.recent))
 
     async def _ask(self, asked: LocalRequest) -> LocalAnswer:
         if asked.control is None:

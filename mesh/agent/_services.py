@@ -192,7 +192,7 @@ def account_services(parts: AgentComponents) -> dict[str, Service]:
         return Accounts((own,))
 
     async def current_block(_request: Nothing) -> BlockNumber:
-        return BlockNumber(await chain.block_number())
+        return BlockNumber(await chain.contract_block())  # deadlines count it
 
     async def eth_balance(request: AccountBalance | Nothing) -> Balance:
         return Balance(await tokens.eth_balance(account_of(request)))
@@ -292,7 +292,7 @@ class MessageServices:
     async def _check(self, message: SignedMessage) -> None:
         if isinstance(message, Result):
             return
-        channel, head = self._parts.channel, self._parts.chain_head.head
+        channel, head = self._parts.channel, self._parts.chain_head.contract_block
         if message.lighthouse != channel.address:
             raise InputError(
                 f"this agent trades on {channel.address} ({channel.lighthouse}), the order is for {message.lighthouse}",

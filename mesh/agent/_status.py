@@ -64,4 +64,4 @@ class AgentStatus(RoleStatus[AgentComponents]):
 
     async def _waiting(self) -> dict[str, int]:
         """The messages in the outbox, by kind."""
-        return await self.parts.ledger.waiting_by_kind(head=self.parts.chain_head.head)
+        return await self.parts.ledger.waiting_by_kind(head=self.parts.chain_head.contract_block)

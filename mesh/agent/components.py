@@ -54,7 +54,7 @@ async def working(
 
         shared = await open_parts(stack, settings, account, chain, ledger=ledger, drops=drops)
         head = shared.chain_head
-        outbox = Outbox(shared.ledger, shared.channel, shared.network, head=lambda: head.head, policy=resend)
+        outbox = Outbox(shared.ledger, shared.channel, shared.network, head=lambda: head.contract_block, policy=resend)
         robots = RobotDirectory(shared.network.session, shared.channel)
         parts = AgentComponents(**vars(shared), outbox=outbox, robots=robots)
         try:

@@ -480,7 +480,8 @@ class ContractReports(Lifecycle):
             while changed.is_set():
                 changed.clear()
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(changed.wait(), 0 if judged.is_split else self.silence)
+                    async with asyncio.timeout(0 if judged.is_split else self.silence):
+                        await changed.wait()
             with suppress(AiraError):  # the node is away: the next state is said
                 await self.of(judged.liability)
                 if judged.is_judged:
@@ -859,15 +860,18 @@ class WatchedContracts:
         """The contract at `address` (or name), read from the chain. Raises `NotALiability`."""
         address = await self._parts.chain.names.address(address)
         is_new = address not in self._watched
-        self._watch(address)  # before it is read: it may end in between
+        watched = self._watch(address)  # before it is read: it may end in between
         try:
-            contract = self.watch(await self._parts.chain.liabilities.get(address))
-            await self.settle()
-            return contract
+            liability = await self._parts.chain.liabilities.get(address)
         except BaseException:
             if is_new:
                 self._watched.pop(address, None)
             raise
+        if watched.ended.done():
+            return Contract(liability, watched.ended, self._parts, self._reports)
+        contract = self.watch(liability)
+        await self.settle()
+        return contract
 
     def watch(self, liability: Liability, *, order: str = "") -> Contract:
         """The contract of `liability`, which was created from our `order` (lasting hash), if from any."""

@@ -333,7 +333,7 @@ class Acceptance:
             raise InvalidMessage("sender", f"the order names {message.sender} as its sender")
         if message.lighthouse != self._parts.channel.address:
             raise InvalidMessage("lighthouse", f"made for {message.lighthouse}, not for this market")
-        if message.deadline <= self._parts.chain_head.head:
+        if message.deadline <= self._parts.chain_head.contract_block:
             raise InvalidMessage("deadline", f"block {message.deadline} has passed")
         await self._parts.chain.validators.check(message)
         return Verified(replace(message, signature=""), message_hash(message), request.maker)

@@ -1,7 +1,7 @@
 """Orders for one robot alone: its offer is asked for first, then a provider gets the demand and the offer together.
 
 A demand can't name who may do it, so it is not published. The robot decides on the demand without its signature, and
-only providers with a stake ever see the signed pair: see "Orders for one robot" in docs/explanation/reliability.md.
+only providers with a stake ever see the signed pair: see "Orders for one robot" in docs/explanation/private-orders.md.
 """
 
 from __future__ import annotations

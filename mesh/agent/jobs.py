@@ -40,6 +40,7 @@ from mesh.base.extras import needs_extra
 from mesh.base.log_context import liability_context, log_event, with_liability_context
 from mesh.base.private_files import make_private_folder, sync_directory
 from mesh.errors import AiraError, ClosedError, ContentError, InputError, public_text
+from mesh.network.presence import present_keys
 from mesh.recording import (
     GENEROUS,
     NOTE_TOPIC,
@@ -195,12 +196,11 @@ def stop_devices(session: zenoh.Session, agent: str, why: str) -> tuple[DeviceSt
                 with contextlib.suppress(InvalidRecord):
                     answer = DeviceStop.decode(reply.ok.payload.to_bytes())
                     answers[answer.device] = answer
-        for reply in session.liveliness().get(device_selector(agent, topic=PRESENT), timeout=ASK_SECONDS):
-            if reply.ok is not None:
-                key = parse_agent_key(str(reply.ok.key_expr))
-                if isinstance(key, DeviceTopicKey) and key.device not in answers:
-                    detail = f"it did not confirm the stop within {HEARING_SECONDS:g} s"
-                    answers[key.device] = DeviceStop(device=key.device, heard=False, detail=detail)
+        for text in present_keys(session, device_selector(agent, topic=PRESENT), timeout=ASK_SECONDS):
+            key = parse_agent_key(text)
+            if isinstance(key, DeviceTopicKey) and key.device not in answers:
+                detail = f"it did not confirm the stop within {HEARING_SECONDS:g} s"
+                answers[key.device] = DeviceStop(device=key.device, heard=False, detail=detail)
     return tuple(answers[device] for device in sorted(answers))
 
 
@@ -395,7 +395,7 @@ class JobRun(Job):
         """Return when the devices that are present are idle; False if none is present."""
         with contextlib.suppress(zenoh.ZError):
             present = device_selector(self._agent, topic=PRESENT)
-            if not any(reply.ok is not None for reply in self._session.liveliness().get(present, timeout=ASK_SECONDS)):
+            if not present_keys(self._session, present, timeout=ASK_SECONDS):
                 return False
             idle = device_selector(self._agent, topic=IDLE)
             target, consolidation = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE

@@ -1,7 +1,7 @@
 """The ledger: an agent's jobs and their phases, its unsent messages and its orders, in one SQLite file.
 
 Every write survives `kill -9` once the call has returned, and a power loss unless it can be repeated: see "What
-survives a crash" in docs/explanation/architecture.md. Writes are idempotent.
+survives a crash" in docs/explanation/decisions/jobs.md. Writes are idempotent.
 """
 
 from __future__ import annotations

@@ -179,15 +179,20 @@ class TradedOrder:
         finally:
             self.on_progress.remove(listener)
 
-    async def contract(self, on_progress: OnProgress) -> Contract:
-        """Wait until it is a contract, and report rejections and declines meanwhile, those of before first."""
+    def expect_contract(self) -> asyncio.Future[Contract]:
+        """Somebody waits for its contract, from now on."""
         if self.created is None:
             self.created = asyncio.get_running_loop().create_future()
+        return self.created
+
+    async def contract(self, on_progress: OnProgress) -> Contract:
+        """Wait until it is a contract, and report rejections and declines meanwhile, those of before first."""
+        created = self.expect_contract()
         for said in (*map(stated, self.rejections.values()), *map(stated, self.declines.values())):
             report(on_progress, said)
         self.on_progress.append(on_progress)
         try:
-            return await asyncio.shield(self.created)
+            return await asyncio.shield(created)
         finally:
             self.on_progress.remove(on_progress)
 
@@ -264,13 +269,13 @@ class TermsWriter:
             "cost": cost,
             "lighthouse": await names.address(settings.lighthouse_contract),
             "validator": await names.address(validator) if validator else ZERO_ADDRESS,
-            "deadline": (await self._chain.node.heads.recent()).number + blocks,
+            "deadline": await deadline_in(self._chain, blocks),
             "sender": None if settings.generation == 3 else self._signer.address,
         }
 
     def terms_of(self, order: Demand | Offer) -> Terms:
         """The terms of a stranger's order, for one that answers it; its deadline counts up to `deadline_limit`."""
-        latest = self._chain_head.head + self._settings.deadline_limit
+        latest = self._chain_head.contract_block + self._settings.deadline_limit
         return {**self._repeated(order), "deadline": min(order.deadline, latest)}
 
     def _repeated(self, order: Demand | Offer) -> Terms:
@@ -308,9 +313,14 @@ def is_repeated(demand: Demand, terms: Terms, *, payable: range) -> bool:
     return demand.cost in payable and all(getattr(demand, field) == same[field] for field in REPEATED)
 
 
+async def deadline_in(chain: Chain, blocks: int) -> int:
+    """The deadline of an order that is valid for that many blocks from now on."""
+    return await chain.node.contract_blocks.last((await chain.node.heads.recent()).number) + blocks
+
+
 async def lifetime_of(chain: Chain, seconds: float = LIFETIME) -> int:
     """How many blocks make about `seconds`, by the time between the latest blocks: for how long an order is valid."""
-    block_time = await chain.node.heads.block_time(MEASURED_BLOCKS)
+    block_time = await chain.node.contract_blocks.seconds(MEASURED_BLOCKS)
     blocks = seconds if block_time is None else seconds / block_time
     return min(max(round(blocks), FEWEST_BLOCKS), MOST_BLOCKS)
 

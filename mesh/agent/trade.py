@@ -470,6 +470,7 @@ class Trader(Lifecycle):
             raise ENDED() if order.is_open else order.why_closed
         else:
             heard = nothing if order.robot else on_progress
+            order.expect_contract()  # now: it may become one while the subscription opens
             async with seen_offers(self._parts, order.signed, heard):
                 contract = await order.contract(on_progress)
         promisor, address = contract.liability.promisor, contract.address
@@ -549,7 +550,7 @@ class Trader(Lifecycle):
         """
         parts = self._parts
         async with self._withdrawing:
-            for order in await parts.ledger.withdrawn_on_chain(head=parts.chain_head.head):
+            for order in await parts.ledger.withdrawn_on_chain(head=parts.chain_head.contract_block):
                 try:
                     await parts.chain.retrying(partial(self._ensure_withdrawn, order), outages=parts.outages)
                 except AiraError as error:
@@ -667,7 +668,7 @@ class Trader(Lifecycle):
             for stored in await self._parts.ledger.orders():
                 order, signed = self._orders.get(stored.identity), decode(stored.payload)
                 assert isinstance(signed, Demand | Offer)
-                if signed.deadline <= self._parts.chain_head.head:
+                if signed.deadline <= self._parts.chain_head.contract_block:
                     continue
                 if order is None:
                     order = self._orders[stored.identity] = TradedOrder(signed, stored.posted, robot=stored.robot)

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
+VERSION: Final = 1
+"""The format of all these files, which each of them states as its `user_version`. Raise it when an older version could
+not go on with what this one writes."""
 DISK_ERRORS: Final = (OSError, sqlite3.Error)
 """What the methods of a `SyncedDatabase` raise when the disk refuses, or the file is no database."""
 
@@ -47,15 +50,21 @@ class SyncedDatabase:
         return self._database is not None
 
     def open(self) -> None:
-        """Open the file, or create it, and sync it: an earlier process may have been killed before it did."""
+        """Open the file, or create it, and sync it: an earlier process may have been killed before it did.
+
+        Raises `ConfigurationError` if a newer version wrote it.
+        """
         if self.path is None:
             return
         make_private_folder(self.path.parent)
         make_private_database(self.path)
         opened = sqlite3.connect(self.path, timeout=self._patience, isolation_level=None, check_same_thread=False)
         try:
+            found = check_format(self.path, opened)
             opened.executescript("PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL;")
-            self._prepare(opened)
+            opened.executescript(self._schema)
+            if found != VERSION:
+                opened.execute(f"PRAGMA user_version = {VERSION}")
             self._version = _version(opened)
             self._sync(self.path)
             sync_directory(self.path.parent)
@@ -65,10 +74,6 @@ class SyncedDatabase:
         self._database = opened
         self.written += 1  # what earlier processes wrote
         self.synced = self.written
-
-    def _prepare(self, database: sqlite3.Connection) -> None:
-        """Create the tables where they are missing."""
-        database.executescript(self._schema)
 
     def close(self) -> None:
         """Close the file if it is open."""
@@ -128,6 +133,18 @@ class SyncedDatabase:
     def _sync(self, path: Path) -> None:
         """What was committed is in SQLite's log, or was synced when it left that."""
         sync_file(path.with_name(f"{path.name}-wal"))
+
+
+def check_format(path: Path, database: sqlite3.Connection) -> int:
+    """The format of an open file. Raises `ConfigurationError` if a newer version wrote it."""
+    version = int(database.execute("PRAGMA user_version").fetchone()[0])
+    if version > VERSION:
+        raise ConfigurationError(
+            f"{path} was written by a newer version (format {version}, this one knows {VERSION})",
+            hint="upgrade aira-mesh",
+            code="state-too-new",
+        )
+    return version
 
 
 def _version(database: sqlite3.Connection) -> int:

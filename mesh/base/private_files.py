@@ -6,7 +6,6 @@ State that an older version or another program left more open is tightened when 
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import stat
 from contextlib import contextmanager, suppress
@@ -75,21 +74,6 @@ def tighten(path: Path) -> bool:
         return False
     path.chmod(stat.S_IMODE(status.st_mode) & ~_OTHERS)
     return True
-
-
-def is_locked(path: Path, *, lock: int = fcntl.LOCK_EX) -> bool:
-    """Whether this process or another has the file at `path` locked, so that it could not have the `lock` as well."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return False
-    try:
-        fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
 
 
 def write_new(path: Path | str, content: bytes, *, mode: int = PRIVATE_FILE) -> None:

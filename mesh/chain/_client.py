@@ -192,6 +192,10 @@ class Chain:
         """Number of the latest block."""
         return await self.node.block_number()
 
+    async def contract_block(self) -> int:
+        """The contracts' number of the latest block, which deadlines and refunds count: on Arbitrum, Ethereum's."""
+        return await self.node.contract_block()
+
     async def history_at(self, block_number: int) -> History:
         """The history of a consumer that has read nothing yet and begins after a block: see `following`."""
         return await history_at(self.node, block_number)

@@ -287,7 +287,7 @@ class OriginalContracts(ContractVersion):
     async def is_turn(self, lighthouse: str, provider: str) -> bool:
         """By the rule of the originals: the provider at the marker, or any provider after a timeout of silence."""
         state = await self.state(lighthouse)
-        silence = await self._node.block_number() + 1 - state.keep_alive_block
+        silence = await self._node.contract_block() + 1 - state.keep_alive_block
         return provider in state.stakes and (provider == state.current or silence > state.timeout_blocks)
 
     async def are_liabilities(self, addresses: Sequence[str]) -> list[bool]:

@@ -280,6 +280,75 @@ class Heads:
         return asyncio.get_running_loop().time()
 
 
+RUN_NUMBER: Final = bytes.fromhex("4360005260206000f3")
+"""Creation code that returns the number of the block it runs in, instead of code: NUMBER, then MSTORE and RETURN."""
+CHECK_AGAIN: Final = 3600.0
+"""Seconds after which it is checked again whose blocks contracts count."""
+CHECK_REFUSED: Final = 60.0
+"""The same if the node did not say."""
+ETHEREUM_SLOT: Final = 12.0
+"""Seconds between two blocks of Ethereum, which the contracts of some other chains count."""
+
+
+class ContractBlocks:
+    """How far blocks have come by the count of contracts, their `block.number`: deadlines, refunds and turns go by it.
+
+    On most chains that is the number of the block. On Arbitrum it is about that of Ethereum's latest block: far from
+    the chain's own numbers, the same for many blocks, and then one or several more. So the node is asked to run NUMBER,
+    in code that is never deployed, which sees what contracts of any kind see: once, and again rarely, where both are
+    the same; elsewhere each `interval` (seconds) at most. `run` runs it at a block; `heads` are the chain's own.
+    """
+
+    def __init__(self, heads: Heads, run: Callable[[int | str], Awaitable[int | None]], *, interval: float) -> None:
+        self._heads = heads
+        self._run = run
+        self._interval = interval
+        self._are_own = True
+        self._check_at = float("-inf")
+        self._seen = 0
+        self._ask_at = float("-inf")
+        self._asking = asyncio.Lock()
+
+    async def last(self, head: int) -> int:
+        """The contracts' number of the latest block, by which those after it are higher; `head` is the chain's own.
+
+        Where contracts count other blocks, it is one below the number that they see now: the next transaction may see
+        the same again.
+        """
+        return head if await self.are_own() else await self._ask()
+
+    async def seconds(self, blocks: int) -> float | None:
+        """Seconds between two of the blocks that contracts count, by the last `blocks`; None if it is not known."""
+        return await self._heads.block_time(blocks) if await self.are_own() else ETHEREUM_SLOT
+
+    async def are_own(self) -> bool:
+        """Whether contracts count the chain's own blocks."""
+        if self._now() >= self._check_at:
+            async with self._asking:
+                if self._now() >= self._check_at:
+                    await self._check()
+        return self._are_own
+
+    async def _check(self) -> None:
+        head = (await self._heads.recent()).number
+        number = await self._run(head)
+        if number is not None:
+            self._are_own = number in (head, head + 1)  # some nodes run calls in the block after
+        self._check_at = self._now() + (CHECK_REFUSED if number is None else CHECK_AGAIN)
+
+    async def _ask(self) -> int:
+        async with self._asking:
+            if self._now() >= self._ask_at:
+                number = await self._run("latest")
+                self._seen = max(self._seen, (number or 0) - 1)  # another machine of the node may be behind
+                self._ask_at = self._now() + self._interval
+        return self._seen
+
+    @staticmethod
+    def _now() -> float:
+        return asyncio.get_running_loop().time()
+
+
 log = logging.getLogger(__name__)
 
 READ_ATTEMPTS: Final = 3
@@ -390,6 +459,8 @@ class Node:
             self._ask_latest, self.header, interval=self.timing.poll_interval, request_pushes=self._request_pushes
         )
         """The latest block, for all who wait for the next one."""
+        self.contract_blocks = ContractBlocks(self.heads, self._run_number, interval=self.timing.poll_interval)
+        """The blocks as contracts count them."""
         self._logs_refused = 0
         self._doubted = b"", 0
         """The block of the last empty answer that could not be proven, and how many there were for it."""
@@ -454,6 +525,18 @@ class Node:
     async def block_number(self) -> int:
         """Number of the latest block."""
         return int(await self._ask("eth_blockNumber"))
+
+    async def contract_block(self) -> int:
+        """The contracts' number of the latest block, which deadlines and refunds count: see `ContractBlocks.last`."""
+        return await self.contract_blocks.last(await self.block_number())
+
+    async def _run_number(self, block: int | str) -> int | None:
+        """The number that a contract sees in the state after a block; None if the node does not run such code."""
+        try:
+            return int.from_bytes(await self.call({"data": "0x" + RUN_NUMBER.hex()}, block=block))
+        except (RequestRefused, Reverted) as error:
+            log.debug("the number of blocks that contracts see can't be asked: %s", error)
+            return None
 
     async def header(self, block: int | str) -> BlockHeader | None:
         """A block, by its number or `latest`; None if the chain does not have it."""

@@ -8,7 +8,6 @@ ended, or that names none, was left behind. It has all versions of the transacti
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import json
 import os
 import sqlite3
@@ -20,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 from mesh.base.database import SyncedDatabase, transactions_not_kept
+from mesh.base.file_locks import is_locked, lock, try_lock
 from mesh.base.flood import BoundedDict
-from mesh.base.private_files import is_locked
 from mesh.chain._accounts import SignedTransaction
 from mesh.errors import ConfigurationError
 from schemas.decoding import decode_json
@@ -140,7 +139,7 @@ class TransactionStore:
         """Create and lock this process's file; its name without the suffix."""
         while True:
             descriptor, name = tempfile.mkstemp(suffix=LOCK, prefix="", dir=self._folder)
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            lock(descriptor)
             if os.path.exists(name):  # nobody took it for that of a process that has ended
                 self._descriptor = descriptor
                 return Path(name).stem
@@ -148,14 +147,14 @@ class TransactionStore:
 
     def _is_alive(self, owner: str) -> bool:
         """Whether another process that a row names has not ended."""
-        return bool(owner) and is_locked((self._folder / owner).with_suffix(LOCK), lock=fcntl.LOCK_SH)
+        return bool(owner) and is_locked((self._folder / owner).with_suffix(LOCK), ours_is_shared=True)
 
     def _clear_locks(self) -> None:
         """Remove the files of processes that have ended."""
         for path in self._folder.glob(f"*{LOCK}"):
-            with suppress(FileNotFoundError, BlockingIOError), path.open("rb") as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                path.unlink()
+            with suppress(FileNotFoundError), path.open("rb") as file:
+                if try_lock(file):
+                    path.unlink()
 
     @contextmanager
     def _on_disk(self) -> Iterator[None]:

@@ -99,10 +99,10 @@ class GasPaid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefundState:
-    """Whether a liability can be refunded, as of the block `block_number`."""
+    """Whether a liability can be refunded. Blocks are as contracts count them: the last one is `contract_block`."""
 
     liability: str
-    block_number: int
+    contract_block: int
     refundable_from: int
     """The first block in which anybody may refund it, if it has not ended by then."""
     is_finalized: bool
@@ -110,7 +110,7 @@ class RefundState:
     @property
     def is_refundable(self) -> bool:
         """Whether a transaction in the next block could refund it."""
-        return not self.is_finalized and self.block_number + 1 >= self.refundable_from
+        return not self.is_finalized and self.contract_block + 1 >= self.refundable_from
 
 
 class Liabilities:
@@ -376,7 +376,7 @@ class Liabilities:
         block = await self._node.block_number()
         return RefundState(
             liability=address,
-            block_number=block,
+            contract_block=await self._node.contract_blocks.last(block),
             refundable_from=await self.refundable_from(address),
             is_finalized=await self._is_finalized(address, block),
         )

@@ -14,7 +14,7 @@ from contextlib import suppress
 from email.utils import parsedate_to_datetime
 from functools import partial
 from itertools import count
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, runtime_checkable
 from urllib.parse import urlsplit
 
 import msgspec
@@ -55,6 +55,20 @@ class Transport(Protocol):
 
     async def make_request(self, method: Any, params: Any) -> Any:
         """The node's response, a JSON object with a result or an error. Raises as `HttpTransport` does."""
+
+
+@runtime_checkable
+class PushingTransport(Transport, Protocol):
+    """A transport whose node pushes new blocks."""
+
+    def push_heads(self, on_head: Callable[[Any], None]) -> None:
+        """Call `on_head` with each new block, as JSON, and with None when none is pushed any more.
+
+        It is called in this event loop, until `end_pushes`. This may be called again and again.
+        """
+
+    def end_pushes(self, on_head: Callable[[Any], None]) -> None:
+        """Call it no more. Unknown ones are ignored."""
 
 
 class _Transport:
@@ -116,14 +130,16 @@ class WebSocketTransport(_Transport):
             self._on_head(None)
 
     def push_heads(self, on_head: Callable[[Any], None]) -> None:
-        """Call `on_head` with each new block that the node pushes, as JSON, and with None when it no longer does.
-
-        A node that has no such subscription is not asked again.
-        """
+        """See `PushingTransport`. A node that has no such subscription is not asked again."""
         if self._on_head is None:
             self._on_head = on_head
             if self._socket is not None and not self._socket.closed:
                 self._subscribing = asyncio.create_task(self._subscribe(), name="aira-chain-heads")
+
+    def end_pushes(self, on_head: Callable[[Any], None]) -> None:
+        """See `PushingTransport`."""
+        if self._on_head is on_head:
+            self._on_head = None
 
     async def make_request(self, method: str, params: Any) -> Any:
         """The node's response, with a result or an error."""
@@ -283,6 +299,10 @@ class Upstream:
     def __init__(self, transport: Transport, *, endpoint: str, owned: Connection | None = None) -> None:
         self.endpoint = endpoint
         self.owned = owned
+        self.pushing = transport if isinstance(transport, PushingTransport) else None
+        """The same, if its node may push new blocks."""
+        self.on_head: Callable[[Any], None] | None = None
+        """What it calls with them."""
         self._transport = transport
         self._secrets = secrets_in(endpoint)
         self.is_on_chain = False
@@ -376,12 +396,13 @@ class RpcClient:
     def push_heads(self, on_head: Callable[[BlockHeader | None], None]) -> None:
         """Call `on_head` with each new block that the node in use pushes, and with None when it no longer does.
 
-        Only over WebSocket, and only of the node that requests go to. May be called again and again.
+        Only over a `PushingTransport`, and only of the node that requests go to. May be called again and again.
         """
         self._on_head = on_head
         first = self._upstreams[0]
-        if isinstance(first.owned, WebSocketTransport):
-            first.owned.push_heads(partial(self._take_head, first))
+        if first.pushing is not None:
+            first.on_head = first.on_head or partial(self._take_head, first)
+            first.pushing.push_heads(first.on_head)
 
     def _take_head(self, upstream: Upstream, pushed: Any) -> None:
         if upstream is not self._upstreams[0] or self._on_head is None:
@@ -511,6 +532,8 @@ class RpcClient:
         """Close the connections that this side opened; further requests raise `ClosedError`."""
         self._is_open = False
         for upstream in self._upstreams:
+            if upstream.pushing is not None and upstream.on_head is not None:
+                upstream.pushing.end_pushes(upstream.on_head)
             if upstream.owned is not None:
                 await upstream.owned.close()
 

@@ -365,7 +365,7 @@ class JudgedTerms:
         await check_named(chain, validator, lighthouse=lighthouse, generation=generation)
         announced, block_time = await directory.find(validator), None
         with suppress(AiraError):  # then it is not known
-            block_time = await chain.node.heads.block_time(MEASURED_BLOCKS)
+            block_time = await chain.node.contract_blocks.seconds(MEASURED_BLOCKS)
         return cls(
             announced=announced,
             fee=announced.fee if fee is None else fee,
@@ -774,8 +774,9 @@ async def _stays(agent: Agent, order: Order) -> str:
     until = f"the demand stays valid until block {order.deadline:,}"
     try:
         async with asyncio.timeout(STOP_TIMEOUT):
-            blocks = order.deadline - await agent.parts.chain.block_number()
-            seconds = blocks * (await agent.parts.chain.node.heads.block_time(blocks) or 0)
+            chain = agent.parts.chain
+            blocks = order.deadline - await chain.contract_block()
+            seconds = blocks * (await chain.node.contract_blocks.seconds(blocks) or 0)
     except (AiraError, TimeoutError):
         seconds = 0
     about = f", for about {plural(round(seconds / 60) or 1, 'minute')}" if seconds > 0 else ""

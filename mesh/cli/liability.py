@@ -211,7 +211,7 @@ def refund_words(refund: RefundState) -> str:
     """When the promisee can get a refund, for people."""
     if refund.is_refundable:
         return "possible now: `aira liability cancel --refund`"
-    blocks = refund.refundable_from - refund.block_number
+    blocks = refund.refundable_from - refund.contract_block
     return f"possible from block {refund.refundable_from:,}, in {plural(blocks, 'block')}"
 
 

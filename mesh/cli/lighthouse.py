@@ -72,7 +72,7 @@ async def info(settings: Settings, name: str | None, as_json: bool) -> None:
     name = name or settings.lighthouse_contract
     async with open_chain(settings) as chain:
         state = await chain.lighthouses.get(await find_lighthouse(chain, name))
-        block = await chain.block_number()
+        block = await chain.contract_block()
         may_send = {provider: await chain.lighthouses.is_turn(state.address, provider) for provider in state.stakes}
     if as_json:
         facts = lighthouse_json(name, state) | {"blockNumber": block}

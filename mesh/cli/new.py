@@ -33,6 +33,8 @@ class ProjectKind(NamedTuple):
     """Folders of templates besides its own."""
     dev_extras: str = "testing,web"
     command: str = "python $module.py"
+    variable: str = ""
+    """What the program reads from its environment besides settings, with an example: `NAME=value`."""
 
 
 MARKET: Final = """The second command runs a market with it on this machine, and prints the address of a page,
@@ -60,6 +62,14 @@ KINDS: Final = {
         "chain,ros2",
         "Work of a ROS 2 robot, for 1 XRT.",
         f"{MARKET}\n`python twin.py` is a robot without hardware. `ROS2_CONNECT` names a real robot's router. {DEPLOY}",
+        variable="ROS2_CONNECT=tcp/127.0.0.1:7448",
+    ),
+    "ros1": ProjectKind(
+        "chain",
+        "Work of a ROS 1 robot, for 1 XRT.",
+        f"{MARKET}\n`python twin.py` is a robot without hardware. `ROS_MASTER_URI` names a real robot's master.\n"
+        f"{DEPLOY} Nodes of the network of 2018 need no program: start `aira bridge ros1` beside them.",
+        variable="ROS_MASTER_URI=http://127.0.0.1:11311",
     ),
     "validator": ProjectKind(
         "chain",
@@ -97,6 +107,9 @@ def write_project(kind: str, name: str, module: str, target: Path) -> None:
     words = chosen._asdict() | {"name": name, "module": module, "version": version("aira-mesh")}
     words |= {"title": name.replace("-", " ").capitalize()}
     words = {key: Template(value).safe_substitute(words) for key, value in words.items() if isinstance(value, str)}
+    variable, _, value = chosen.variable.partition("=")
+    words["unit_variable"] = f"\nEnvironment={chosen.variable}" if variable else ""
+    words["compose_variable"] = f"\n      {variable}: $" + f"{{{variable}:?as in {value}}}" if variable else ""
     words["command_list"] = "[" + ", ".join(f'"{word}"' for word in words["command"].split()) + "]"
     for source in (
         path for part in (*chosen.parts, kind) for path in sorted((TEMPLATES / part).rglob("*")) if path.is_file()

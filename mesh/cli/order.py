@@ -45,7 +45,7 @@ async def list_orders(settings: Settings, as_json: bool) -> None:
 
     address = await asyncio.to_thread(required_address, settings)
     async with open_chain(settings) as chain:
-        head = await chain.block_number()
+        head = await chain.contract_block()
         found = []
         for stored in await _stored_orders(settings, chain, address):
             message: Any = decode(stored.payload)

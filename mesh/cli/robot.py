@@ -10,7 +10,7 @@ import msgspec
 
 from mesh.cli.chain_client import own_address
 from mesh.cli.options import AmountText, with_json, with_settings
-from mesh.cli.output import print_facts, print_json, printable
+from mesh.cli.output import plural, print_facts, print_json, printable
 from mesh.errors import InputError
 from mesh.settings import NetworkSettings
 from schemas.records import ControlRobot, RobotControl
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.settings import Settings
+    from schemas.records import NotifyTarget
 
 
 @click.group("robot")
@@ -104,9 +105,14 @@ async def _control(settings: Settings, robot: str | None, asked: ControlRobot, *
         "takes": takes,
         "refuses": printable(", ".join(control.refuse)) or "nobody",
         "least price": printable(control.least_price) or "any",
+        "tells": printable(", ".join(map(_target, control.notify))) or "nobody",
         "done": printable(control.stopped) or None,
     }
     print_facts(facts)
+
+
+def _target(one: NotifyTarget) -> str:
+    return f"{one.target} ({plural(one.waiting, 'event')} waiting)" if one.waiting else one.target
 
 
 async def _address(settings: Settings, robot: str) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import secrets
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, TypeAlias, cast
 
+from mesh.base.file_locks import lock, try_lock
 from mesh.base.private_files import open_private
 from mesh.content._errors import StoreFull
 
@@ -63,9 +63,8 @@ class TemporaryFile:
         """The file at `path`, created if it does not exist, or None if another writer has it locked."""
         descriptor = open_private(path, os.O_RDWR | os.O_CREAT)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            same = os.fstat(descriptor).st_ino == os.stat(path).st_ino
-        except (BlockingIOError, FileNotFoundError):
+            same = try_lock(descriptor) and os.fstat(descriptor).st_ino == os.stat(path).st_ino
+        except FileNotFoundError:
             same = False
         if same:
             return cls(path, descriptor)
@@ -96,8 +95,9 @@ class TemporaryFile:
             self._unwritten += len(data)
             if self._unwritten >= _WRITE_BEHIND:
                 self._unwritten = 0
-                # Starts the write-back now, so that `finish` does not wait for all of a large file.
-                os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+                if hasattr(os, "posix_fadvise"):  # macOS has none
+                    # Starts the write-back now, so that `finish` does not wait for all of a large file.
+                    os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
 
     def read(self, length: int, *, offset: int) -> bytes:
         """The bytes from `offset`; fewer than `length` at the end of the file."""
@@ -133,7 +133,7 @@ def directory_lock(directory: Path) -> Iterator[None]:
     """Hold the exclusive lock of the directory, waiting for any other process or thread that has it."""
     descriptor = open_private(directory / ".lock", os.O_RDWR | os.O_CREAT)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        lock(descriptor)
         yield
     finally:
         os.close(descriptor)

@@ -17,7 +17,6 @@ Above the quota the least recently used files are evicted first, pinned ones nev
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import io
 import logging
@@ -34,11 +33,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Self, cast
 
 from mesh.base.database import SyncedDatabase
+from mesh.base.file_locks import is_locked, lock_shared, try_lock
 from mesh.base.log_context import log_event
 from mesh.base.private_files import (
     PRIVATE_FILE,
     PRIVATE_FOLDER,
-    is_locked,
     make_private_folder,
     open_private,
     sync_directory,
@@ -315,7 +314,7 @@ class Store:
                 in_use = open_private(self.directory / _IN_USE, os.O_RDWR | os.O_CREAT)
                 failed = opened.enter_context(ExitStack())
                 failed.callback(os.close, in_use)
-                fcntl.flock(in_use, fcntl.LOCK_SH)
+                lock_shared(in_use)
                 self._index = self._open_index(in_use)
                 failed.callback(self._index.close)
                 self._delete_leftovers()
@@ -707,13 +706,11 @@ class Store:
         except sqlite3.DatabaseError as error:
             event = log_event("content-index-rebuilt", path=path, error=error)
             log.warning("the block index %s is unusable (%s) and will be rebuilt", path, error, extra=event)
-        try:
-            fcntl.flock(in_use, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise _damaged(path, "is unusable, and other processes use it") from None
+        if not try_lock(in_use):
+            raise _damaged(path, "is unusable, and other processes use it")
         for suffix in ("", "-wal", "-shm"):
             path.with_name(path.name + suffix).unlink(missing_ok=True)
-        fcntl.flock(in_use, fcntl.LOCK_SH)
+        lock_shared(in_use)
         return BlockIndex(path)
 
     def _delete_leftovers(self) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from mesh.base.background import call_in_loop
 from mesh.base.extras import needs_extra
 from mesh.dev._rpc import CHANGES, LIMIT_EXCEEDED, RUNS, RpcError
 from mesh.errors import ClosedError
@@ -66,6 +68,10 @@ class EmbeddedChain:
         self._evm: Evm | None = None
         self._methods: Methods | None = None
         self._clock: asyncio.Task[None] | None = None
+        self._listeners: dict[Callable[[Any], None], Callable[[Any], None]] = {}
+        """Who is told of each new block, and how, from any thread."""
+        self._pushed: Any = None
+        """The block that they were told last."""
         self._funded_keys: tuple[bytes, ...] = ()
         self.provider = EmbeddedProvider(self)
 
@@ -108,6 +114,20 @@ class EmbeddedChain:
         """Mine that many empty blocks."""
         await self.request("evm_mine", [blocks])
 
+    def push_heads(self, on_head: Callable[[Any], None]) -> None:
+        """From now on call `on_head` in this event loop with each new block (JSON), and first with the latest.
+
+        It is called before who changed the chain has the answer, and now and then again with the same block.
+        """
+        if on_head not in self._listeners:
+            push = self._listeners[on_head] = partial(call_in_loop, asyncio.get_running_loop(), on_head)
+            if self._pushed is not None:
+                push(self._pushed)
+
+    def end_pushes(self, on_head: Callable[[Any], None]) -> None:
+        """Call it no more."""
+        self._listeners.pop(on_head, None)
+
     async def request(self, method: str, params: Any) -> Any:
         """The result of a JSON-RPC method. Raises `RpcError` for what the node refuses."""
         if self._requests >= self._max_requests:
@@ -115,7 +135,7 @@ class EmbeddedChain:
         self._requests += 1
         try:
             does = "changes" if method in CHANGES else "runs" if method in RUNS else "reads"
-            return await self._in_thread(does, lambda: self._opened().answer(method, params))
+            return await self._in_thread(does, lambda: self._answer(does, method, params))
         finally:
             self._requests -= 1
 
@@ -131,6 +151,18 @@ class EmbeddedChain:
         if self._evm is not None and self._evm.head == 0:
             self._start(HISTORY)
 
+    def _answer(self, does: str, method: str, params: Any) -> Any:
+        try:
+            return self._opened().answer(method, params)
+        finally:
+            if does == "changes":
+                self._push()
+
+    def _push(self) -> None:
+        self._pushed = self._opened().answer("eth_getBlockByNumber", ["latest"])
+        for push in tuple(self._listeners.values()):
+            push(self._pushed)
+
     def _opened(self) -> Methods:
         if self._methods is None:
             raise ClosedError("the embedded chain is closed")
@@ -144,18 +176,25 @@ class EmbeddedChain:
     async def _mine_by_time(self, seconds: float) -> None:
         while True:
             await asyncio.sleep(seconds)
-            if seconds < 1 or self._evm is None:
+            if seconds < 1:
                 await self.mine()
             else:
-                await self._in_thread("changes", self._evm.mine_on_time)
+                await self._in_thread("changes", self._mine_on_time)
+
+    def _mine_on_time(self) -> None:
+        if self._evm is not None:
+            self._evm.mine_on_time()
+            self._push()
 
 
 class EmbeddedProvider:
-    """The transport of requests to an `EmbeddedChain`."""
+    """The transport of requests to an `EmbeddedChain`, which pushes each block at once."""
 
     def __init__(self, chain: EmbeddedChain) -> None:
         self._chain = chain
         self.in_the_past = chain.in_the_past
+        self.push_heads = chain.push_heads
+        self.end_pushes = chain.end_pushes
 
     async def make_request(self, method: str, params: Any) -> Any:
         """A JSON-RPC response with the result or the error."""

@@ -251,8 +251,9 @@ class LiabilityEvents:
             self._settle_again(message)
         self._parts.store.settle_sent(self._parts.orders.versions.expire(block), block)
         self._parts.orders.confirm(block)
-        self._parts.withdrawals.expire(block - self._parts.chain.node.timing.reorg_depth)
-        for order in self._parts.orders.book.expire(block):
+        contract_block = self._parts.head.contract_block
+        self._parts.withdrawals.expire(contract_block - self._parts.chain.node.timing.reorg_depth)
+        for order in self._parts.orders.book.expire(contract_block):
             self._parts.forget(order)  # its deadline may be later than the book's limit
             facts = {"order": order.hash.hex(), "signer": order.signer}
             log.info("expired order %(order)s of %(signer)s", facts, extra=log_event("order-expired", **facts))

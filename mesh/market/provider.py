@@ -223,10 +223,11 @@ class Provider(Role):
     async def _open(self, stack: AsyncExitStack) -> None:
         timing, options = self._chain.node.timing, self._options
         address, latest = await self._chain.names.address(self._lighthouse), await self._chain.block_number()
-        head = self.head = ChainHead(max(latest - timing.reorg_depth, 0))  # blocks that may be replaced are read again
+        start = max(latest - timing.reorg_depth, 0)  # blocks that may be replaced are read again
+        head = self.head = await ChainHead.at(self._chain, start)
         stack.enter_context(self._store)
         stack.enter_context(self.withdrawals)
-        self.withdrawals.expire(head.head)
+        self.withdrawals.expire(head.contract_block)
         self.orders = Orders(
             address,
             depth=timing.reorg_depth,
@@ -234,7 +235,7 @@ class Provider(Role):
             limit=options.limit,
             deadline_limit=options.deadline_limit,
         )
-        self.book.expire(head.head)
+        self.book.expire(head.contract_block)
         await self._restore(latest)
         self.free = FreeContracts(
             self.address,
@@ -248,7 +249,7 @@ class Provider(Role):
         self.queue = TransactionQueue(
             self._chain,
             address,
-            head=lambda: head.head,
+            head=lambda: head.contract_block,
             earnings=self.ledger,
             lookups=lookups,
             retry=options.retry,
@@ -261,7 +262,7 @@ class Provider(Role):
                 address=address,
                 resolver=self._chain.names.address,
                 validators=self._chain.validators.settled,
-                head=lambda: head.head,
+                head=lambda: head.contract_block,
                 blocked=options.blocked,
                 drops=self.drops,
             )

@@ -116,7 +116,7 @@ class Turns:
         before = (providers.index(self._provider) - providers.index(state.current)) % len(providers)
         # After two timeouts the contract lets all of them send. Those far behind don't wait for each silent one.
         behind = min(max(before - 2, 0), state.timeout_blocks)
-        return await self._chain.block_number() - since >= min(before, 2) * state.timeout_blocks + behind
+        return await self._chain.contract_block() - since >= min(before, 2) * state.timeout_blocks + behind
 
 
 log = logging.getLogger(__name__)

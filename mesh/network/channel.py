@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 from contextlib import suppress
 from contextvars import copy_context
-from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Generic, Self
 
 import zenoh
@@ -20,6 +19,7 @@ from mesh.base.flood import Drops, FairQueue, KnownSenders, Rate, RateLimiter
 from mesh.errors import ClosedError, InputError, InvalidKey
 from mesh.network import sending
 from mesh.network._validation import M, MarketRules, MessageValidator, Unresolved, message_key
+from mesh.network.presence import PresenceWatch, present_keys
 from mesh.network.pump import BATCH, Pump
 from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, lighthouse_selector, market_selector, parse_key, presence_selector
@@ -179,8 +179,6 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
             self.fail(error)
 
 
-PRESENT_LIMIT: Final = 1024
-"""Agents that a question for presence returns, at most."""
 ANSWER_TIMEOUT: Final = 5.0
 """Seconds that others have to answer a query."""
 
@@ -218,6 +216,7 @@ class Channel:
         )
         self._drops = Drops() if drops is None else drops
         self._declarations: list[Any] = []
+        self._watches: list[PresenceWatch] = []
         self._open = False
 
     async def __aenter__(self) -> Self:
@@ -231,7 +230,10 @@ class Channel:
         if not self._session.is_closed():
             for declaration in self._declarations:
                 declaration.undeclare()
+        for watch in self._watches:
+            watch.end()
         self._declarations.clear()
+        self._watches.clear()
 
     def publish(self, message: SignedMessage) -> str:
         """Put a signed message on its key, at most once and without waiting; return the key.
@@ -291,13 +293,11 @@ class Channel:
         self._check_open()
         loop, context = asyncio.get_running_loop(), copy_context()
 
-        def changed(sample: zenoh.Sample) -> None:
-            for key in _presence_keys([str(sample.key_expr)]):
-                notify = appeared if sample.kind == zenoh.SampleKind.PUT else gone
-                call_in_loop(loop, notify, key, context=context)
+        def changed(text: str, is_present: bool) -> None:
+            for key in _presence_keys([text]):
+                call_in_loop(loop, appeared if is_present else gone, key, context=context)
 
-        selector = presence_selector(self.lighthouse, role)
-        self._declarations.append(self._session.liveliness().declare_subscriber(selector, changed, history=True))
+        self._watches.append(PresenceWatch(self._session, presence_selector(self.lighthouse, role), changed))
 
     async def present(self, role: str = "*", agent: str = "*") -> list[PresenceKey]:
         """The agents that are announced on the channel now, or those in a `role`, or an `agent` (address).
@@ -306,17 +306,11 @@ class Channel:
         number of agents: ask for the role, or the agent, that matters.
         """
         self._check_open()
-        ask, selector = self._session.liveliness().get, presence_selector(self.lighthouse, role, agent)
-        handler: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(PRESENT_LIMIT)
-
-        def collect() -> list[PresenceKey]:
-            found = {str(reply.ok.key_expr) for reply in islice(replies, PRESENT_LIMIT) if reply.ok is not None}
-            if more := sum(1 for _ in replies):
-                self._drops.count("presence", number=more)
-            return list(_presence_keys(sorted(found)))
-
-        replies = iter(ask(selector, handler, timeout=self.answer_timeout))
-        return await asyncio.to_thread(collect)
+        selector = presence_selector(self.lighthouse, role, agent)
+        found = await asyncio.to_thread(
+            present_keys, self._session, selector, timeout=self.answer_timeout, drops=self._drops
+        )
+        return list(_presence_keys(found))
 
     def _check_open(self) -> None:
         if not self._open:

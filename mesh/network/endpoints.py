@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import resource
 import socket
 import sys
 from dataclasses import dataclass
@@ -162,12 +161,16 @@ class Endpoints:
 
 def room_for_sessions() -> int:
     """The number of sessions for which a router may have file descriptors: by the hard limit."""
+    import resource  # Windows has none
+
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     return sys.maxsize if hard == resource.RLIM_INFINITY else max(0, hard - SPARE_DESCRIPTORS)
 
 
 def allow_sessions(count: int) -> None:
     """Raise this process's soft limit of file descriptors to what `count` sessions need, as far as it may."""
+    import resource
+
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = min(count, room_for_sessions()) + SPARE_DESCRIPTORS
     if soft != resource.RLIM_INFINITY and soft < wanted:

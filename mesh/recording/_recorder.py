@@ -11,7 +11,6 @@ another crash comes, one of the two files has all messages.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import threading
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Literal, Self, TypeAlias, get_args
 
 from mesh.base.clock import SYSTEM_CLOCK
+from mesh.base.file_locks import try_lock
 from mesh.base.log_context import log_event
 from mesh.base.private_files import make_missing_folders, open_private, sync_directory
 from mesh.errors import ClosedError
@@ -223,11 +223,9 @@ class PartialFile:
 
 def _locked(path: Path, stream: BinaryIO) -> BinaryIO:
     """The same stream, locked until it is closed. Raises `InputError` if another process has locked it."""
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    if not try_lock(stream):
         stream.close()
-        raise recording_exists(path) from None
+        raise recording_exists(path)
     return stream
 
 

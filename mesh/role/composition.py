@@ -87,7 +87,7 @@ async def open_parts(
     directory = await state_folder(settings, chain, account.address)
     opened = ledger(directory)
     await enter(opened)
-    head = ChainHead(await first_position(opened, chain, lookback=lookback))
+    head = await ChainHead.at(chain, await first_position(opened, chain, lookback=lookback))
     network, channel = await enter(connected(settings, chain, head, drops))
     store = await open_store(stack, settings, directory.parent / "content", limit=settings.objective_expanded_limit)
     return RoleParts(
@@ -132,7 +132,7 @@ async def connected(
             address=await chain.names.address(settings.lighthouse_contract),
             resolver=chain.names.address,
             validators=chain.validators,
-            head=lambda: head.head,
+            head=lambda: head.contract_block,
             blocked=blocklist_at(settings.blocked_signers),
             drops=drops,
             answer_timeout=settings.answer_timeout,

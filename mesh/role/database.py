@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import sqlite3
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from mesh.base.database import DISK_ERRORS, SyncedDatabase
 from mesh.errors import ClosedError, ConfigurationError
@@ -18,9 +18,6 @@ from mesh.errors import ClosedError, ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
-
-VERSION: Final = 1
-"""The format of these files."""
 
 
 class LedgerUnusable(ConfigurationError, code="ledger-unusable"):
@@ -33,24 +30,6 @@ class LedgerUnusable(ConfigurationError, code="ledger-unusable"):
         self.why = str(why)
 
 
-def check_format(path: Path, version: int) -> None:
-    """Raise `ConfigurationError` for a ledger of a newer version of its format."""
-    if version > VERSION:
-        raise ConfigurationError(
-            f"the ledger {path} was written by a newer version (format {version}, this one knows {VERSION})",
-            hint="upgrade aira-mesh",
-            code="ledger-too-new",
-        )
-
-
-class _LedgerFile(SyncedDatabase):
-    def _prepare(self, database: sqlite3.Connection) -> None:
-        assert self.path is not None
-        check_format(self.path, database.execute("PRAGMA user_version").fetchone()[0])
-        super()._prepare(database)
-        database.execute(f"PRAGMA user_version = {VERSION}")
-
-
 class Database:
     """The database in the file at `path`, with the tables of `schema`. Calls run in order.
 
@@ -59,7 +38,7 @@ class Database:
 
     def __init__(self, path: Path, schema: str) -> None:
         self._path = path
-        self._file = _LedgerFile(path, schema)
+        self._file = SyncedDatabase(path, schema)
         self._using = asyncio.Lock()
         self._needed = 0
         """The number of the last write that must not be lost."""

@@ -53,13 +53,27 @@ log = logging.getLogger(__name__)
 
 
 class ChainHead:
-    """How far a role has handled the chain: the number of its last block, and when that was."""
+    """How far a role has handled the chain: the number of its last block, and when that was.
 
-    def __init__(self, head: int) -> None:
+    Events and reorganisations are of blocks of the chain, so compare them with `head`. Deadlines, refunds and turns are
+    of blocks as contracts count them (`ContractBlocks`), so compare these with `contract_block`.
+    """
+
+    def __init__(self, head: int, contract_block: int | None = None) -> None:
         self._advanced = asyncio.Event()
         self.head = head
-        self.advance_to(head)
+        self.advance_to(head, contract_block)
         self._handled = -1
+
+    @classmethod
+    async def at(cls, chain: Chain, block: int) -> ChainHead:
+        """That of a role which begins after `block`. Raises the errors of the node."""
+        return cls(block, await chain.node.contract_blocks.last(block))
+
+    @property
+    def contract_block(self) -> int:
+        """The number of the last block as contracts count it."""
+        return self.head if self._other is None else self._other
 
     def begin_after(self, block: int) -> None:
         """All blocks up to `block` were handled in earlier runs, or are older than this role."""
@@ -67,9 +81,10 @@ class ChainHead:
         self.head = max(self.head, block)
         self._advance()
 
-    def advance_to(self, block: int) -> None:
+    def advance_to(self, block: int, contract_block: int | None = None) -> None:
         """All of `block` has been handled. After a reorganisation it may be lower than before."""
         self.head = self._handled = block
+        self._other = None if contract_block == block else contract_block
         self.advanced_at = time.monotonic()
         self._advance()
 
@@ -155,7 +170,8 @@ async def follow_chain(
             async with aclosing(blocks):
                 async for block in blocks:
                     await _take_block(role, read, block, history, store)
-                    head.advance_to(block.block_number)
+                    contract_block = await chain.node.contract_blocks.last(block.block_number)
+                    head.advance_to(block.block_number, contract_block)
                     await role.on_head(block.block_number)
                     backoff.reset()
         except (NodeUnreachable, RequestRefused, NotALiability, NoContracts) as error:

@@ -66,13 +66,38 @@ class _NodeLine:
 
     def __init__(self, node: EmbeddedChain) -> None:
         self._node = node
-        self.is_down = False
+        self._told: set[Callable[[Any], None]] = set()
+        """Who is told of new blocks."""
+        self._is_down = False
 
     async def make_request(self, method: str, params: Any) -> Any:
         """The node's response. Raises `ConnectionRefusedError` while the node is down."""
-        if self.is_down:
+        if self._is_down:
             raise ConnectionRefusedError("the node is down")
         return await self._node.provider.make_request(method, params)
+
+    def push_heads(self, on_head: Callable[[Any], None]) -> None:
+        """See `PushingTransport`."""
+        if not self._is_down:
+            self._told.add(on_head)
+            self._node.push_heads(on_head)
+
+    def end_pushes(self, on_head: Callable[[Any], None]) -> None:
+        """See `PushingTransport`."""
+        self._told.discard(on_head)
+        self._node.end_pushes(on_head)
+
+    @contextmanager
+    def down(self) -> Iterator[None]:
+        """Meanwhile the node answers nobody."""
+        self._is_down = True
+        for on_head in tuple(self._told):
+            self.end_pushes(on_head)
+            on_head(None)
+        try:
+            yield
+        finally:
+            self._is_down = False
 
     def __str__(self) -> str:
         return "the node of the market"
@@ -89,7 +114,8 @@ class MarketChain(Lifecycle):
 
     def __init__(self) -> None:
         self.node = EmbeddedChain()
-        self._line = _NodeLine(self.node)
+        self.line: Final = _NodeLine(self.node)
+        """The way of all programs to it."""
         self._market: DevelopmentMarket | None = None
         self._numbers = count(1)
 
@@ -109,7 +135,7 @@ class MarketChain(Lifecycle):
 
     def chain(self, account: Account) -> Chain:
         """The chain for an account, not yet open."""
-        return Chain(self._line, account=account, ens=self.market.deployment.ens, timing=TIMING)
+        return Chain(self.line, account=account, ens=self.market.deployment.ens, timing=TIMING)
 
     def new_account(self) -> Account:
         """An account that was never used; the accounts of each run are the same, in the same order."""
@@ -122,7 +148,7 @@ class MarketChain(Lifecycle):
     async def fund(self, chain: Chain, *addresses: str) -> None:
         """Give accounts `ALLOWANCE` and `ETHER`; `chain` is that of the bank."""
         for address in addresses:
-            transfer = {"from": self._bank.address, "to": address, "value": hex(ETHER)}
+            transfer = {"from": self._ether, "to": address, "value": hex(ETHER)}
             await self.node.request("eth_sendTransaction", [transfer])
             await chain.tokens.transfer(address, ALLOWANCE)
 
@@ -133,6 +159,11 @@ class MarketChain(Lifecycle):
     @property
     def _bank(self) -> Account:
         return Account(self.node.funded_keys[3])
+
+    @property
+    def _ether(self) -> str:
+        """The account that gives everyone ether: another one, so that nobody else uses the nonces of the bank."""
+        return Account(self.node.funded_keys[4]).address
 
 
 class Market(Lifecycle):
@@ -347,11 +378,8 @@ class Market(Lifecycle):
     @asynccontextmanager
     async def node_down(self) -> AsyncIterator[None]:
         """Meanwhile no node answers, neither the robots and people nor the provider; `mine` and `reorg` still work."""
-        self.chain._line.is_down = True
-        try:
+        with self.chain.line.down():
             yield
-        finally:
-            self.chain._line.is_down = False
 
     async def _default_customer(self) -> Agent:
         if self._customer is None:

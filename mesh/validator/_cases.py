@@ -228,7 +228,7 @@ class CaseJudge:
                         await self._file(recording, liability.address),
                     )
             except (ContentUnavailable, ContentCorrupt, StoreFull, TimeoutError) as error:
-                if until is not None and self._parts.chain_head.head >= until:
+                if until is not None and self._parts.chain_head.contract_block >= until:
                     facts = log_event("files-missing", error=type(error).__name__)
                     log.warning("not judged, it can be refunded now: %s", error, extra=facts)
                     return None

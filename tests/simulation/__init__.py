@@ -1,1 +1,1 @@
-"""A deterministic simulator of whole markets: `make simulate`, described in docs/explanation/reliability.md."""
+"""A deterministic simulator of whole markets: `make simulate`, described in docs/explanation/simulator.md."""

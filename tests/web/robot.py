@@ -66,6 +66,9 @@ async def main() -> None:
         for file in (model, *map(Path, sys.argv[3:])):
             await agent.add(file)
         print(f"robot {agent.address}", flush=True)
+        while os.environ.get("ROBOT_READS"):
+            agent.publish("/battery", round(80 + 10 * math.sin(asyncio.get_running_loop().time() / 5), 1))
+            await asyncio.sleep(0.25)
         await asyncio.Event().wait()
 
 

@@ -68,7 +68,7 @@ def test_a_no_in_the_wallet_sends_nothing(browser: Browser, site: Site) -> None:
     fill_in(browser, site)
     review(browser)
     browser.click("#sign")
-    browser.sees("You said no in the wallet")
+    browser.sees("You rejected it in the wallet")
     browser.wallet.rejects.clear()
     browser.click("#sign")
     browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")

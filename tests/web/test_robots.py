@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import sys
+import threading
 import urllib.request
-from typing import TYPE_CHECKING
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TYPE_CHECKING, Any
 from urllib.error import HTTPError
 
 import pytest
@@ -23,22 +27,53 @@ if TYPE_CHECKING:
     from tests.web.conftest import Site
 
 
-@pytest.fixture(scope="module")
-def scout(site: Site) -> Iterator[str]:
-    """A second robot of the model, which has a name and is cheaper; gives its address."""
-    keyfile, data = site.folder / "scout.json", site.folder / "scout"
+LOOKS = [
+    (f"{name}-{'dark' if dark else 'light'}", size, dark)
+    for name, size in (("desktop", DESKTOP), ("phone", PHONE))
+    for dark in (False, True)
+]
+"""Screens on which a page is looked at."""
+
+
+@contextmanager
+def named_robot(site: Site, name: str, **variables: str) -> Iterator[str]:
+    """A further robot of the model; gives its address."""
+    keyfile, data = site.folder / f"{name}.json", site.folder / name
     password = site.variables["AIRA_KEYFILE_PASSWORD_FILE"]
     address = str(aira("account", "new", keyfile, "--password-file", password).stdout.strip())
-    variables = site.variables | {
-        "AIRA_KEYFILE": str(keyfile),
-        "AIRA_DATA_DIR": str(data),
-        "AIRA_NAME": "Scout",
-        "AIRA_ABOUT": "Small and quick.",
-        "AIRA_OPEN_SERVICES": "true",
-        "ROBOT_PRICE": "2.5 XRT",
-    }
+    own = {"AIRA_KEYFILE": str(keyfile), "AIRA_DATA_DIR": str(data), "AIRA_NAME": name, "AIRA_OPEN_SERVICES": "true"}
     robot = (sys.executable, HERE / "robot.py", site.folder / "model.json")
-    with Serving(*robot, says="robot 0x", variables=variables):
+    with Serving(*robot, says="robot 0x", variables=site.variables | own | variables):
+        yield address
+
+
+@pytest.fixture(scope="module")
+def told() -> Iterator[tuple[str, list[Any]]]:
+    """A server of an owner: its URL, and the events that it has got."""
+    taken: list[Any] = []
+
+    class Receiver(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            taken.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Say nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Receiver) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}/robots", taken
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def scout(site: Site, told: tuple[str, list[Any]]) -> Iterator[str]:
+    """A robot that is cheaper, and whose owner is told what happens to it; gives its address."""
+    about = {"AIRA_ABOUT": "Small and quick.", "ROBOT_PRICE": "2.5 XRT"}
+    with named_robot(site, "Scout", AIRA_NOTIFY=told[0], **about) as address:
         yield address
 
 
@@ -93,7 +128,9 @@ def test_a_wallet_orders_from_one_robot_and_stops_it(browser: Browser, site: Sit
     assert facts(site, f"liabilities/{job}")["liability"]["promisor"] == scout
 
 
-def test_an_owner_changes_the_price_pauses_and_reads_the_income(site: Site, scout: str, pictures: Path) -> None:
+def test_an_owner_changes_the_price_sees_the_notification_and_its_job_and_downloads_the_statement(
+    site: Site, scout: str, told: tuple[str, list[Any]], pictures: Path
+) -> None:
     with site.page(keyfile=True) as url, Browser(url) as browser:
         browser.go(f"order/model/{site.model}/{scout}")
         browser.type("Duration", "1")
@@ -101,16 +138,29 @@ def test_an_owner_changes_the_price_pauses_and_reads_the_income(site: Site, scou
         browser.click("#order:not([disabled])")
         browser.click("#sign")
         browser.sees("the robot was paid")
+        job = browser.driver.current_url
         browser.go(f"robot/{scout}")
-        browser.type("Works for no less than", "3")
+        browser.type("Price of a job", "3")
+        browser.click("#set-price")
+        browser.until(lambda: browser.find(".hero .price-tag").text == "3 XRT", "the new price")
+        browser.until(lambda: "Job paid" in browser.find(".events li").text, "the notification")
+        browser.sees("They are sent to 127.0.0.1.")
+        browser.until(lambda: told[1] and told[1][-1]["type"] == "aira.job-paid", "the owner's event")
+        assert job.endswith(told[1][-1]["subject"])
+        browser.press("Show the job")
+        browser.sees("the robot was paid")
+        assert browser.driver.current_url == job
+        browser.driver.back()
+        browser.type("Lowest price it accepts", "3")
         browser.click("#set-least")
         browser.sees("Saved.")
         browser.click("#pause")
-        browser.sees("It finishes what it has, and takes nothing new.")
+        browser.sees("It finishes its jobs and takes no new ones.")
         browser.sees("takes no jobs now")
         browser.until(lambda: "2.5 XRT" in browser.find(".owner .lead").text, "the income")
-        for look, size in (("desktop", DESKTOP), ("phone", PHONE)):
+        for look, size, dark in LOOKS:
             browser.resize(size)
+            browser.set_dark(dark)
             check(browser, pictures / f"owner-{look}.png")
         with urllib.request.urlopen(browser.find("#statement").get_attribute("href") or "", timeout=30) as answer:
             rows = list(csv.DictReader(io.StringIO(answer.read().decode())))
@@ -120,3 +170,43 @@ def test_an_owner_changes_the_price_pauses_and_reads_the_income(site: Site, scou
         browser.go(f"robot/{scout}")
         browser.click("#pause")
         browser.sees("It takes jobs.")
+
+
+def test_a_robot_that_left_stands_as_away_with_what_it_read_and_did_before_anybody_looked(
+    site: Site, pictures: Path
+) -> None:
+    with site.page() as url, Browser(url, site.wallet()) as browser:
+        with named_robot(site, "Rover", ROBOT_READS="1") as rover:
+            browser.go("jobs")  # the server is looked at, and the robot is not
+            browser.until(lambda: charges(url, rover), "readings that nobody has asked for")
+            before = charges(url, rover)
+            browser.go()
+            browser.sees("Rover")
+            browser.connect()
+            fill_in(browser, site)
+            browser.click(f".quote [value='{rover}']")
+            job = sign(browser)
+            browser.sees("the robot was paid")
+            browser.go()
+        browser.sees("away since")
+        assert not browser.all(f".robots a[href*='{rover}']")
+        for look, size, dark in LOOKS:
+            browser.resize(size)
+            browser.set_dark(dark)
+            check(browser, pictures / f"away-{look}.png")
+        browser.press("Rover")
+        browser.sees("What it read last")
+        browser.find(".tracks canvas")
+        assert charges(url, rover)[: len(before)] == before
+        browser.find(f".list-row[href='#/job/{job}']")
+        assert not browser.all("a[href*='#/order/model/']")
+        for look, size, dark in LOOKS:
+            browser.resize(size)
+            browser.set_dark(dark)
+            check(browser, pictures / f"robot-away-{look}.png")
+
+
+def charges(url: str, robot: str) -> list[float]:
+    """What the robot's battery had, as the page's server knows it; the last ones may still be replaced."""
+    with urllib.request.urlopen(f"{url}/api/v1/agents/{robot}/readings", timeout=30) as answer:
+        return [sample["value"] for sample in json.load(answer)["readings"].get("/battery", ())][:-2]

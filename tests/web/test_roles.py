@@ -112,7 +112,7 @@ def test_an_allowance_that_the_wallet_refuses_can_be_given_later(site: Site) -> 
         browser.connect()
         fill_in(browser, site)
         browser.click("#allow")
-        browser.sees("You said no in the wallet")
+        browser.sees("You rejected it in the wallet")
         wallet.rejects.clear()
         browser.click("#allow")
         browser.click("#order:not([disabled])")

@@ -35,6 +35,7 @@ async function tests() {
     bundle: true,
     platform: "node",
     format: "esm",
+    external: ["esbuild"],
     outdir: "node_modules/.tests",
     outExtension: { ".js": ".mjs" },
     jsx: "automatic",

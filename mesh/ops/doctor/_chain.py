@@ -363,7 +363,7 @@ class AccountChecks:
         """Whose turn it is at the lighthouse."""
         chain = self._chain_checks.chain
         state = await chain.lighthouses.get(self._context.settings.lighthouse_contract)
-        block, providers = await chain.block_number(), list(state.stakes)
+        block, providers = await chain.contract_block(), list(state.stakes)
         if state.current == self.address:
             return passed(f"its own, with {state.quota:,} transactions left", code="own-turn")
         place = f"{providers.index(state.current) + 1} of {len(providers)}" if state.current in providers else "left"

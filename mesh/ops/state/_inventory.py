@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 import msgspec
 
 from mesh.agent.ledger import UNFINISHED, Ledger
+from mesh.base.database import check_format
 from mesh.content import Store
 from mesh.content.store import is_in_use
 from mesh.ops.state._archive import (
@@ -32,7 +33,7 @@ from mesh.ops.state._archive import (
     read_archive,
     transactions_in,
 )
-from mesh.role.database import LedgerUnusable, check_format
+from mesh.role.database import LedgerUnusable
 from mesh.validator.ledger import VerdictLedger
 from schemas import Demand, Offer, decode
 
@@ -122,7 +123,7 @@ def copy_ledger(ledger: Path, copy: Path) -> None:
     """
     try:
         with closing(sqlite3.connect(f"{ledger.resolve().as_uri()}?mode=ro", uri=True)) as source:
-            _check_version(source, ledger)
+            check_format(ledger, source)
             copy.unlink(missing_ok=True)
             with closing(sqlite3.connect(copy)) as target:
                 source.backup(target)
@@ -139,7 +140,7 @@ def check_ledger(ledger: Path) -> None:
             (found,) = database.execute("PRAGMA integrity_check(1)").fetchone()
             if found != "ok":
                 raise LedgerUnusable(ledger, found)
-            _check_version(database, ledger)
+            check_format(ledger, database)
             if (kind := database.execute(ACTIVE).fetchone()) is not None:
                 raise LedgerUnusable(ledger, f"it contains a {kind[0]}, which ledgers never have")
     except sqlite3.Error as error:
@@ -174,11 +175,6 @@ def locked_ledger(ledger: Path) -> Iterator[None]:
         except sqlite3.DatabaseError:
             pass  # not a ledger, or a damaged one, which no agent uses
         yield
-
-
-def _check_version(database: sqlite3.Connection, ledger: Path) -> None:
-    (version,) = database.execute("PRAGMA user_version").fetchone()
-    check_format(ledger, version)
 
 
 def _pending(table: Path) -> int:

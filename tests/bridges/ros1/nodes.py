@@ -192,6 +192,19 @@ def sensor() -> None:
     rospy.spin()
 
 
+def light() -> None:
+    """A robot with a light that can be turned on, and not off."""
+    from std_srvs.srv import SetBool, SetBoolResponse
+
+    def switch(request: SetBool) -> SetBoolResponse:
+        say({"light": request.data})
+        return SetBoolResponse(request.data, "" if request.data else "the switch is stuck")
+
+    rospy.Service("/light", SetBool, switch)
+    say("ready")
+    rospy.spin()
+
+
 if __name__ == "__main__":
     rospy.init_node(f"test_{sys.argv[1]}", anonymous=True)
     globals()[sys.argv[1]](*sys.argv[2:])

@@ -44,9 +44,9 @@ async def triggered(_request: Mapping[str, Any], caller: str) -> dict[str, Any]:
 async def test_the_tools_of_ros_show_and_call_our_node(graph: Opened, ros: Callable[[str], Ros]) -> None:
     """rosnode, rostopic, rosservice and rosparam on our own master."""
     async with graph() as here, Ros1Node(here, "/liability/executor") as node:
-        publisher = await node.advertise("/liability/ready", {TEXT.md5: TEXT}, TEXT.md5)
+        publisher = await node.advertise("/liability/ready", TEXT)
         publisher.kept["job"] = {"data": "ready"}
-        await node.serve("/liability/start", {TRIGGER.md5: TRIGGER}, TRIGGER.md5, triggered)
+        await node.serve("/liability/start", TRIGGER, triggered)
         tools = ros(here.master)
         await tools.run("rosparam", "set", "/liability/executor/recording_topics", "{a: [1, 2]}")
         shown = await asyncio.gather(
@@ -75,7 +75,7 @@ async def test_rospy_hears_us_and_we_hear_it(rosmaster: RosMasterServer, ros: Ca
         there.node("listener", "/both/told") as listener,
     ):
         await node.subscribe("/both/said", "std_msgs/String", lambda data, _: heard.append(TEXT.decode(data)["data"]))
-        publisher = await node.advertise("/both/told", {TEXT.md5: TEXT}, TEXT.md5)
+        publisher = await node.advertise("/both/told", TEXT)
         assert await talker.hear() == "ready"
         assert await publisher.wait_for_subscriber(20)
         publisher.publish({"data": "hello"})
@@ -91,9 +91,9 @@ async def test_three_generations_listen_to_one_topic(
     graph: Opened, ros: Callable[[str], Ros], messages: dict[str, Path]
 ) -> None:
     """Each connection gets the version that it asks for."""
-    versions = message_types()["robonomics_msgs/Demand"]
+    versions = tuple(message_types()["robonomics_msgs/Demand"].values())
     async with graph() as here, Ros1Node(here, "/channel") as node, AsyncExitStack() as stack:
-        demands = await node.advertise("/demand", versions, next(iter(versions)))
+        demands = await node.advertise("/demand", versions[0], versions)
         demands.kept["one"] = {"model": "Qm", "cost": 42}
         tools = ros(here.master)
         nodes = [
@@ -110,7 +110,7 @@ async def test_three_generations_listen_to_one_topic(
 async def test_our_services_and_clients_understand_each_other(graph: Opened) -> None:
     """An error of a handler is the caller's error; so is a service that nobody offers."""
     async with graph() as here, Ros1Node(here, "/server") as server, Ros1Node(here, "/failing") as failing:
-        await server.serve("/trigger", {TRIGGER.md5: TRIGGER}, TRIGGER.md5, triggered)
+        await server.serve("/trigger", TRIGGER, triggered)
         assert await server.call("/trigger", TRIGGER, {}) == ANSWER
         with pytest.raises(Ros1Error, match="not for you"):
             await failing.call("/trigger", TRIGGER, {})
@@ -121,10 +121,10 @@ async def test_our_services_and_clients_understand_each_other(graph: Opened) -> 
 async def test_a_node_of_the_same_name_shuts_the_first_one_down(graph: Opened) -> None:
     """As the master of ROS does it."""
     async with graph() as here, Ros1Node(here, "/twin") as first:
-        await first.advertise("/a", {TEXT.md5: TEXT}, TEXT.md5)
+        await first.advertise("/a", TEXT)
         there = Ros1Graph(here.master)
         async with Ros1Node(there, "/twin") as second:
-            await second.advertise("/b", {TEXT.md5: TEXT}, TEXT.md5)
+            await second.advertise("/b", TEXT)
             await until(here.ended.is_set, what="the end of the first one")
             assert await there.call("lookupNode", "/twin") == second.uri
 
@@ -134,7 +134,7 @@ async def test_nodes_are_registered_again_after_a_restart_of_the_master(rosmaste
     here = Ros1Graph(rosmaster.uri)
     async with Ros1Node(here, "/again") as node:
         watching = asyncio.create_task(here.watch())
-        await node.advertise("/again/topic", {TEXT.md5: TEXT}, TEXT.md5)
+        await node.advertise("/again/topic", TEXT)
         rosmaster.kill()
         await asyncio.to_thread(rosmaster.start)
 
@@ -149,7 +149,7 @@ async def test_a_subscriber_that_does_not_read_loses_messages_and_holds_up_nobod
     """What waits for it is bounded."""
     heard = list[int]()
     async with graph() as here, Ros1Node(here, "/fast") as node:
-        publisher = await node.advertise("/big", {TEXT.md5: TEXT}, TEXT.md5)
+        publisher = await node.advertise("/big", TEXT)
         there = Ros1Graph(here.master)
         async with Ros1Node(there, "/reader") as reader:
             await reader.subscribe("/big", "std_msgs/String", lambda data, _: heard.append(len(data)))
@@ -187,7 +187,7 @@ HOSTILE = {
 async def test_what_is_malformed_ends_its_own_connection_only(graph: Opened, name: str) -> None:
     """It is counted, and others are served."""
     async with graph() as here, Ros1Node(here, "/stout") as node:
-        await node.serve("/trigger", {TRIGGER.md5: TRIGGER}, TRIGGER.md5, triggered)
+        await node.serve("/trigger", TRIGGER, triggered)
         reader, writer = await asyncio.open_connection(*place_of(node.uri))
         writer.write(HOSTILE[name])
         async with asyncio.timeout(20):
@@ -232,7 +232,7 @@ async def test_a_flood_is_one_line_in_the_log_and_keeps_nobody_out(
     """A thousand connections of each kind: what they take is bounded, and others are served."""
     caplog.set_level(logging.INFO)
     async with graph() as here, Ros1Node(here, "/stout") as node:
-        await node.serve("/trigger", {TRIGGER.md5: TRIGGER}, TRIGGER.md5, triggered)
+        await node.serve("/trigger", TRIGGER, triggered)
         tracemalloc.start()
         strangers = [await asyncio.open_connection(*place_of(node.uri)) for _ in range(1000)]
         for _, writer in strangers:
@@ -258,7 +258,7 @@ async def test_rosbag_records_our_topics_and_plays_to_our_node(
     heard = list[str]()
     bag = tmp_path / "recorded.bag"
     async with graph() as here, Ros1Node(here, "/said") as node, Ros1Node(Ros1Graph(here.master), "/hears") as other:
-        publisher = await node.advertise("/say", {TEXT.md5: TEXT}, TEXT.md5)
+        publisher = await node.advertise("/say", TEXT)
         publisher.kept["one"] = {"data": "hello"}
         tools = ros(here.master)
         await tools.run("rosbag", "record", "-O", str(bag), "-l", "1", "/say")

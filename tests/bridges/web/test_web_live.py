@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from bridges.web import _live
-from bridges.web._live import Samples
+from bridges.web._live import Readings, Samples
 from mesh import Job, String  # noqa: TC001  handlers are read at run time
+from mesh.recording import Played
+from schemas.payloads import PayloadType
 from tests.bridges.web.test_page_server import DATA
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
+    import pytest
     from aiohttp import ClientWebSocketResponse
 
     from tests.support.market import Place
@@ -80,22 +83,32 @@ async def test_what_a_job_publishes_is_seen_while_it_runs_and_afterwards(place: 
         await browser.get(f"liabilities/{place.address('robot')}/live", status=404)
 
 
-async def test_readings_are_kept_from_the_first_question_on(place: Place, serve: Any) -> None:
-    async with place.agent("robot") as robot, serve() as browser:
+async def test_readings_are_kept_before_anybody_looks(place: Place, serve: Any) -> None:
+    async with place.agent("robot") as robot, serve() as browser, serve() as witness:
         path = f"agents/{robot.address}/readings"
         assert (await browser.get(path))["readings"] == {}
+        async with witness.session.ws_connect(f"{witness.server.url}/api/v1/stream") as socket:
+            await socket.send_json({"subscribe": [f"readings/{robot.address}"]})
+            await socket.receive()
+            for battery in (80, 81, 82):
+                robot.publish("/battery", battery)
+            await received(socket, f"readings/{robot.address}", 3)
+
+        async def of_battery() -> Any:
+            kept = (await browser.get(path))["readings"].get("/battery", ())
+            return [sample["value"] for sample in kept] if kept and kept[-1]["value"] == 82 else None
+
+        # Of what came within a few seconds, while nobody looked here, the first and the last.
+        assert await until_found(of_battery, what="the readings") == [80, 82]
         async with browser.session.ws_connect(f"{browser.server.url}/api/v1/stream") as socket:
             await socket.send_json({"subscribe": [f"readings/{robot.address}", "readings/nobody", "live/nothing"]})
             await socket.receive()
 
-            async def heard() -> Any:
-                robot.publish("/battery", 81.5)
-                return (await browser.get(path))["readings"]
-
-            readings = await until_found(heard, what="a reading")
-            assert readings["/battery"][0]["numbers"] == [["", 81.5]]
+            robot.publish("/battery", 81.5)
             (told,) = await received(socket, f"readings/{robot.address}", 1)
             assert told["value"] == 81.5
+            readings = (await browser.get(path))["readings"]
+            assert readings["/battery"][-1]["numbers"] == [["", 81.5]]
             for number in range(20):
                 robot.publish(f"/sensor/{number}", float("nan"))
             many = "/sensor/14"
@@ -117,13 +130,6 @@ async def test_readings_are_kept_from_the_first_question_on(place: Place, serve:
 async def test_a_flood_of_one_robot_is_cut(place: Place, serve: Any) -> None:
     async with place.agent("robot") as robot, serve() as browser:
         path = f"agents/{robot.address}/readings"
-        await browser.get(path)
-
-        async def heard() -> Any:
-            robot.publish("/first", 1)
-            return (await browser.get(path))["readings"]
-
-        await until_found(heard, what="a reading")
         drops = browser.server.components.drops
         for number in range(3_000):
             robot.publish("/flood", number)
@@ -137,6 +143,54 @@ async def test_a_flood_of_one_robot_is_cut(place: Place, serve: Any) -> None:
         readings = (await browser.get(path))["readings"]
         assert len(readings["/flood"]) <= _live.READINGS
         assert len(readings.get("/picture", [])) < 20
+
+
+def reading(topic: str, second: float, payload: bytes = b"1") -> Played:
+    at = int(second * 1e9)
+    return Played(topic, payload, at, at, 0, PayloadType("json"), "device")
+
+
+def seconds_of(readings: Readings, robot: str) -> list[float]:
+    return [one.log_time_ns / 1e9 for one in readings.of(robot)["/battery"]]
+
+
+def test_readings_that_nobody_looks_at_are_sparse_and_those_somebody_looks_at_are_not() -> None:
+    viewed = set[str]()
+    readings = Readings(viewed.__contains__)
+    for second in range(13):
+        readings.add("arm", reading("/battery", second))
+    assert seconds_of(readings, "arm") == [0, 5, 10, 12]
+    viewed.add("arm")
+    for second in (13, 14):
+        readings.add("arm", reading("/battery", second))
+    assert seconds_of(readings, "arm") == [0, 5, 10, 12, 13, 14]
+    readings.add("arm", reading("/battery", 13 + _live.READING_SECONDS))
+    assert seconds_of(readings, "arm") == [13, 14, 613]
+
+
+def test_the_readings_of_many_robots_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    readings = Readings({"0"}.__contains__)
+    for number in range(_live.ROBOTS + 1):
+        readings.add(str(number), reading("/battery", number))
+    assert readings.of("0")  # somebody looks at it
+    assert not readings.of("1")
+    assert readings.of("2")
+    for topic in range(_live.TOPICS + 1):
+        readings.add("2", reading(f"/sensor/{topic}", 1))
+    assert len(readings.of("2")) == _live.TOPICS
+    monkeypatch.setattr(_live, "ALL_READING_BYTES", readings.size + 10_000)
+    readings.add("3", reading("/picture", 1, bytes(9_000)))
+    assert readings.of("3")
+    readings.add("4", reading("/battery", 1, bytes(9_500)))
+    assert not readings.of("4")  # it had the most
+    readings.add("4", reading("/battery", 1, bytes(500)))
+    assert readings.of("4")
+    assert readings.size == sum(
+        len(one.payload) + _live.OVERHEAD
+        for robot in range(_live.ROBOTS + 1)
+        for kept in readings.of(str(robot)).values()
+        for one in kept
+    )
 
 
 def test_samples_are_the_latest_ones_in_number_and_bytes() -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 import secrets
+import time
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec.structs import replace
 
+from bridges.web import _robots
 from mesh import Demand, Verified
 from mesh.agent.errors import Declined
 from schemas import ZERO_ADDRESS, message_hash
@@ -23,6 +25,8 @@ from tests.support.objectives import objective
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
+    import pytest
+
     from tests.support.market import Place
 
 NAMED = {"name": "Arm", "about": "It moves.", "place": "Hall 3"}
@@ -75,6 +79,50 @@ async def test_robots_present_themselves_and_say_what_they_want(place: Place, se
         assert quotes[1]["detail"] == "not today"
         assert quotes[0]["until"] > 0
         await browser.post("quotes", {"model": "no CID", "objective": "neither"}, status=400)
+
+
+async def test_robots_that_have_left_are_known_as_away(
+    place: Place, serve: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = place.agent("robot", **NAMED)
+    async with place.provider(), serve("person") as browser:
+
+        async def agents() -> Any:
+            return await browser.get("agents")
+
+        async def named() -> Any:
+            return [one for one in (await agents())["agents"] if one["profile"]]
+
+        before = time.time()
+        async with working(robot):
+            await until_found(named, what="the robot")
+            wanted = {"model": MODEL, "objective": await made(browser), "cost": "7", "robot": robot.address}
+            posted = (await browser.post("local/orders", wanted, status=202))["order"]
+            job = await contract_of(browser, posted["hash"])
+
+            async def paid() -> Any:
+                return (await browser.get(f"liabilities/{job}"))["liability"]["state"] == "paid"
+
+            await until_found(paid, what="the payment")
+            assert (await agents())["away"] == []
+
+        async def gone() -> Any:
+            return (await agents())["away"]
+
+        (away,) = await until_found(gone, what="that the robot is away")
+        assert (away["address"], away["profile"]["name"], away["models"]) == (place.address("robot"), "Arm", [MODEL])
+        assert before <= away["since"] <= time.time()
+        assert away["record"]["done"] == 1
+        async with serve() as later:  # it has never seen the robot, but its contract
+
+            async def known() -> Any:
+                return (await later.get("agents"))["away"]
+
+            (away,) = await until_found(known, what="the robot of the contract")
+            assert (away["address"], away["profile"], away["record"]["done"]) == (place.address("robot"), None, 1)
+            monkeypatch.setattr(_robots, "AWAY_SECONDS", -3600.0)
+            monkeypatch.setattr(later.server.api._views, "_agents", None)
+            assert await known() == []
 
 
 async def test_an_order_for_one_robot_is_seen_by_nobody_else(place: Place, serve: Any) -> None:

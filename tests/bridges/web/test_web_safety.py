@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -13,11 +12,12 @@ from mesh.errors import ConfigurationError
 from schemas import RpcKey
 from tests.bridges.web.conftest import OWN
 from tests.bridges.web.openapi import DOCUMENT
-from tests.bridges.web.reference import reference
 from tests.support.objectives import objective
 from tests.support.waiting import until_answered
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tests.support.market import Place
 
 TOKEN = "a token of people 123"
@@ -146,7 +146,3 @@ async def test_every_route_is_documented(serve: Any) -> None:
     documented = {(method, path) for path, methods in DOCUMENT["paths"].items() for method in methods}
     assert documented - routes == {("post", "/api/v1/session")}
     assert routes <= documented
-
-
-def test_the_reference_is_that_of_the_interface() -> None:
-    assert (Path(__file__).parents[3] / "docs" / "reference" / "http.md").read_text() == reference()

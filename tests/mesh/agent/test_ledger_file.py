@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent.ledger import SCHEMA, Ledger, Phase
+from mesh.base.database import VERSION
 from mesh.errors import ClosedError, ConfigurationError
-from mesh.role.database import VERSION, Database, LedgerUnusable
+from mesh.role.database import Database, LedgerUnusable
 from tests.mesh.agent.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.agent.samples import liability, message
 from tests.support.disks import file_size_limit, synced
@@ -96,7 +97,7 @@ async def test_a_ledger_of_a_newer_version_is_refused_and_not_touched(path: Path
         pass
     mark_as_version(path, VERSION + 1)
     error = await refused(path)
-    assert error.code == "ledger-too-new"
+    assert error.code == "state-too-new"
     assert f"format {VERSION + 1}, this one knows {VERSION}" in str(error)
     assert error.hint
     assert version_of(path) == VERSION + 1

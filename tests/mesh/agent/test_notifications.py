@@ -15,7 +15,7 @@ import pytest
 from aiohttp import web
 
 from mesh import Agent, ConfigurationError, Empty, JobFailed, Settings
-from mesh.agent._notifications import QUEUED, Notifier, OwnerWatch
+from mesh.agent._notifications import QUEUED, RECENT, Notifier, OwnerWatch
 from mesh.base.retry import RetryPolicy
 from mesh.chain import Account
 from mesh.network import Endpoints, Network
@@ -106,12 +106,14 @@ async def notifying(tmp_path: Path, *targets: str, **options: Any) -> AsyncItera
 
 
 async def test_the_owner_is_told_what_becomes_of_each_job(place: Place, receiver: Receiver) -> None:
-    async with place.at_work(working(place, notify=(receiver.url,))) as person:
+    robot = working(place, notify=(receiver.url,))
+    async with place.at_work(robot) as person:
         done = await person.demand([("/go", Empty())], cost=5)
         assert (await done.outcome()).success
         failed = await person.demand([("/fail", Empty())], cost=7)
         assert not (await failed.outcome()).success
         await until(lambda: receiver.kinds()[-1:] == ["job-refunded"])
+        control = await robot.control()
 
     assert receiver.kinds() == [
         *("job-offered", "job-begun", "job-paid"),
@@ -128,6 +130,36 @@ async def test_the_owner_is_told_what_becomes_of_each_job(place: Place, receiver
         "job-failed",
     )
     assert len({event["id"] for event in receiver.taken}) == 7
+    assert [(one.event, one.about) for one in control.events[1:3]] == [
+        ("job-begun", done.address),
+        ("job-paid", done.address),
+    ]
+    assert (control.events[5].event, control.events[5].detail) == ("job-failed", "the arm is stuck")
+    assert [(one.target, one.waiting) for one in control.notify] == [("127.0.0.1", 0)]
+
+
+async def test_the_latest_events_are_remembered_also_if_nobody_is_told(tmp_path: Path) -> None:
+    async with notifying(tmp_path, notify_events=("job-paid", "robot-unreachable")) as notifier:
+        notifier.notify("job-begun", {}, about="0x1")
+        for number in range(RECENT):
+            notifier.notify("job-paid", {}, about=f"0x{number}")
+        notifier.notify("robot-unreachable", {"part": "device arm" * 100})
+        assert notifier.targets() == ()
+        assert len(notifier.recent) == RECENT
+        assert (notifier.recent[0].event, notifier.recent[0].about) == ("job-paid", "0x1")
+        assert (notifier.recent[-1].event, len(notifier.recent[-1].detail)) == ("robot-unreachable", 200)
+
+
+async def test_the_owner_sees_what_a_target_has_not_got(tmp_path: Path, receiver: Receiver) -> None:
+    receiver.broken = 503
+    async with notifying(tmp_path, receiver.url) as notifier:
+        notifier.notify("job-begun", {})
+        notifier.notify("job-paid", {})
+        await until(lambda: receiver.requests)
+        assert [(one.target, one.waiting) for one in notifier.targets()] == [("127.0.0.1", 2)]
+        receiver.broken = 0
+        await until(lambda: receiver.kinds() == ["job-begun", "job-paid"])
+        await until(lambda: notifier.targets()[0].waiting == 0)
 
 
 async def test_a_server_that_fails_gets_each_event_when_it_has_recovered_and_no_job_waits(

@@ -12,7 +12,7 @@ from mesh.agent._runtime import AgentRuntime
 from mesh.agent.errors import OrderClosed
 from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, OrderState, lifetime_of
 from mesh.chain import BlockHeader, InsufficientTokens
-from mesh.chain._node import Heads
+from mesh.chain._node import ContractBlocks, Heads
 from mesh.chain.answers import Count, Word
 from mesh.role.database import LedgerUnusable
 from schemas import Demand, Offer, Withdrawal, cid_of_bytes, decode, message_hash
@@ -267,6 +267,10 @@ class Clock:
         self.times = times
         self.node = self
         self.heads = Heads(self.latest_header, self.header, interval=1.0)
+        self.contract_blocks = ContractBlocks(self.heads, self.run_number, interval=1.0)
+
+    async def run_number(self, block: int | str) -> int:
+        return int(block)
 
     async def header(self, number: int) -> BlockHeader | None:
         if number >= len(self.times):

@@ -43,6 +43,19 @@ async def profile_of(robot: Agent, asker: Agent) -> Profile:
     return found
 
 
+async def test_a_robot_that_ends_while_its_profile_changes_ends(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`asyncio.wait_for` before Python 3.12 loses a cancellation that comes together with what it waits for."""
+    monkeypatch.setattr("mesh.agent._profile.INTERVAL", 0.0)
+    async with robot_at(place) as robot:
+        profile = robot.runtime.profile
+        watching = asyncio.create_task(profile.run())
+        await until(lambda: len(profile._changed._waiters) == 1)
+        profile.changed()
+        watching.cancel()
+        await asyncio.wait([watching], timeout=10)
+        assert watching.cancelled()
+
+
 async def test_a_robot_says_what_its_settings_and_its_model_say(place: Place) -> None:
     picture = place.save(PNG, "lift.png")
     robot = driving(robot_at(place, place.save(DRIVE.encode(), "model.json"), picture=str(picture), **LIFT))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from mesh.agent.contracts import Outcome
 from mesh.chain import InsufficientTokens, NotALiability
+from mesh.chain.liabilities import Liabilities
 from mesh.content import ContentUnavailable
 from mesh.errors import ClosedError
 from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, cid_of_file, message_hash
@@ -17,8 +19,10 @@ from tests.support.market import MODEL, Place, offering
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from mesh.agent.handlers import Job
-    from schemas import Verified
+    from schemas import Liability, Verified
 
 GENERATIONS = pytest.mark.parametrize("generation", [3, 5])
 
@@ -91,6 +95,40 @@ async def test_an_overtaken_demand_of_generation_5_is_signed_again_without_a_rej
         await until_found(lambda: all_posted(person, 1))
         lonely.cancel()
         await asyncio.wait([lonely])
+
+
+async def test_a_demand_may_become_a_contract_before_its_maker_listens_to_offers(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @asynccontextmanager
+    async def late(*_: object) -> AsyncIterator[None]:
+        await until(lambda: not person.orders())
+        yield
+
+    monkeypatch.setattr("mesh.agent.trade.seen_offers", late)
+    async with place.provider(seconds=20), working(place.agent("robot")), place.agent("person") as person:
+        contract = await person.demand(job(place), on_progress=lambda _: None)
+        assert (await contract.outcome()).success
+
+
+async def test_a_contract_may_end_while_it_is_read(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, get, released = offering(place.agent("robot")), Liabilities.get, asyncio.Event()
+
+    @robot.on("*")
+    async def wait(job: Job, message: Any) -> None:
+        await released.wait()
+
+    async def late(self: Liabilities, address: str) -> Liability:
+        found = await get(self, address)
+        if self._node is other.chain.node:
+            released.set()
+            await until(lambda: address not in other.runtime.trader.contracts)
+        return found
+
+    async with place.provider(seconds=20), robot, place.agent("person") as person, place.agent("provider") as other:
+        contract = await person.demand(job(place))
+        monkeypatch.setattr(Liabilities, "get", late)
+        assert (await (await other.contract(contract.address)).outcome()).success
 
 
 async def test_the_allowance_of_the_factory_covers_all_open_demands(place: Place) -> None:

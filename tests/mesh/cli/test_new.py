@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
 from string import Template
+from typing import TYPE_CHECKING
 
 import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
 from mesh.cli.new import KINDS
+from mesh.testing import assert_paid, assert_refunded
+from tests.bridges.ros1.peers import Ros, RosMasterServer
 from tests.support.commands import AIRA, Serving, aira, environment, refused
 from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from mesh.testing import Market
 
 ROOT = Path(__file__).parents[3]
 
@@ -33,24 +42,61 @@ def projects(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(folder: Path, module: str, *arguments: str | Path) -> None:
-    """Run a module of Python with this tree, and with the programs of all projects; it must succeed."""
+def run(folders: Iterable[Path], module: str, *arguments: str | Path) -> None:
+    """Run a module of Python with this tree, and with the programs of some projects; it must succeed."""
     command = [sys.executable, "-m", module, *map(str, arguments)]
-    places = ":".join(map(str, (ROOT, *folder.iterdir())))
-    variables = {"PYTHONPATH": places, "MYPYPATH": places, "ROS2_CONNECT": f"tcp/127.0.0.1:{free_port()}"}
+    places = ":".join(map(str, (ROOT, *folders)))
+    variables = {
+        "PYTHONPATH": places,
+        "MYPYPATH": places,
+        "ROS2_CONNECT": f"tcp/127.0.0.1:{free_port()}",
+        "ROS_MASTER_URI": f"http://127.0.0.1:{free_port()}",
+    }
     done = subprocess.run(
         command, cwd=ROOT, env=environment(variables), capture_output=True, text=True, timeout=150, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def batches(projects: Path) -> Iterator[list[Path]]:
+    """The projects in groups, each without two modules of one name: ROS 1 and ROS 2 both have a `twin`."""
+    yield [projects / kind for kind in KINDS if kind != "ros1"]
+    yield [projects / "ros1"]
+
+
 def test_the_projects_are_typed(projects: Path) -> None:
-    run(projects, "mypy", *projects.glob("*/*.py"))  # strict, and with the cache of `make lint`
+    for folders in batches(projects):
+        # strict, and with the cache of `make lint`
+        run(folders, "mypy", *(file for folder in folders for file in folder.glob("*.py")))
 
 
 def test_the_tests_of_the_projects_pass(projects: Path) -> None:
     plugin = () if entry_points(group="pytest11", name="aira") else ("-p", "mesh.testing._plugin")
-    run(projects, "pytest", "-q", *plugin, "-c", projects / "robot" / "pyproject.toml", *projects.glob("*/test_*.py"))
+    for folders in batches(projects):
+        tests = (file for folder in folders for file in folder.glob("test_*.py"))
+        run(folders, "pytest", "-q", *plugin, "-c", folders[0] / "pyproject.toml", *tests)
+
+
+async def test_the_agent_of_ros_1_turns_the_light_of_a_real_robot_on(
+    projects: Path, tmp_path: Path, market: Market, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a master of ROS, with a service of rospy."""
+    with RosMasterServer() as master:
+        monkeypatch.setenv("ROS_MASTER_URI", master.uri)
+        agent = runpy.run_path(str(projects / "ros1" / "my_ros1.py"))["agent"]
+        async with Ros(master.uri, tmp_path).node("light") as node, market.robot(agent):
+            assert await node.hear() == "ready"
+            assert_paid(await market.order(agent, [("/light", True)], cost="1 XRT"))
+            assert await node.hear() == {"light": True}
+            assert_refunded(await market.order(agent, [("/light", False)], cost="1 XRT"), code="job-failed")
+
+
+def test_what_the_environment_names_is_in_the_unit_and_in_the_compose_file(projects: Path) -> None:
+    for kind, name in (("ros1", "ROS_MASTER_URI"), ("ros2", "ROS2_CONNECT")):
+        deploy = projects / kind / "deploy"
+        assert f"\nEnvironment={name}=" in (deploy / f"my_{kind}.service").read_text()
+        assert f"\n      {name}: ${{{name}:?" in (deploy / "compose.yaml").read_text()
+        assert f'environ.get("{name}"' in (projects / kind / f"my_{kind}.py").read_text()
 
 
 def test_the_tests_are_as_short_as_promised(projects: Path) -> None:

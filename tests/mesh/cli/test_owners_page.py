@@ -1,4 +1,4 @@
-"""The page for owners: its commands run as printed, its settings load, and its tables are complete."""
+"""The pages for owners: their commands run as printed, their settings load, and their tables are complete."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from tests.mesh.cli.served_chain import ServedChain
     from tests.support.routers import EmbeddedRouter
 
-PAGE: Final = (Path(__file__).parents[3] / "docs" / "guides" / "owners.md").read_text()
+GUIDES: Final = Path(__file__).parents[3] / "docs" / "guides"
+PAGE: Final = "".join((GUIDES / f"{name}.md").read_text() for name in ("owners", "robot-control", "notifications"))
 ROBOT: Final = """
 import asyncio
 from mesh import Agent

@@ -10,7 +10,7 @@ import msgspec
 
 from mesh.cli.status import peers
 from mesh.network import Channel, Endpoints, Network
-from mesh.network.channel import PRESENT_LIMIT
+from mesh.network.presence import PRESENT_LIMIT
 from mesh.settings import Settings
 from mesh.watching import present
 from schemas.status import BridgeStatus, bridge_status_key

@@ -155,6 +155,27 @@ async def test_blocks_are_mined_on_demand(node: EmbeddedChain) -> None:
     assert await web3_of(node).eth.block_number == 3
 
 
+async def test_each_block_is_pushed_before_its_transaction_is_answered(node: EmbeddedChain) -> None:
+    heads: list[int] = []
+
+    def push(head: Any) -> None:
+        heads.append(int(head["number"], 16))
+
+    node.push_heads(push)
+    await node.mine(2)
+    assert heads == [2]
+    await node.request("eth_sendTransaction", [{"from": Account(node.funded_keys[0]).address}])
+    assert heads == [2, 3]
+    node.push_heads(push)
+    await node.request("eth_blockNumber", [])
+    node.end_pushes(push)
+    await node.mine()
+    assert heads == [2, 3]
+    node.push_heads(push)
+    await node.request("eth_blockNumber", [])
+    assert heads == [2, 3, 4]
+
+
 async def test_blocks_are_mined_with_a_block_time() -> None:
     async with EmbeddedChain(block_time=0.01) as node:
         web3 = web3_of(node)

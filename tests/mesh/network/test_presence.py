@@ -93,3 +93,36 @@ async def until_present(channel: Channel, expected: list[PresenceKey]) -> None:
     async with asyncio.timeout(60):
         while await channel.present() != expected:
             await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("is_watching", [True, False], ids=["watching", "having watched"])
+async def test_who_is_present_is_found_each_time_while_a_session_watches_and_afterwards(
+    here: zenoh.Session, there: zenoh.Session, *, is_watching: bool
+) -> None:
+    """Zenoh loses replies to a question for tokens that its session subscribes to, some in a hundred."""
+    appeared = list[PresenceKey]()
+    async with opened(there) as theirs, opened(here) as asking:
+        theirs.announce("provider", ROBOT.address)
+        async with opened(here) as watching:
+            (asking if is_watching else watching).watch_presence(appeared.append, role="provider")
+            await until(lambda: appeared)
+        for _ in range(150):
+            answers = await asyncio.gather(*(asking.present(role) for role in ("provider", "*") * 4))
+            assert answers == [[PresenceKey(MARKET, "provider", ROBOT.address)]] * 8
+
+
+async def test_a_session_watches_a_role_again(here: zenoh.Session, there: zenoh.Session) -> None:
+    """The second watch is told of those that the first one saw, and that have not gone since."""
+    first, second = list[PresenceKey](), list[PresenceKey]()
+    async with opened(there) as theirs:
+        theirs.announce("provider", PERSON.address)
+        async with opened(there) as leaving:
+            leaving.announce("provider", ROBOT.address)
+            async with opened(here) as watching:
+                watching.watch_presence(first.append, role="provider")
+                await until(lambda: len(first) == 2)
+        async with opened(here) as watching:
+            await until_present(watching, [PresenceKey(MARKET, "provider", PERSON.address)])
+            watching.watch_presence(second.append, role="provider")
+            await until(lambda: second)
+            assert second == [PresenceKey(MARKET, "provider", PERSON.address)]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from mesh.base.flood import Drops
 from mesh.network import Channel
-from mesh.network.channel import PRESENT_LIMIT
+from mesh.network.presence import PRESENT_LIMIT
 from mesh.watching import PresentPeer, present
 from schemas import PresenceKey
 from tests.support.orders import MARKET, ROBOT

@@ -75,6 +75,23 @@ async def test_a_failed_job_and_a_declined_one_say_why(market: Market, forklift:
         assert_declined(caught.value, code="too-cheap")
 
 
+async def test_nobody_polls_the_node(market: Market, forklift: Forklift, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    ask = market.chain.node.request
+
+    async def request(method: str, params: object) -> object:
+        asked.append(method)
+        return await ask(method, params)
+
+    async with market.robot(forklift):
+        contract = await market.demand(forklift, [("/lift", 0.0)], cost=PRICE)
+        await market.running(contract)
+        monkeypatch.setattr(market.chain.node, "request", request)
+        forklift.released.set()
+        assert_paid(await market.outcome(contract))
+        assert asked.count("eth_getBlockByNumber") <= 3, asked
+
+
 async def test_a_model_is_ordered_of_any_robot(market: Market, forklift: Forklift) -> None:
     async with market.robot(forklift):
         assert_paid(await market.order(ANYTHING, [("/lift", 1.5)], cost=PRICE))

@@ -1,4 +1,4 @@
-"""The programs in docs/guides/testing.md, run by pytest as a reader's."""
+"""The programs in the pages on testing, run by pytest as a reader's."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ import pytest
 
 from tests.support.commands import environment
 
-PAGE = Path(__file__).parents[3] / "docs" / "guides" / "testing.md"
+GUIDES = Path(__file__).parents[3] / "docs" / "guides"
+PAGES = (GUIDES / "testing.md", GUIDES / "testing-market.md")
 
 
 @pytest.fixture
 def programs() -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    return re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def test_the_tests_of_the_page_pass(programs: list[str], tmp_path: Path) -> None:

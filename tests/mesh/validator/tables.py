@@ -1,4 +1,4 @@
-"""The tables of recordings in docs/guides/validators.md: `python -m tests.mesh.validator.tables` writes them."""
+"""The tables of recordings in docs/reference/tampered-recordings.md: `python -m tests.mesh.validator.tables`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.mesh.validator.tampering import Others
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-PAGE: Final = Path(__file__).parents[3] / "docs" / "guides" / "validators.md"
+PAGE: Final = Path(__file__).parents[3] / "docs" / "reference" / "tampered-recordings.md"
 
 
 def tampered_table(folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""The tables in docs/guides/validators.md are those of what the tests run."""
+"""The tables in docs/reference/tampered-recordings.md are those of what the tests run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_the_documented_honest_jobs_are_what_the_tests_judge() -> None:
 
 
 def test_every_shipped_policy_is_documented_with_what_it_demands() -> None:
-    documented = in_page(PAGE.read_text(), "policy")
+    documented = in_page((PAGE.parent / "policies.md").read_text(), "policy")
     assert [line.split("`")[1] for line in documented.splitlines()[2:]] == list(POLICIES)
     for name in ("complete", "schema"):
         assert POLICIES[name].description in documented
@@ -31,7 +31,7 @@ def test_every_shipped_policy_is_documented_with_what_it_demands() -> None:
 
 def test_every_finding_is_documented(tmp_path: Path) -> None:
     job = make_job(tmp_path)
-    codes = (PAGE.parents[1] / "reference" / "codes.md").read_text().split("## Findings")[1]
+    codes = (PAGE.parent / "checks.md").read_text().split("## Findings")[1]
     first_cells = [line.partition(" | ")[0] for line in codes.splitlines() if line.startswith("| `")]
     documented = {name for cell in first_cells for name in re.findall(r"`([a-z-]+)`", cell)}
     found = {finding.name for finding in job.verify().findings}

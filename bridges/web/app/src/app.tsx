@@ -21,7 +21,9 @@ interface App {
   block: number;
   /** Who is present; null until it is known. */
   agents: Agents | null;
-  /** The robot at an address, if it is present. */
+  /** Robots that were here, the latest first. */
+  away: Agent[];
+  /** The robot at an address, if it is present or was lately. */
   robotAt: (address: string) => Agent | undefined;
   account: Account | null;
   connect: (wallet: Announced) => Promise<void>;
@@ -54,6 +56,7 @@ export function AppProvider(props: { market: Market; reloadMarket: () => void; c
   const [live, setLive] = useState<Agents | null>(null);
   useTopic("agents", (event) => (event.kind === "agents" ? setLive(event.data) : listed.reload()));
   const agents = live ?? listed.data;
+  const away = useMemo(() => (agents?.away ?? []).map((one): Agent => ({ ...one, role: "agent", health: "away", status: null, offers: [] })).sort((one, other) => other.since! - one.since!), [agents]);
 
   const notify = useCallback((text: string, kind: "good" | "bad" = "good") => {
     const id = ++lastNote.current;
@@ -117,7 +120,8 @@ export function AppProvider(props: { market: Market; reloadMarket: () => void; c
       market,
       block,
       agents,
-      robotAt: (address) => agents?.agents.find((agent) => agent.role === "agent" && agent.address === address),
+      away,
+      robotAt: (address) => [...(agents?.agents ?? []), ...away].find((agent) => agent.role === "agent" && agent.address === address),
       account,
       connect,
       useLocal,

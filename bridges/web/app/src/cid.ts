@@ -1,5 +1,7 @@
 // CIDv0 and files as trees of blocks, as in schemas/cid.py and schemas/unixfs.py.
 
+import { texts } from "./texts";
+
 const ALPHABET = "123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz";
 const CHUNK = 262_144;
 const LINKS = 174;
@@ -21,13 +23,13 @@ export function parseCid(text: string): Uint8Array {
   let number = 0n;
   for (const letter of text) {
     const digit = ALPHABET.indexOf(letter);
-    if (digit < 0) throw new Error(`not a CID: ${text.slice(0, 80)}`);
+    if (digit < 0) throw new Error(texts.notACid);
     number = number * 58n + BigInt(digit);
   }
   const bytes = new Uint8Array(34);
   for (let place = 33; place >= 0; place--, number >>= 8n) bytes[place] = Number(number & 0xffn);
   if (text.length !== 46 || number !== 0n || bytes[0] !== 0x12 || bytes[1] !== 0x20) {
-    throw new Error(`not a CID: ${text.slice(0, 80)}`);
+    throw new Error(texts.notACid);
   }
   return bytes;
 }

@@ -55,6 +55,13 @@ export function clock(at: number): string {
   return time.toLocaleString(undefined, today ? options : { ...options, day: "numeric", month: "short", year: "numeric" });
 }
 
+/** A time in the past, to the minute. */
+export function since(at: number): string {
+  const time = new Date(at * 1000);
+  const day: Intl.DateTimeFormatOptions = time.toDateString() === new Date().toDateString() ? {} : { day: "numeric", month: "short" };
+  return time.toLocaleString(undefined, { hour: "2-digit", minute: "2-digit", ...day });
+}
+
 /** A decoded value in one line. */
 export function shown(value: unknown): string {
   return plain(typeof value === "string" ? value : encodeJson(value) ?? "", 600);

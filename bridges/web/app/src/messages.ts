@@ -4,6 +4,7 @@ import { bytesToHex, encodeAbiParameters, encodePacked, keccak256, recoverMessag
 import type { Address, Hex } from "viem";
 import { parseCid } from "./cid";
 import { encodeJson } from "./numbers";
+import { texts } from "./texts";
 
 interface Terms {
   model: string;
@@ -88,7 +89,7 @@ export async function signerOf(hash: Hex, signature: string): Promise<Address> {
   const digits = signature.replace(/^0x/, "");
   const v = digits.slice(128);
   if (!/^[0-9a-f]{130}$/i.test(digits) || !/^1[bc]$/i.test(v) || BigInt(`0x${digits.slice(64, 128)}`) > HALF_ORDER) {
-    throw new Error("not a signature of the market");
+    throw new Error(texts.notASignature);
   }
   return recoverMessageAddress({ message: { raw: hash }, signature: `0x${digits}` });
 }

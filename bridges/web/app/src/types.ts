@@ -152,7 +152,16 @@ export interface Quote {
   detail: string;
 }
 
-/** What an owner may change while the robot works. */
+/** What has happened to a robot, for its owner. */
+export interface RobotEvent {
+  event: string;
+  time: number;
+  /** A contract's address, or an order's hash; may be empty. */
+  about: string;
+  detail: string;
+}
+
+/** What an owner may change while the robot works; and who is told of what. */
 export interface OwnerRules {
   price: string;
   paused: boolean;
@@ -160,6 +169,8 @@ export interface OwnerRules {
   leastPrice: string;
   held: boolean;
   here: boolean;
+  notify: { target: string; waiting: number }[];
+  events: RobotEvent[];
 }
 
 /** A contract in the account's statement: amounts in the smallest unit. */
@@ -195,16 +206,19 @@ export interface PastJob {
 export interface Agent {
   role: string;
   address: Address;
-  health: "alive" | "degraded" | "silent";
+  health: "alive" | "degraded" | "silent" | "away";
   status: AgentStatus | null;
   models: string[];
   offers: Order[];
   record: JobRecord;
   profile: Profile | null;
+  /** When it was here last; only if it is away. */
+  since?: number;
 }
 
 export interface Agents {
   agents: Agent[];
+  away: (Pick<Agent, "address" | "models" | "record" | "profile"> & { since: number })[];
   unlisted: number;
   alerts: { agent: Address; code: string; detail: string }[];
 }

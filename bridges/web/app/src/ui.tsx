@@ -3,6 +3,7 @@
 import { cloneElement, toChildArray } from "preact";
 import type { ComponentChildren, VNode } from "preact";
 import { useEffect, useId, useRef, useState } from "preact/hooks";
+import { isAddress } from "viem";
 import { useApp, wordsOf } from "./app";
 import type { Loaded } from "./app";
 import { amount, plain, short } from "./format";
@@ -17,7 +18,6 @@ export function Name(props: { text: string; href?: string; label?: string }) {
   const [copied, setCopied] = useState(false);
   const named = plain(robotAt(props.text)?.profile?.name ?? "", 80);
   const visible = props.label ?? (own ? texts.you : named || short(props.text));
-  const isAddress = /^0x[0-9a-fA-F]{40}$/.test(props.text);
   const copy = async () => {
     await navigator.clipboard.writeText(props.text);
     setCopied(true);
@@ -31,7 +31,7 @@ export function Name(props: { text: string; href?: string; label?: string }) {
           {copied ? <path d="M3 8.500 6.500 12 13 4.500" /> : <path d="M5.500 5.500h8v8h-8zM10.500 5.500v-3h-8v8h3" />}
         </svg>
       </button>
-      {isAddress && market.explorer ? <a class="copy" href={`${market.explorer}/address/${props.text}`} rel="noreferrer" target="_blank" aria-label={texts.inExplorer(props.text)}>↗</a> : null}
+      {isAddress(props.text) && market.explorer ? <a class="copy" href={`${market.explorer}/address/${props.text}`} rel="noreferrer" target="_blank" aria-label={texts.inExplorer(props.text)}>↗</a> : null}
     </span>
   );
 }
@@ -94,6 +94,16 @@ export function Action(props: {
       {props.children}
     </button>
   );
+}
+
+/** A button that copies a text. */
+export function Copy(props: { text: string; label: string; class: string }) {
+  const { notify } = useApp();
+  const copy = async () => {
+    await navigator.clipboard.writeText(props.text);
+    notify(texts.copied);
+  };
+  return <Action class={props.class} run={copy}>{props.label}</Action>;
 }
 
 export function Field(props: { label: ComponentChildren; hint?: ComponentChildren; error?: string; children: (id: string, described: string) => ComponentChildren }) {

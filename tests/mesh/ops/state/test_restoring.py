@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.agent.ledger import Ledger, Phase
+from mesh.base.database import VERSION
 from mesh.chain._pending import TransactionStore
 from mesh.content import Store
 from mesh.errors import ConfigurationError
 from mesh.ops.state import back_up, restore
-from mesh.role.database import VERSION, LedgerUnusable
+from mesh.role.database import LedgerUnusable
 from schemas import cid_of_bytes
 from tests.mesh.agent.ledgers import mark_as_version
 from tests.mesh.ops.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, Folder, forge, members, names_in
@@ -188,7 +189,7 @@ async def test_a_newer_ledger_in_a_backup_is_named_and_nothing_changed(
     newer.write_bytes(folder.ledger.read_bytes())
     mark_as_version(newer, VERSION + 1)
     forged = forge_ledger(archive, tmp_path / "forged", newer.read_bytes())
-    with raises_with(ConfigurationError, code="ledger-too-new") as caught:
+    with raises_with(ConfigurationError, code="state-too-new") as caught:
         await restore(forged, tmp_path / "new")
     assert f"format {VERSION + 1}, this one knows {VERSION}" in str(caught.value)
     assert names_in(tmp_path / "new") == []
@@ -196,7 +197,7 @@ async def test_a_newer_ledger_in_a_backup_is_named_and_nothing_changed(
 
 async def test_a_newer_ledger_is_not_backed_up(folder: Folder, tmp_path: Path) -> None:
     mark_as_version(folder.ledger, VERSION + 1)
-    with raises_with(ConfigurationError, code="ledger-too-new") as caught:
+    with raises_with(ConfigurationError, code="state-too-new") as caught:
         await back_up(folder.path, tmp_path / "it", content="none")
     assert caught.value.hint == "upgrade aira-mesh"
     assert str(folder.ledger) in str(caught.value)

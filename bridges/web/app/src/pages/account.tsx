@@ -4,7 +4,7 @@ import { clock, ether, plain, short } from "../format";
 import { withdraw } from "../ordering";
 import { texts } from "../texts";
 import type { AccountState, Liability, PostedOrder } from "../types";
-import { Action, Badge, Dialog, Facts, Money, Name, Picture, Show, Table } from "../ui";
+import { Action, Badge, Dialog, Facts, Money, Name, Picture, Show, Strange, Table } from "../ui";
 import { announcedWallets, watchWallets } from "../wallet";
 import { nameOf } from "./robots";
 
@@ -39,8 +39,8 @@ export function AccountControl() {
           {wallets.map((wallet) => (
             <li key={wallet.info.uuid}>
               <Action class="choice" run={async () => { await connect(wallet); setOpen(false); }}>
-                <strong>{wallet.info.name.slice(0, 60)}</strong>
-                <span class="quiet">{wallet.info.rdns.slice(0, 60)}</span>
+                <strong>{plain(wallet.info.name, 60)}</strong>
+                <span class="quiet">{plain(wallet.info.rdns, 60)}</span>
               </Action>
             </li>
           ))}
@@ -113,7 +113,14 @@ export function OrderTable(props: { orders: PostedOrder[]; changed: () => void }
 /** Jobs as rows: what, who, for how much, how it ended. */
 export function JobTable(props: { liabilities: Liability[] }) {
   if (!props.liabilities.length) return <p class="quiet">{texts.noJobs}</p>;
-  return <ul class="jobs" aria-label={texts.jobs}>{props.liabilities.map((liability) => <JobRow key={liability.address} liability={liability} />)}</ul>;
+  return <ul class="rows" aria-label={texts.jobs}>{props.liabilities.map((liability) => <JobRow key={liability.address} liability={liability} />)}</ul>;
+}
+
+/** The latest jobs of an account, which stay up to date. */
+export function LatestJobs(props: { of: string }) {
+  const jobs = useData<{ liabilities: Liability[] }>(`liabilities?party=${props.of}&limit=20`);
+  useTopic("chain", jobs.reload);
+  return <Show of={jobs}>{({ liabilities }) => <JobTable liabilities={liabilities} />}</Show>;
 }
 
 function JobRow({ liability }: { liability: Liability }) {
@@ -123,7 +130,7 @@ function JobRow({ liability }: { liability: Liability }) {
   const mine = account?.address === liability.promisee;
   return (
     <li title={liability.address}>
-      <a href={`#/job/${liability.address}`} class="job-row">
+      <a href={`#/job/${liability.address}`} class="list-row">
         <Picture address={liability.promisor} cid={robot?.profile?.picture} size="small" />
         <span class="who"><strong>{title ? plain(title, 60) : texts.job}</strong><span class="quiet">{robot ? nameOf(robot) : short(liability.promisor)}{mine ? "" : ` · ${texts.for} ${short(liability.promisee)}`}</span></span>
         <JobState state={liability.state} />
@@ -144,7 +151,7 @@ export function StatementList(props: { statements: PostedOrder["statements"] }) 
     <ul class="statements">
       {props.statements.map((one) => (
         <li key={`${one.agent}${one.at}`}>
-          <Badge kind="warn">{texts.statement[one.kind]}</Badge> <Name text={one.agent} /> {clock(one.at)}: <bdi class="strange">{one.detail.slice(0, 500)}</bdi>{" "}
+          <Badge kind="warn">{texts.statement[one.kind]}</Badge> <Name text={one.agent} /> {clock(one.at)}: <Strange text={one.detail} most={500} />{" "}
           <code>{one.code}</code>
         </li>
       ))}

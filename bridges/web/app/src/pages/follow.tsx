@@ -9,6 +9,7 @@ import { checkAnswer, checkOrder } from "../trust";
 import type { Answer, PostedOrder, Quote, Summary } from "../types";
 import { Action, Badge, Facts, Name, Problem, Show } from "../ui";
 import { StatementList } from "./account";
+import { isUsable } from "./order";
 
 /** An order from its publication to its contract; then the page of the job takes over. */
 export function FollowPage(props: { hash: string }) {
@@ -56,7 +57,7 @@ function WhatWouldWork({ order, changed }: { order: PostedOrder["order"]; change
   const { account, market } = useApp();
   const [quotes, setQuotes] = useState<Quote[] | null>(null);
   useEffect(() => void post<{ quotes: Quote[] }>("quotes", { model: order.model, objective: order.objective }).then((found) => setQuotes(found.quotes), () => setQuotes([])), [order.hash]);
-  const usable = (quotes ?? []).filter((quote) => !quote.code && quote.token.address === market.token.address);
+  const usable = (quotes ?? []).filter((quote) => isUsable(quote, market.token.address));
   if (account?.address !== order.signer || !usable.length) return null;
   const take = async (quote: Quote) => {
     await withdraw(order, account);

@@ -1,4 +1,5 @@
 import { useEffect, useState } from "preact/hooks";
+import { zeroAddress } from "viem";
 import { post } from "../api";
 import { useApp, useData, useModel, useTopic, wordsOf } from "../app";
 import { isCid } from "../cid";
@@ -9,7 +10,7 @@ import { stopJob } from "../ordering";
 import { texts } from "../texts";
 import { checkJob } from "../trust";
 import type { Finding, Job, Step } from "../types";
-import { Action, Badge, Dialog, Facts, Money, Name, Picture, Show, Strange } from "../ui";
+import { Action, Badge, Copy, Dialog, Facts, Money, Name, Picture, Show, Strange } from "../ui";
 import { JobState } from "./account";
 import { Steps } from "./follow";
 import { nameOf } from "./robots";
@@ -34,8 +35,9 @@ const PHASES = { incoming: 2, ready: 2, running: 3, complete: 4, finalized: 5 };
 
 export function JobView(props: { job: Job; playback: Job["playback"]; changed: () => void }) {
   const { job, playback } = props;
-  const { robotAt } = useApp();
+  const { robotAt, account } = useApp();
   const { liability } = job;
+  const stopper = texts.stoppedBy[job.stopped?.by !== liability.promisee ? "robot" : account?.address === liability.promisee ? "you" : "customer"];
   const description = useModel(liability.model)?.description ?? null;
   const robot = robotAt(liability.promisor);
   const ended = liability.isFinalized;
@@ -57,13 +59,13 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
       </section>
       <Steps done={done} active={!ended} failed={failed} share={job.phase === "running" || playback ? share : undefined} />
       <p class="lead" aria-live="polite">
-        <JobState state={liability.state} /> {owed ? texts.owedNow(amount(job.owed, liability.token), !failed) : code === "stopped" ? texts.stoppedLong : job.stopped && liability.state === "paid" ? texts.stoppedPaid : texts.jobStateLong[liability.state]}
+        <JobState state={liability.state} /> {owed ? texts.owedNow(amount(job.owed, liability.token), !failed) : job.stopped ? `${stopper} ${ended ? (failed ? texts.stoppedBack : texts.stoppedPaid) : texts.jobStateLong.open}` : texts.jobStateLong[liability.state]}
         {playback && !ended && playback.total > 1 ? ` ${texts.played(playback.position, playback.total)}` : ""}
       </p>
-      {job.reason ? <p class={code === "stopped" ? "callout" : "problem"}><Strange text={job.reason.text || texts.reason[code] || ""} /> <code>{code}</code></p> : null}
+      {job.reason && (!job.stopped || job.stopped.why) ? <p class={code === "stopped" ? "callout" : "problem"}><Strange text={job.reason.text || texts.reason[code] || ""} /> <code>{code}</code></p> : null}
       {owed ? <p class="hint">{texts.owedHow} <code>aira liability claim {liability.address}</code></p> : null}
       <Refund job={job} changed={props.changed} />
-      {ended ? <p class="row"><a class="button quietly" href={`#/order/model/${liability.model}/${liability.promisor}/${liability.objective}`}>{texts.orderAgain}</a><CopyLink /></p> : null}
+      {ended ? <p class="row"><a class="button quietly" href={`#/order/model/${liability.model}/${liability.promisor}/${liability.objective}`}>{texts.orderAgain}</a><Copy text={location.href} label={texts.copyLink} class="button quietly" /></p> : null}
       {liability.result ? <Replay cid={liability.result} model={description} /> : <LiveJob address={liability.address} model={description} />}
       <div class="columns">
         <section>
@@ -84,7 +86,7 @@ export function JobView(props: { job: Job; playback: Job["playback"]; changed: (
             [texts.model, <Name text={liability.model} href={`#/order/model/${liability.model}`} />],
             [texts.objective, <Name text={liability.objective} href={`#/file/${liability.objective}`} />],
             [texts.result, liability.result ? <Name text={liability.result} href={`#/file/${liability.result}`} /> : texts.notYet],
-            [texts.validator, /^0x0+$/.test(liability.validator) ? "" : <Name text={liability.validator} />],
+            [texts.validator, liability.validator === zeroAddress ? "" : <Name text={liability.validator} />],
             [texts.demand, job.demandHash ? <Name text={job.demandHash} href={`#/order/${job.demandHash}`} /> : ""],
             [texts.offer, job.offerHash ? <Name text={job.offerHash} href={`#/order/${job.offerHash}`} /> : ""],
           ]}
@@ -101,7 +103,7 @@ function Stop({ job, changed }: { job: Job; changed: () => void }) {
   const { liability } = job;
   if (liability.isFinalized || account?.address !== liability.promisee || job.phase === "complete") return null;
   const stop = async () => {
-    await stopJob(liability.address, texts.stoppedByPerson, account);
+    await stopJob(liability.address, "", account);
     setOpen(false);
     notify(texts.stopSent);
     changed();
@@ -119,16 +121,6 @@ function Stop({ job, changed }: { job: Job; changed: () => void }) {
       </Dialog>
     </>
   );
-}
-
-/** The address of this page stays: it names the contract. */
-function CopyLink() {
-  const { notify } = useApp();
-  const copy = async () => {
-    await navigator.clipboard.writeText(location.href);
-    notify(texts.copied);
-  };
-  return <Action class="button quietly" run={copy}>{texts.copyLink}</Action>;
 }
 
 function Timeline(props: { steps: Step[]; owed: boolean }) {

@@ -1,4 +1,5 @@
 import { useState } from "preact/hooks";
+import { isAddress } from "viem";
 import { query } from "../api";
 import { useApp, useData, useTopic } from "../app";
 import { texts } from "../texts";
@@ -33,7 +34,7 @@ export function JobsPage() {
         <Field label={texts.byAddress}>
           {(id) => <input id={id} class="wide" placeholder="0x…" spellcheck={false} value={wanted} onInput={(event) => setWanted(event.currentTarget.value.trim())} />}
         </Field>
-        <button class="button small" disabled={!/^0x[0-9a-fA-F]{40}$/.test(wanted)}>{texts.show}</button>
+        <button class="button small" disabled={!isAddress(wanted)}>{texts.show}</button>
       </form>
       <Show of={jobs}>{({ liabilities, more }) => <><JobTable liabilities={liabilities} />{more ? <p class="hint">{texts.moreJobs}</p> : null}</>}</Show>
     </>

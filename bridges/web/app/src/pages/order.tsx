@@ -11,11 +11,11 @@ import type { Prepared, Wish } from "../ordering";
 import { texts } from "../texts";
 import { allowedContract, rememberContract } from "../trust";
 import type { AccountState, Model, Quote } from "../types";
-import { Action, Dialog, Facts, Field, Name, NumberField, Picture, Problem, Show, Strange } from "../ui";
+import { Action, Copy, Dialog, Facts, Field, Name, NumberField, Picture, Problem, Show, Strange } from "../ui";
 import { inWords } from "../values";
 import { Fit, ObjectiveChoice, firstChoice, useObjective, withoutDescription } from "./objective";
 import type { Make } from "./objective";
-import { nameOf } from "./robots";
+import { Title, nameOf, recordOf } from "./robots";
 import { NOBODY, ValidatorChoice } from "./validator";
 import type { Judge } from "./validator";
 
@@ -31,7 +31,7 @@ export function OrderPage(props: { model: string; robot: string; objective: stri
   return (
     <div class="order">
       <p class="back"><a href="#/">{texts.otherRobots}</a></p>
-      <h1><Strange text={description?.title ?? (known ? texts.undescribed : texts.loading)} most={80} /></h1>
+      <h1>{known ? <Title of={description} /> : texts.loading}</h1>
       {description?.description ? <p class="lead"><Strange text={description.description} /></p> : null}
       <Show of={described}>{() => null}</Show>
       {known ? <OrderForm key={`${known.described}`} model={known} robot={props.robot} objective={props.objective} /> : null}
@@ -40,7 +40,7 @@ export function OrderPage(props: { model: string; robot: string; objective: stri
 }
 
 /** The price that a description calls typical, for the form; empty if it is in another unit. */
-function typicalPrice(price: string | undefined, symbol: string): string {
+export function typicalPrice(price: string | undefined, symbol: string): string {
   const [number, unit] = (price ?? "").split(" ");
   return unit === symbol ? number : "";
 }
@@ -96,7 +96,7 @@ function OrderForm({ model, robot, objective }: { model: Model; robot: string; o
   );
 }
 
-const isUsable = (quote: Quote, token: Address) => !quote.code && quote.token.address === token && !quote.validator;
+export const isUsable = (quote: Quote, token: Address) => !quote.code && quote.token.address === token && !quote.validator;
 
 /** Milliseconds without a key after which robots are asked. */
 const SETTLED = 500;
@@ -156,14 +156,13 @@ function Robots(props: { quotes: Quote[] | null; asking: boolean; wanted: Choosi
 function QuoteRow({ quote, chosen, choose }: { quote: Quote; chosen: boolean; choose: () => void }) {
   const { market, robotAt } = useApp();
   const robot = robotAt(quote.agent);
-  const { done = 0, failed = 0 } = robot?.record ?? {};
   return (
     <label class={`quote ${chosen ? "chosen" : ""}`}>
       <input type="radio" name="robot" checked={chosen} onChange={choose} value={quote.agent} />
       <Picture address={quote.agent} cid={robot?.profile?.picture} size="small" />
       <span class="who">
         <strong>{robot ? nameOf(robot) : plain(quote.name, 80) || <Name text={quote.agent} />}</strong>
-        <span class="quiet">{[quote.start ? texts.beginsIn(duration(quote.start)) : texts.beginsNow, quote.seconds ? texts.takes(duration(quote.seconds)) : "", done + failed ? texts.recordShort(done, failed) : texts.noRecord].filter(Boolean).join(" · ")}</span>
+        <span class="quiet">{[quote.start ? texts.beginsIn(duration(quote.start)) : texts.beginsNow, quote.seconds ? texts.takes(duration(quote.seconds)) : "", recordOf(robot?.record ?? { done: 0, failed: 0 })].filter(Boolean).join(" · ")}</span>
       </span>
       <span class="price-tag">{amount(quote.cost, market.token)}</span>
     </label>
@@ -215,7 +214,7 @@ export function OrderButton(props: { wish: Wish | null; declined?: (error: Robot
   };
   const copyAddress = (
     <p class="row">
-      <Action class="button small" run={async () => { await navigator.clipboard.writeText(account.address); notify(texts.copied); }}>{texts.copyAddress}</Action>
+      <Copy text={account.address} label={texts.copyAddress} class="button small" />
       <Action class="button small quietly" run={state.reload}>{texts.checkAgain}</Action>
     </p>
   );

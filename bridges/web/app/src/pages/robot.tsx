@@ -2,29 +2,28 @@ import { useEffect, useState } from "preact/hooks";
 import { isAddress } from "viem";
 import type { Address } from "viem";
 import { ApiError, post } from "../api";
-import { useApp, useData, useModel, useTopic } from "../app";
-import { amount, clock, plain } from "../format";
+import { useApp, useData, useModel } from "../app";
+import { amount, clock, ether, plain, since } from "../format";
 import { Readings } from "../live";
 import { texts } from "../texts";
-import type { Agent, Entry, Liability, OwnerRules, Token } from "../types";
-import { Action, Dialog, Facts, Field, Name, NumberField, Picture, Show, Strange } from "../ui";
-import { JobTable } from "./account";
-import { Doing, nameOf, priceOf } from "./robots";
+import type { Agent, Entry, OwnerRules, RobotEvent, Token } from "../types";
+import { Action, Badge, Dialog, Facts, Field, Name, NumberField, Picture, Show, Strange } from "../ui";
+import { LatestJobs } from "./account";
+import { Doing, Title, nameOf, priceOf, recordOf } from "./robots";
 import { Health, Log, OperatorLogin } from "./services";
 
 /** One robot: who it is, what it reads, what it did; and for its owner, how it is run. */
 export function RobotPage(props: { address: string }) {
   const { agents, robotAt } = useApp();
   const robot = robotAt(props.address);
-  if (robot) return <RobotView robot={robot} />;
-  if (agents === null) return <p class="quiet" aria-busy="true">{texts.loading}</p>;
-  return (
-    <div class="empty">
-      <h1>{texts.robotAway}</h1>
-      <p><Name text={props.address} href={`#/account/${props.address}`} /></p>
-      <p><a class="button" href="#/">{texts.otherRobots}</a></p>
-    </div>
-  );
+  if (!robot && agents === null) return <p class="quiet" aria-busy="true">{texts.loading}</p>;
+  return <RobotView robot={robot ?? unknown(props.address as Address)} />;
+}
+
+/** A robot of which nobody has heard lately. */
+function unknown(address: Address): Agent {
+  const record = { created: 0, done: 0, failed: 0, open: 0, earned: "0" };
+  return { role: "agent", address, health: "away", status: null, models: [], offers: [], record, profile: null };
 }
 
 function RobotView({ robot }: { robot: Agent }) {
@@ -32,28 +31,27 @@ function RobotView({ robot }: { robot: Agent }) {
   const { profile, record } = robot;
   const cid = robot.models[0] ?? "";
   const description = useModel(cid)?.description ?? null;
-  const jobs = useData<{ liabilities: Liability[] }>(`liabilities?party=${robot.address}&limit=20`);
-  useTopic("chain", jobs.reload);
+  const isAway = robot.health === "away";
   return (
     <>
       <section class="hero">
         <Picture address={robot.address} cid={profile?.picture} size="large" />
         <div>
           <h1>{nameOf(robot)}</h1>
-          <p class="does"><Strange text={description?.title ?? texts.undescribed} most={80} />{profile?.place ? <span class="quiet"> · <Strange text={profile.place} most={80} /></span> : null}</p>
+          <p class="does"><Title of={description} />{profile?.place ? <span class="quiet"> · <Strange text={profile.place} most={80} /></span> : null}</p>
           <p><Strange text={profile?.about || description?.description || ""} /></p>
           <p class="inline"><Doing robot={robot} /></p>
           <p class="row">
-            {cid ? <a class="button huge" href={`#/order/model/${cid}/${robot.address}`}>{texts.order}</a> : null}
-            <span><strong class="price-tag">{priceOf(robot, description?.price) || texts.asksPrice}</strong> <span class="quiet">{record.done + record.failed ? texts.recordShort(record.done, record.failed) : texts.noRecord}</span></span>
+            {isAway ? <a class="button quietly" href="#/">{texts.otherRobots}</a> : cid ? <a class="button huge" href={`#/order/model/${cid}/${robot.address}`}>{texts.order}</a> : null}
+            <span>{isAway ? null : <strong class="price-tag">{priceOf(robot, description?.price) || texts.asksPrice}</strong>} <span class="quiet">{recordOf(record)}</span></span>
           </p>
         </div>
       </section>
-      <h2>{texts.readsNow}</h2>
+      <h2>{isAway ? texts.readLast : texts.readsNow}</h2>
       <Readings robot={robot.address} model={description} />
       {market.role === "operator" ? <Owner robot={robot} /> : null}
       <h2>{texts.latestJobs}</h2>
-      <Show of={jobs}>{({ liabilities }) => <JobTable liabilities={liabilities} />}</Show>
+      <LatestJobs of={robot.address} />
       <details class="more">
         <summary>{texts.details}</summary>
         <Facts
@@ -71,21 +69,72 @@ function RobotView({ robot }: { robot: Agent }) {
   );
 }
 
-/** What the owner sees and changes: stop and release, price, pause, refused customers, income, log. */
+/** What the owner sees and changes: stop and release, price, pause, refused customers, notifications, income, log. */
 function Owner({ robot }: { robot: Agent }) {
-  const rules = useData<OwnerRules>(`agents/${robot.address}/settings`);
+  const isAway = robot.health === "away";
+  const rules = useData<OwnerRules>(isAway ? null : `agents/${robot.address}/settings`);
+  useEffect(() => {
+    const timer = setInterval(rules.reload, 3_000);
+    return () => clearInterval(timer);
+  }, []);
+  const isClosed = rules.error instanceof ApiError && rules.error.code === "service-failed";
   return (
     <section class="panel owner">
-      <h2>{texts.runIt}</h2>
-      {rules.error instanceof ApiError && rules.error.code === "service-failed" && !rules.data ? <p class="callout">{texts.notFromHere}</p> : null}
-      <Show of={rules.error instanceof ApiError && rules.error.code === "service-failed" ? { ...rules, error: null } : rules}>{(known) => <Controls key={JSON.stringify(known)} robot={robot} rules={known} changed={rules.reload} />}</Show>
+      <h2>{texts.forOwner}</h2>
+      {isClosed && !rules.data ? <p class="callout">{texts.notFromHere}</p> : null}
+      <Show of={isClosed ? { ...rules, error: null } : rules}>
+        {({ notify, events, ...known }) => (
+          <>
+            <Controls key={JSON.stringify(known)} robot={robot} rules={known} changed={rules.reload} />
+            <Notifications notify={notify} events={events} />
+          </>
+        )}
+      </Show>
       <Income address={robot.address} />
-      <Log address={robot.address} />
+      {isAway ? null : <Log address={robot.address} />}
     </section>
   );
 }
 
-function Controls(props: { robot: Agent; rules: OwnerRules; changed: () => void }) {
+/** The latest of what the owner is told, and who tells him. */
+function Notifications({ notify, events }: Pick<OwnerRules, "notify" | "events">) {
+  const targets = notify.map(({ target, waiting }) => (waiting ? texts.stillWaiting(target, waiting) : target)).join(", ");
+  return (
+    <>
+      <h3>{texts.notifications}</h3>
+      {events.length ? (
+        <ol class="plain events" aria-label={texts.notifications} tabIndex={0}>
+          {[...events].reverse().map((one) => <Happened key={`${one.time}${one.event}${one.about}`} event={one} />)}
+        </ol>
+      ) : <p class="quiet">{texts.nothingHappened}</p>}
+      {targets ? <p class="hint"><Strange text={texts.notified(targets)} /></p> : (
+        <>
+          <p class="hint">{texts.nobodyNotified}</p>
+          <pre>{texts.notifyExample}</pre>
+        </>
+      )}
+    </>
+  );
+}
+
+const KINDS: Record<string, "good" | "bad" | "warn"> = { "job-paid": "good", "job-failed": "bad", "robot-unreachable": "warn", "low-on-gas": "warn" };
+
+function Happened({ event: { event, time, about, detail } }: { event: RobotEvent }) {
+  return (
+    <li>
+      <span class="number quiet">{since(time)}</span>
+      <span>
+        <Badge kind={KINDS[event] ?? "calm"}>{texts.robotEvent[event] ?? event}</Badge>{" "}
+        <Strange text={event === "low-on-gas" && /^\d+$/.test(detail) ? ether(detail) : detail} />{" "}
+        {isAddress(about) ? <a href={`#/job/${about}`}>{texts.showJob}</a> : null}
+      </span>
+    </li>
+  );
+}
+
+type Rules = Omit<OwnerRules, "notify" | "events">;
+
+function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
   const { robot, rules, changed } = props;
   const { notify, market } = useApp();
   const [price, setPrice] = useState(rules.price);
@@ -93,7 +142,7 @@ function Controls(props: { robot: Agent; rules: OwnerRules; changed: () => void 
   const [banned, setBanned] = useState("");
   const [stopping, setStopping] = useState(false);
   const path = `agents/${robot.address}`;
-  const change = (fields: Partial<OwnerRules>) => async () => {
+  const change = (fields: Partial<Rules>) => async () => {
     await post(`${path}/settings`, fields);
     notify(texts.saved);
     changed();

@@ -1,9 +1,9 @@
 import { useMemo, useState } from "preact/hooks";
 import { useApp, useModel } from "../app";
 import { isCid } from "../cid";
-import { duration, plain } from "../format";
+import { duration, plain, short, since } from "../format";
 import { texts } from "../texts";
-import type { Agent } from "../types";
+import type { Agent, Description, JobRecord } from "../types";
 import { Badge, Field, Picture, Strange } from "../ui";
 
 /** The robots of an owner, not the programs of people who order. */
@@ -11,20 +11,22 @@ export function robotsOf(agents: Agent[] | undefined): Agent[] {
   return (agents ?? []).filter((agent) => agent.role === "agent" && (agent.profile || agent.models.length));
 }
 
-/** Home: who is here, what each does and for how much. */
+/** Home: who is here, what each does and for how much; and who is away. */
 export function RobotsPage() {
-  const { agents } = useApp();
+  const { agents, away } = useApp();
   const [search, setSearch] = useState("");
   const [model, setModel] = useState("");
   const robots = robotsOf(agents?.agents);
-  const models = [...new Set(robots.flatMap((robot) => robot.models))];
-  const shown = robots.filter((robot) => (!model || robot.models.includes(model)) && matches(robot, search));
+  const models = [...new Set([...robots, ...away].flatMap((robot) => robot.models))];
+  const isWanted = (robot: Agent) => (!model || robot.models.includes(model)) && matches(robot, search);
+  const shown = robots.filter(isWanted);
+  const gone = away.filter(isWanted);
   const order = { idle: 0, working: 1, closed: 2, stopped: 3 };
   shown.sort((one, other) => (order[one.profile?.state ?? "stopped"] - order[other.profile?.state ?? "stopped"]) || nameOf(one).localeCompare(nameOf(other)));
   return (
     <>
       <h1>{texts.homeTitle}</h1>
-      {robots.length > 1 ? (
+      {robots.length + away.length > 1 ? (
         <div class="row find" role="search">
           <input type="search" aria-label={texts.search} placeholder={texts.search} value={search} onInput={(event) => setSearch(event.currentTarget.value)} />
           <ModelFilter models={models} model={model} choose={setModel} />
@@ -38,15 +40,45 @@ export function RobotsPage() {
           <p>{texts.noRobotsHint}</p>
           <pre>{texts.noRobotsCommand}</pre>
         </div>
-      ) : agents !== null && !shown.length ? <p class="empty">{texts.noneFound} <button type="button" class="button small quietly" onClick={() => { setSearch(""); setModel(""); }}>{texts.showAll}</button></p> : null}
+      ) : agents !== null && !shown.length && !gone.length ? <p class="empty">{texts.noneFound} <button type="button" class="button small quietly" onClick={() => { setSearch(""); setModel(""); }}>{texts.showAll}</button></p> : null}
+      {gone.length ? (
+        <section>
+          <h2>{texts.away}</h2>
+          <ul class="rows away" aria-label={texts.away}>{gone.map((robot) => <AwayRow key={robot.address} robot={robot} />)}</ul>
+        </section>
+      ) : null}
       <ByModel />
     </>
   );
 }
 
+/** A robot that is away: who it was, and what it has done. */
+function AwayRow({ robot }: { robot: Agent }) {
+  const description = useModel(robot.models[0] ?? "")?.description;
+  return (
+    <li>
+      <a class="list-row" href={`#/robot/${robot.address}`}>
+        <Picture address={robot.address} cid={robot.profile?.picture} size="small" />
+        <span class="who"><strong>{nameOf(robot)}</strong><span class="quiet"><Title of={description} /> · {recordOf(robot.record)}</span></span>
+        <Doing robot={robot} />
+      </a>
+    </li>
+  );
+}
+
+/** What a model does, in its own words. */
+export function Title(props: { of: Description | null | undefined; most?: number }) {
+  return <Strange text={props.of?.title || texts.undescribed} most={props.most ?? 80} />;
+}
+
+/** How many jobs a robot has done. */
+export function recordOf({ done, failed }: Pick<JobRecord, "done" | "failed">): string {
+  return done + failed ? texts.recordShort(done, failed) : texts.noRecord;
+}
+
 /** What a robot is called here. */
 export function nameOf(robot: Agent): string {
-  return plain(robot.profile?.name ?? "", 80) || `${texts.robot} ${robot.address.slice(0, 6)}…${robot.address.slice(-4)}`;
+  return plain(robot.profile?.name ?? "", 80) || `${texts.robot} ${short(robot.address)}`;
 }
 
 function matches(robot: Agent, search: string): boolean {
@@ -68,7 +100,7 @@ export function ModelFilter(props: { models: string[]; model: string; choose: (c
 
 function ModelChip(props: { cid: string; chosen: boolean; choose: (cid: string) => void }) {
   const model = useModel(props.cid);
-  return <button type="button" class="chip" aria-pressed={props.chosen} onClick={() => props.choose(props.cid)}><Strange text={model?.description?.title ?? texts.undescribed} most={40} /></button>;
+  return <button type="button" class="chip" aria-pressed={props.chosen} onClick={() => props.choose(props.cid)}><Title of={model?.description} most={40} /></button>;
 }
 
 function RobotCard({ robot }: { robot: Agent }) {
@@ -82,12 +114,12 @@ function RobotCard({ robot }: { robot: Agent }) {
       <a class="face" href={page} tabIndex={-1} aria-hidden="true"><Picture address={robot.address} cid={profile?.picture} size="large" /></a>
       <div class="inside">
         <h2><a href={page}>{nameOf(robot)}</a></h2>
-        <p class="does"><Strange text={description?.title ?? texts.undescribed} most={80} /></p>
+        <p class="does"><Title of={description} /></p>
         <p class="about"><Strange text={profile?.about || description?.description || ""} most={160} /></p>
         <p class="inline"><Doing robot={robot} />{profile?.place ? <Badge kind="calm"><Strange text={profile.place} most={40} /></Badge> : null}</p>
         <Readings of={profile?.readings ?? {}} />
         <div class="row between foot">
-          <span><strong class="price-tag">{price || texts.asksPrice}</strong><span class="quiet record">{record.done + record.failed ? texts.recordShort(record.done, record.failed) : texts.noRecord}</span></span>
+          <span><strong class="price-tag">{price || texts.asksPrice}</strong><span class="quiet record">{recordOf(record)}</span></span>
           {cid ? <a class="button" href={`#/order/model/${cid}/${robot.address}`} aria-label={texts.orderFrom(nameOf(robot))}>{texts.order}</a> : null}
         </div>
       </div>
@@ -103,6 +135,7 @@ export function priceOf(robot: Agent, described: string | undefined): string {
 /** What a robot is doing, and how long a new job would wait. */
 export function Doing({ robot }: { robot: Agent }) {
   const { profile, health } = robot;
+  if (health === "away") return <Badge kind="calm">{robot.since ? texts.awaySince(since(robot.since)) : texts.robotAway}</Badge>;
   if (health === "silent") return <Badge kind="warn">{texts.health.silent}</Badge>;
   if (!profile) return <Badge kind="calm">{texts.doing.present}</Badge>;
   const kinds = { idle: "good", working: "calm", stopped: "bad", closed: "warn" } as const;

@@ -4,9 +4,9 @@ import { post, query } from "../api";
 import { useApp, useData, useTopic } from "../app";
 import { amount, clock, duration, ether, size } from "../format";
 import { texts } from "../texts";
-import type { AccountState, Agent, Agents, Liability, LogEvent } from "../types";
+import type { AccountState, Agent, Agents, LogEvent } from "../types";
 import { Action, Badge, Facts, Field, Money, Name, Show, Strange, Table } from "../ui";
-import { JobTable } from "./account";
+import { LatestJobs } from "./account";
 import { LoginForm } from "./login";
 
 /** Who is present, for operators: health, jobs by phase, earnings, alerts, actions. */
@@ -55,8 +55,6 @@ function Phases(props: { jobs?: Record<string, number> }) {
 
 function AgentDetails({ agent }: { agent: Agent }) {
   const { market } = useApp();
-  const jobs = useData<{ liabilities: Liability[] }>(`liabilities?party=${agent.address}&limit=20`);
-  useTopic("chain", jobs.reload);
   return (
     <section class="panel">
       <h2><Strange text={agent.role} most={40} /> <Name text={agent.address} href={agent.role === "agent" ? `#/robot/${agent.address}` : undefined} /></h2>
@@ -77,7 +75,7 @@ function AgentDetails({ agent }: { agent: Agent }) {
         </>
       ) : null}
       <h3>{texts.jobs}</h3>
-      <Show of={jobs}>{({ liabilities }) => <JobTable liabilities={liabilities} />}</Show>
+      <LatestJobs of={agent.address} />
       <Log address={agent.address} />
       {market.role === "operator" ? <OperateByAddress robot={agent.address} /> : <OperatorLogin what={texts.operatorsOnly} />}
     </section>

@@ -9,7 +9,7 @@ import type { Model, Robot } from "../types";
 import { Show, Strange } from "../ui";
 import { AccountControl } from "./account";
 import { ObjectiveChoice, firstChoice, objectiveOf, useObjective, withoutDescription } from "./objective";
-import { OrderButton } from "./order";
+import { OrderButton, typicalPrice } from "./order";
 
 /** The page of one robot: what it does, what it costs, one button. Fit for a frame in another site. */
 export function SinglePage({ robot }: { robot: Robot }) {
@@ -33,9 +33,7 @@ function RobotOrder({ robot, model }: { robot: Robot; model: Model }) {
   const { market, account } = useApp();
   const [choice, setChoice] = useState(() => firstChoice(model));
   const chosen = useObjective(model, choice);
-  const [number, unit] = (model.description?.price ?? "").split(" ");
-  const typical = unit === market.token.symbol ? parseAmount(number, market.token.decimals) ?? 0n : 0n;
-  const cost = robot.cost !== null ? BigInt(robot.cost) : typical;
+  const cost = robot.cost !== null ? BigInt(robot.cost) : parseAmount(typicalPrice(model.description?.price, market.token.symbol), market.token.decimals) ?? 0n;
   const wish = useMemo<Wish | null>(() => {
     const objective = robot.objective ? () => objectiveOf(robot.objective!, model) : chosen;
     return objective && { model, robot: "" as const, objective, cost, validator: zeroAddress, validatorFee: 0n, minutes: null };

@@ -1,4 +1,4 @@
-"""Writes docs/reference/http.md from openapi.json: `python -m tests.bridges.web.reference > docs/reference/http.md`."""
+"""The page about the interface of `aira web`, from its openapi.json."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Errors have a fitting status and this body, with a code of [codes.md](codes.md):
 """
 
 
-def reference() -> str:
-    """The text of docs/reference/http.md."""
+def http_api() -> str:
+    """The page's text."""
     document = decode_json(OPENAPI.read_text(encoding="utf-8"))
     return "\n".join((HEAD.format(description=document["info"]["description"]), *_paths(document), *_schemas(document)))
 
@@ -87,7 +87,3 @@ def _type(schema: dict[str, Any]) -> str:
     if kind == "string":
         return "bytes" if schema.get("format") == "binary" else "text"
     return str(kind)
-
-
-if __name__ == "__main__":
-    print(reference(), end="")
