@@ -1,4 +1,6 @@
-"""The commands of the READMEs, run as printed by shells that have nothing but a PATH and a home.
+"""The commands of the READMEs and of the tutorial, run as printed by shells that have nothing but a PATH and a home.
+
+What the pages show of their output is what they print, but for addresses, hashes and numbers.
 
 The ports are this test's own, by variables; `aira up` has none for its chain, so that gets options.
 """
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from documentation.blocks import blocks as blocks_of
 from tests.support.commands import Serving, run
 from tests.support.peers import require
 from tests.support.ports import free_port
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 ROOT: Final = Path(__file__).parents[1]
+TUTORIAL: Final = ROOT / "docs" / "tutorials" / "first-robot.md"
 READMES: Final = (ROOT / "README.md", *sorted(ROOT.glob("examples/*/README.md")))
 COMMAND: Final = re.compile(r"(?:\w+=\S+ )*(?:aira|echo|eval|export|make|npm|pip|pipx|python|uv)\s")
 PORT: Final = "/tmp/aira-board-…/tty"
@@ -34,11 +38,15 @@ SERVES: Final = {
     "aira router": "listens at",
     "aira board run": "connect it with",
     "aira edge": "edge of 0x",
+    "hello_mesh/agent.py": "watching on",
     "/robot.py": "account 0x",
     "/rover.py": "the rover drives",
 }
 """Commands that serve until they are stopped, each with what it prints when it is ready."""
+VARIES: Final = re.compile(r"0x[0-9a-fA-F]+|Qm\w{44}|\b[0-9a-f]{64}\b|\d[\d,.]*")
+"""What commands print, and is another each time."""
 NOT_RUN: Final = {
+    "aira chain deploy": "it is for other chains than that of `aira up`, which has the contracts",
     "make test": "it runs this test",
     "pipx install": "it installs from a registry; the tests of the wheel install the package",
 }
@@ -63,6 +71,24 @@ def blocks(readme: Path) -> list[str]:
         for block in re.split(r"\n\n+", re.sub(r"^    ", "", text, flags=re.MULTILINE).strip("\n"))
         if COMMAND.match(block)
     ]
+
+
+def lines_of(text: str) -> list[str]:
+    """The lines of an output, as they are each time; lines about progress, which are alike then, once."""
+    lines = [VARIES.sub("…", line.strip()) for line in text.splitlines() if line.strip()]
+    return [line for line, before in zip(lines, ["", *lines], strict=False) if line != before]
+
+
+def blocks_printed(page: Path, printed: str) -> int:
+    """How many blocks of a page show what a command has printed: their first line is in it, and so must be the rest."""
+    output, found = lines_of(printed), 0
+    for block in blocks_of(page):
+        shown = lines_of(block.text)
+        if shown[0] in output:
+            at = output.index(shown[0])
+            assert output[at : at + len(shown)] == shown, f"{page.name}:{block.line}"
+            found += 1
+    return found
 
 
 @dataclass
@@ -161,6 +187,19 @@ def test_the_first_steps(reader: Reader) -> None:
     commands = [re.sub(r"^make demo", "aira demo", block) for block in blocks(ROOT / "README.md")]
     (demo, _) = reader.follow(commands)
     assert "person    had 1,000 XRT, has 958 XRT" in demo
+    assert blocks_printed(ROOT / "README.md", demo) == 3
+
+
+def test_the_tutorial(reader: Reader) -> None:
+    written = blocks(TUTORIAL)
+    market = [block for block in written if "aira up --data-dir" in block or "examples/hello_mesh" in block]
+    (printed,) = reader.follow(market)
+    assert blocks_printed(TUTORIAL, printed) == 1
+    (contract,) = re.findall(r"^contract (0x\w{40})", printed, re.MULTILINE)
+    (questions,) = [block for block in written if block.startswith("aira chain status")]
+    account = f"{market[-1].splitlines()[0]} AIRA_KEYFILE=.aira/development/person.json\n"
+    (answers,) = reader.follow([account + re.sub(r"0x\w{40}", contract, questions)])
+    assert "958 XRT" in answers
 
 
 def test_a_job_is_ordered_of_the_rover(reader: Reader) -> None:
