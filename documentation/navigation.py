@@ -1,8 +1,9 @@
-"""The order of the site's pages: that in which the first page links to them, and then that of their names."""
+"""The order of the site's pages: as the first page links to them, then as their folder's does, then by name."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from typing import TYPE_CHECKING, Final
 
@@ -26,7 +27,12 @@ ABOUT: Final = ("contributing.md", "security.md", "changelog.md", "contracts.md"
 
 def navigation(pages: Path) -> str:
     """The setting `nav`, in TOML."""
-    linked = re.findall(r"\]\(([^)#\s]+\.md)", (pages / "index.md").read_text(encoding="utf-8"))
+    linked = [
+        os.path.normpath(os.path.join(folder, name))
+        for folder in ("", *SECTIONS)
+        if (index := pages / folder / "index.md").exists()
+        for name in re.findall(r"\]\(([^)#\s]+\.md)", index.read_text(encoding="utf-8"))
+    ]
     ranks = {name: rank for rank, name in reversed(list(enumerate(linked)))}
     top = [folder for folder in SECTIONS if "/" not in folder and (pages / folder).is_dir()]
     sections = [_section(pages, folder, ranks) for folder in top]

@@ -73,8 +73,10 @@ def _table(measured: dict[str, Any], bars: dict[str, str]) -> str:
             cells = {(row, column): text for (column, row), text in cells.items()}
             return _grid(columns, list(measured), cells)
         return _grid(list(measured), columns, cells)
-    rows = (f"| {_words(figure)} | {_shown(value)} | {bars.get(figure, '')} |\n" for figure, value in _flat(measured))
-    return f"| figure | measured | bar |\n|---|---|---|\n{''.join(rows)}"
+    figures = dict(_flat(measured))
+    cells = {(figure, "measured"): _shown(value) for figure, value in figures.items()}
+    cells |= {(figure, "bar"): bar for figure, bar in bars.items()}
+    return _grid(list(figures), ["measured", "bar"] if bars else ["measured"], cells)
 
 
 def _grid(rows: list[str], columns: list[str], cells: dict[tuple[str, str], str]) -> str:

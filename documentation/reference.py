@@ -154,7 +154,9 @@ def _keys() -> str:
     """The page of the keyspace and of the messages on it."""
     about = cleandoc(keys.__doc__ or "").partition("\n\n")[0]
     text = f"# Keyspace and messages of a market\n\n{about}\n\n| key | what is on it |\n|---|---|\n"
-    text += "".join(f"| `{key.pattern}` | {escaped(_first(key))} |\n" for key in _key_classes())
+    text += "".join(
+        f"| <code>{key.pattern.replace('/', '/<wbr>')}</code> | {escaped(_first(key))} |\n" for key in _key_classes()
+    )
     text += "\n## Messages\n\nThe JSON objects that travel on a market's keys.\n"
     for kind in MESSAGE_TYPES:
         text += f"\n### {kind.__name__}\n\n{escaped(_first(kind))}\n\n| field | type |\n|---|---|\n"
