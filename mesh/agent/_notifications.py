@@ -36,7 +36,7 @@ from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.errors import ConfigurationError
-from mesh.market.transactions import LEAST_GAS
+from mesh.market.transactions import least_cost
 from mesh.network import NetworkChange
 from mesh.network.presence import PresenceWatch
 from schemas.decoding import InvalidData, first_line
@@ -330,7 +330,7 @@ class OwnerWatch:
         is_low, chain = False, self._parts.chain
 
         async def shortage() -> tuple[int, int]:
-            return await chain.tokens.eth_balance(), ENOUGH * LEAST_GAS * await chain.node.gas_price()
+            return await chain.tokens.eth_balance(), ENOUGH * await least_cost(chain.node)
 
         while True:
             balance, needed = await chain.retrying(shortage, outages=self._parts.outages)

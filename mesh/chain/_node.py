@@ -47,6 +47,7 @@ from mesh.chain.metrics import NodeMetrics
 from mesh.chain.rpc import RpcClient
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings.chains import ANY
+from schemas import keccak256
 from schemas.address import address_bytes
 
 if TYPE_CHECKING:
@@ -349,6 +350,44 @@ class ContractBlocks:
         return asyncio.get_running_loop().time()
 
 
+FEE_ORACLE: Final = "0x420000000000000000000000000000000000000F"
+"""Where each OP-type rollup has its contract `GasPriceOracle`."""
+GET_L1_FEE: Final = bytes.fromhex("49948e0e")
+"""Selector of its `getL1Fee(bytes)`: what a transaction with these bytes, unsigned, pays for its data, wei."""
+FEE_SAMPLE: Final = b"".join([keccak256(bytes([number])) for number in range(32)])
+"""Bytes that can't be compressed: what the oracle is asked about."""
+OTHER_FIELDS: Final = 64
+"""Bytes of a transaction beside its data, about: number, fees, gas, recipient."""
+FEE_SECONDS: Final = 60.0
+"""How long what the oracle said is used."""
+
+
+class DataFees:
+    """What a rollup of the OP type charges for the data of transactions, which it brings to Ethereum, beside their gas.
+
+    Its oracle is asked once a minute at most. What is charged goes by the compressed length, to which zeros add
+    nothing, so each other byte costs about the same. On a chain without the oracle nothing is asked after the first
+    time. `call` calls it.
+    """
+
+    def __init__(self, call: Callable[[bytes], Awaitable[bytes | None]]) -> None:
+        self._call = call
+        self._has_oracle = True
+        self._per_byte = 0.0
+        self._until = float("-inf")
+
+    async def of(self, data: bytes) -> int:
+        """What a transaction with this data is charged now, about; 0 elsewhere, wei."""
+        now = asyncio.get_running_loop().time()
+        if self._has_oracle and now >= self._until:
+            answer = await self._call(GET_L1_FEE + encode(["bytes"], [FEE_SAMPLE]))
+            self._has_oracle = answer != b""
+            if answer is not None and len(answer) == 32:
+                self._per_byte = int.from_bytes(answer) / len(FEE_SAMPLE)
+            self._until = now + FEE_SECONDS
+        return round(self._per_byte * (len(data) - data.count(0) + OTHER_FIELDS))
+
+
 log = logging.getLogger(__name__)
 
 READ_ATTEMPTS: Final = 3
@@ -461,6 +500,7 @@ class Node:
         """The latest block, for all who wait for the next one."""
         self.contract_blocks = ContractBlocks(self.heads, self._run_number, interval=self.timing.poll_interval)
         """The blocks as contracts count them."""
+        self._data_fees = DataFees(self._ask_fee_oracle)
         self._logs_refused = 0
         self._doubted = b"", 0
         """The block of the last empty answer that could not be proven, and how many there were for it."""
@@ -758,6 +798,22 @@ class Node:
     async def gas_price(self) -> int:
         """The price of a unit of gas that the node suggests, wei."""
         return int(await self._ask("eth_gasPrice"))
+
+    async def data_fee(self, data: bytes) -> int:
+        """What a transaction with this data is charged for it beside its gas, wei; 0 but on OP-type rollups."""
+        return await self._data_fees.of(data)
+
+    async def data_gas(self, data: bytes) -> int:
+        """The same as the gas that can be bought for it now."""
+        fee = await self.data_fee(data)
+        return -(-fee // max((await self.gas_market()).price, 1)) if fee else 0
+
+    async def _ask_fee_oracle(self, data: bytes) -> bytes | None:
+        try:
+            return await self.call({"to": FEE_ORACLE, "data": "0x" + data.hex()})
+        except (RequestRefused, Reverted) as error:
+            log.debug("the fee for data can't be asked: %s", error)
+            return None
 
     async def gas_market(self) -> GasMarket:
         """The price of gas in the latest block, with the priority fee that the node suggested of late."""

@@ -189,7 +189,8 @@ class Log(_Answer, frozen=True):
 class MinedTransaction(_Answer, frozen=True):
     """The receipt of a transaction. `status` is 1 if it succeeded, `sender` is who paid its gas.
 
-    Some nodes don't say at which price: then `effective_gas_price` is None.
+    Some nodes don't say at which price: then `effective_gas_price` is None. `l1_fee` is what OP-type rollups charge for
+    the data of a transaction beside its gas, wei.
     """
 
     block_number: Count
@@ -199,6 +200,12 @@ class MinedTransaction(_Answer, frozen=True):
     logs: Annotated[list[Log], Meta(max_length=MAX_LOGS)]
     effective_gas_price: Quantity | None = None
     sender: Address | None = msgspec.field(default=None, name="from")
+    l1_fee: Quantity | None = None
+
+    def wei(self, *, price: int | None = None) -> int | None:
+        """What it has cost; `price` counts where the node does not say the price of gas, and None is not known."""
+        paid = price if self.effective_gas_price is None else self.effective_gas_price
+        return None if paid is None else self.gas_used * paid + (self.l1_fee or 0)
 
 
 class BlockReceipt(_Answer, frozen=True):

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from schemas.records import Liability
 
 OUTCOME_GETTERS: Final = ("promisor", "isFinalized", "isSuccess")
+FINALIZATION_DATA: Final = 130
+"""Bytes of the data of a finalization, about, without zeros."""
 READ_AT_ONCE: Final = 60
 """How many records a listing reads at a time, in ten calls."""
 ASKED_AT_ONCE: Final = 32
@@ -91,7 +93,7 @@ class Dated:
 
 @dataclass(frozen=True, slots=True)
 class GasPaid:
-    """What the gas of a transaction cost, wei (None: the node does not say the price), and the account that paid it."""
+    """What a transaction cost, wei (None: the node does not say the price of gas), and the account that paid it."""
 
     wei: int | None
     payer: str | None
@@ -213,9 +215,7 @@ class Liabilities:
         for start in range(0, len(wanted), ASKED_AT_ONCE):
             some = wanted[start : start + ASKED_AT_ONCE]
             for tx, receipt in zip(some, await asyncio.gather(*map(self._node.receipt, some)), strict=True):
-                price = None if receipt is None else receipt.effective_gas_price
-                wei = None if receipt is None or price is None else receipt.gas_used * price
-                found[tx] = GasPaid(wei, None if receipt is None else receipt.sender)
+                found[tx] = GasPaid(None, None) if receipt is None else GasPaid(receipt.wei(), receipt.sender)
         return found
 
     async def _created_before(self, block: int, wanted: set[str]) -> dict[str, tuple[str, int]]:
@@ -306,6 +306,11 @@ class Liabilities:
         made = first_event(receipt.logs, NewLiability, emitter=self._contracts.factory)
         self._version.recognise(made.liability)
         return Created(made.liability, receipt.tx, receipt.nonce, receipt.gas_used, receipt.wei)
+
+    async def data_gas(self, demand: Demand, offer: Offer) -> int:
+        """The gas for whose price the data of a contract's two transactions goes to Ethereum, on OP-type rollups."""
+        data = order_abi(demand) + order_abi(offer) + b"\1" * FINALIZATION_DATA
+        return await self._node.data_gas(data)
 
     async def withdraw(self, order: Order) -> Receipt:
         """Make a signed order of one's own unusable on the chain, for every provider.

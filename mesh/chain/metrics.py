@@ -45,7 +45,9 @@ class NodeMetrics:
         self.transactions = Counter(dict.fromkeys(TransactionOutcome, 0))
         self.gas_used = 0
         self.wei = 0
-        """What that gas has cost."""
+        """What they have cost."""
+        self.data_wei = 0
+        """The part of it that an OP-type rollup has charged for their data."""
         self.failures = 0
         """Requests that no node answered in any attempt."""
         self.losses = 0
@@ -66,7 +68,8 @@ class NodeMetrics:
         return (
             by_label("aira_transactions_total", "counter", meaning, "outcome", outcomes),
             counter("aira_gas_used_total", "Gas that transactions on the chain have used", self.gas_used),
-            counter("aira_gas_spent_wei_total", "What that gas has cost, wei", self.wei),
+            counter("aira_gas_spent_wei_total", "What these transactions have cost, wei", self.wei),
+            counter("aira_data_spent_wei_total", "The part of it for their data, on OP-type rollups", self.data_wei),
             counter("aira_node_failures_total", "Questions that no node of the chain answered", self.failures),
             counter("aira_node_losses_total", "How often the nodes of the chain fell silent", self.losses),
         )

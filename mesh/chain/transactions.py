@@ -548,12 +548,13 @@ class TransactionSender:
         """The receipt of a mined transaction. Raises `Reverted` if it failed."""
         gas_used = receipt.gas_used
         # Where the node does not say at which price, the most that the transaction offered: it has cost no more.
-        price = receipt.effective_gas_price
-        wei = gas_used * (Fees.of(entry.fields).maximum if price is None else price)
+        wei = receipt.wei(price=Fees.of(entry.fields).maximum)
+        assert wei is not None
         succeeded = receipt.status == 1
         self.node.metrics.transactions[TransactionOutcome.MINED if succeeded else TransactionOutcome.FAILED] += 1
         self.node.metrics.gas_used += gas_used
         self.node.metrics.wei += wei
+        self.node.metrics.data_wei += receipt.l1_fee or 0
         if not succeeded:
             why = await self._why_failed(entry.fields, receipt)
             raise Reverted(
@@ -589,6 +590,7 @@ class TransactionSender:
     async def _raise_if_poor(self, fields: dict[str, Any], refused: RequestRefused) -> None:
         balance = await self.node.eth_balance(self.account.address)
         needed = fields.get("gas", 0) * fields.get("maxFeePerGas", fields.get("gasPrice", 0)) + fields["value"]
+        needed += await self.node.data_fee(bytes.fromhex(fields["data"][2:]))
         if balance < needed:
             raise InsufficientFunds(self.account.address, balance=balance, needed=needed) from refused
 

@@ -1,9 +1,9 @@
 """What a provider earns and spends, and which contracts it creates.
 
 It creates those that cover its gas, its customers', and a number of free ones a day. Creating and finalizing a contract
-costs the provider gas. The fee of the offer covers it, and what the factory mints when work was paid for, both counted
-at the factory's rate of 1 wn for a unit of gas. Anybody can sign any number of orders that bring neither, with keys
-made for it.
+costs the provider gas, and on OP-type rollups a fee for the data, which counts as the gas that it would buy. The fee of
+the offer covers it, and what the factory mints when work was paid for, both counted at the factory's rate of 1 wn for a
+unit of gas. Anybody can sign any number of orders that bring neither, with keys made for it.
 """
 
 from __future__ import annotations
@@ -209,15 +209,18 @@ class FreeContracts:
         """How many may be created now for strangers."""
         return int(self._refilled(self._clock.time()))
 
-    def lacking(self, match: Match) -> int:
-        """The wn that a contract lacks to cover the provider's gas; 0 if it covers it."""
+    def lacking(self, match: Match, *, data_gas: int = 0) -> int:
+        """The wn that a contract lacks to cover the provider's gas; 0 if it covers it.
+
+        `data_gas` is what its data costs besides, as gas; nothing is minted for that.
+        """
         demand, offer = match.demand.message, match.offer.message
         cost, fee = demand.cost, offer.lighthouse_fee
         gas = _gas(demand.generation, cost, fee)
         strangers = len({match.demand.signer, match.offer.signer, self._account}) == 3
         is_minted = demand.token == self._xrt and strangers
         minted = gas if self._always_minted else min(cost, gas) if is_minted else 0
-        return max(gas - fee - minted, 0)
+        return max(gas + data_gas - fee - minted, 0)
 
     async def take(self, match: Match) -> bool:
         """Whether to create a contract that does not cover its gas; what it uses up is on disk when this returns."""
@@ -245,12 +248,12 @@ class FreeContracts:
         return min(self._left + max(now - self._at, 0.0) * self.a_day / DAY, self._most)
 
 
-def why(match: Match, xrt: str) -> str:
+def why(match: Match, xrt: str, *, data_gas: int = 0) -> str:
     """Why a contract that does not cover the gas is not created, for the makers of its orders."""
     demand, fee = match.demand.message, match.offer.message.lighthouse_fee
     enough = f"a cost of {XRT.show(_gas(demand.generation, 1, fee))} does"
-    if demand.token != xrt:
-        enough = f"a fee of {XRT.show(_gas(demand.generation, demand.cost, 1))} in the offer does"
+    if demand.token != xrt or data_gas:
+        enough = f"a fee of {XRT.show(_gas(demand.generation, demand.cost, 1) + data_gas)} in the offer does"
     return f"its contract would not cover the provider's gas, and there is no free one left now: {enough}, or wait"
 
 

@@ -679,8 +679,11 @@ class Settlement:
 
     async def _create(self, match: Match) -> None:
         parts, (demand, offer) = self._parts, match
-        if parts.free.lacking(match) and not await parts.free.take(match):
-            self._decline(match)
+        data_gas = await parts.chain.retrying(
+            partial(parts.chain.liabilities.data_gas, demand.message, offer.message), outages=parts.lookups
+        )
+        if parts.free.lacking(match, data_gas=data_gas) and not await parts.free.take(match):
+            self._decline(match, data_gas)
             return
         try:
             priority = parts.chain.funds.worth(demand.message)
@@ -721,7 +724,7 @@ class Settlement:
             amounts.update({Holding(token, order.signer): amount for token, amount in costs.items()})
         return Stakes(+amounts, frozenset(order.signer for order in match if order.message.generation == 5))
 
-    def _decline(self, match: Match) -> None:
+    def _decline(self, match: Match, data_gas: int) -> None:
         """A match does not cover the gas: drop the offer, let the demand wait for a better one, and tell both."""
         self._parts.orders.end(match.demand)
         self._parts.orders.end(match.offer, OrderStage.REFUSED)
@@ -731,7 +734,7 @@ class Settlement:
         orders = self._parts.orders
         is_waiting = order_id(match.demand) in orders.book or orders.is_paired(match.demand)
         for order in match if is_waiting else (match.offer,):
-            self.rejections.reject(order, Refusal.UNPAID, why(match, self._parts.chain.xrt))
+            self.rejections.reject(order, Refusal.UNPAID, why(match, self._parts.chain.xrt, data_gas=data_gas))
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[CreatedContract]]:
         """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`."""

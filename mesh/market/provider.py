@@ -26,7 +26,7 @@ from mesh.market._services import OrderBookService, PairService, ProviderStatus
 from mesh.market._settlement import OPEN_LIABILITIES, Settlement, SettlementParts
 from mesh.market.book import LIMIT, Match
 from mesh.market.store import MarketStore
-from mesh.market.transactions import LEAST_GAS, RETRY, UNDER_WAY, NoStake, TransactionQueue
+from mesh.market.transactions import RETRY, UNDER_WAY, NoStake, TransactionQueue, least_cost
 from mesh.market.withdrawals import Withdrawals
 from mesh.network.channel import Channel
 from mesh.network.metrics import link_state, network_families
@@ -390,9 +390,9 @@ async def check_account(chain: Chain, lighthouse: str) -> None:
     state = await chain.lighthouses.get(lighthouse)
     if address not in state.stakes:
         raise NoStake(address, lighthouse, minimal_stake=state.minimal_stake)
-    balance, price = await chain.tokens.eth_balance(), await chain.node.gas_price()
-    if balance < LEAST_GAS * price:
-        raise InsufficientFunds(address, balance=balance, needed=LEAST_GAS * price)
+    balance, needed = await chain.tokens.eth_balance(), await least_cost(chain.node)
+    if balance < needed:
+        raise InsufficientFunds(address, balance=balance, needed=needed)
 
 
 async def provider_file(settings: StorageSettings, chain: Chain, address: str, lighthouse: str) -> Path:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
 
-    from mesh.chain import Chain, Funding, Holding, LighthouseState
+    from mesh.chain import Chain, Funding, Holding, LighthouseState, Node
     from mesh.market._earnings import EarningsLedger
 
 
@@ -140,7 +140,14 @@ OUT_OF_TURN: Final = frozenset({"NotYourTurn", "NotAProvider"})
 """The lighthouse's errors for a provider whose turn it is not, whatever the transaction."""
 LEAST_GAS: Final = 200_000
 """About what the cheapest transaction of a provider uses."""
+LEAST_DATA: Final = 500
+"""Bytes of its data, about, without zeros."""
 WAITS: Final = "a transaction waits"
+
+
+async def least_cost(node: Node) -> int:
+    """About what the cheapest transaction of a provider costs now, wei."""
+    return LEAST_GAS * await node.gas_price() + await node.data_fee(b"\1" * LEAST_DATA)
 
 
 def may_pass(error: NodeUnreachable | RequestRefused | Reverted) -> bool:

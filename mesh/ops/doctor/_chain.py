@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from mesh.amounts import ETH, XRT, Unit
 from mesh.chain import GWEI, Account, Chain, FeePolicy, Node, Timing
 from mesh.chain.errors import NoContracts, RequestRefused
-from mesh.market.transactions import LEAST_GAS
+from mesh.market.transactions import least_cost
 from mesh.ops.doctor._machine import RECENT, TOLERATED, compare_chain_clock, compare_clock, duration
 from mesh.ops.doctor.checks import CheckResult, failed, in_thread, passed, warning
 from schemas.address import ZERO_ADDRESS
@@ -242,7 +242,7 @@ class AccountChecks:
         node = self._chain_checks.node
         balance = await node.eth_balance(self.address)
         node.fees.offer(await node.gas_market())
-        one = LEAST_GAS * await node.gas_price()
+        one = await least_cost(node)
         count = balance // one if one else AMPLE
         shown = f"{self.address} has {_amount(balance, ETH)}"
         if count >= AMPLE:
@@ -292,7 +292,7 @@ class AccountChecks:
             return passed(f"the factory may transfer {_amount(allowed, coin)}")
         node = chain.node
         approve = "`aira xrt approve factory AMOUNT`"
-        if await node.eth_balance(self.address) < LEAST_GAS * await node.gas_price():
+        if await node.eth_balance(self.address) < await least_cost(node):
             return failed(
                 f"the factory may not transfer {coin.symbol} of {self.address}, which has no ETH to approve it",
                 code="no-allowance",
