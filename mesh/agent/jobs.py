@@ -543,6 +543,11 @@ _playing: ContextVar[str] = ContextVar("playing", default="")
 """The job whose playback, or handler, is the running code."""
 
 
+def job_of_handler() -> str:
+    """The job (address) whose playback, or handler, is the running code; empty outside of one."""
+    return _playing.get()
+
+
 class Executor:
     """Does the jobs of one agent: `run` in a task, `prepare` each new job.
 

@@ -7,7 +7,7 @@ import dataclasses
 import logging
 import shutil
 import tempfile
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -29,6 +29,9 @@ from mesh.network import Endpoints, Network
 from mesh.network.endpoints import free_endpoint
 from mesh.recording import open_objective
 from mesh.settings import Settings
+from mesh.testing._cable import Cable
+from mesh.testing._clock import MarketClock
+from mesh.testing._disk import full, small_disk
 from mesh.testing._outcomes import JobRecording, RecordedOutcome
 from schemas import cid_of_bytes, keccak256
 from schemas.keys import RpcKey
@@ -190,6 +193,7 @@ class Market(Lifecycle):
         self.chain = await enter(MarketChain()) if self._given_chain is None else self._given_chain
         """Where its contracts are."""
         self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-market-")))
+        self._disks = stack.enter_context(ExitStack())
         self.endpoint = await _router(stack)
         """Where it can be reached with Zenoh, as in `tcp/127.0.0.1:7447`."""
         self._first = await _block_number(self.chain.node)
@@ -205,6 +209,9 @@ class Market(Lifecycle):
         self._ready = await _block_number(self.chain.node)
         network = await enter(Network(Endpoints(connect=(self.endpoint,))))
         self._session = network.session
+        self.clock = MarketClock(self.mine, self._running)
+        """The clock of the jobs here, and of the chain: `await market.clock.advance(20)`."""
+        stack.enter_context(self.clock.running())
         options = ProviderOptions(free_contracts=FREE_CONTRACTS)
         working = await enter(Provider(network.session, provider, self.lighthouse, options))
         tasks = await enter(Background())
@@ -238,17 +245,24 @@ class Market(Lifecycle):
         return await self._stack_of_people.enter_async_context(agent)
 
     @asynccontextmanager
-    async def robot(self, agent: Agent) -> AsyncIterator[Agent]:
+    async def robot(self, agent: Agent, *, disk: int = 0) -> AsyncIterator[Agent]:
         """Put an agent to work in this market: `async with market.robot(agent)`; yields it.
 
         It gets an account with 1,000 XRT, and settings that point to this market; those that say how it works stay.
-        Afterwards it has its own settings again. In the same market it keeps its account and its files.
+        Afterwards it has its own settings again. In the same market it keeps its account and its files. With `disk`
+        these are on a disk of their own of that many bytes, for `disk_full`: on Linux, as root; elsewhere the test is
+        skipped.
         """
         host = self._hosts.get(id(agent))
         if host is None:
             account, chain = await self._account(agent._account)
-            place = self._place(account.address)
-            host = self._hosts[id(agent)] = _Host(agent, account, chain, place, self._session)
+            folder = account.address
+            if disk:
+                self._disks.enter_context(small_disk(self._folder / folder, disk))
+                folder = f"{folder}/files"
+            cable = await self._stack_of_people.enter_async_context(Cable(self.endpoint))
+            place = self._place(folder) | {"connect": (cable.endpoint,)}
+            host = self._hosts[id(agent)] = _Host(agent, account, chain, place, cable, self._session)
         with host.moved():
             try:
                 await host.start()
@@ -338,6 +352,11 @@ class Market(Lifecycle):
         if not await _until(has_begun, timeout):
             raise RemoteError(f"the job has not begun within {timeout:g} s", code="not-running")
 
+    def _running(self) -> set[str]:
+        """The jobs (addresses) that have begun and not ended."""
+        at_work = [host.agent for host in self._hosts.values() if host.agent.is_open]
+        return {address for agent in at_work for address in agent.runtime.executor.runs}
+
     async def stop(self, contract: Contract, why: str = "") -> None:
         """Stop a job as its customer, once the robot works on it. Raises as `running` and `Contract.stop` do."""
         await self.running(contract)
@@ -352,11 +371,17 @@ class Market(Lifecycle):
         await self._host_of(robot).kill()
 
     async def restart(self, robot: Agent) -> None:
-        """Start a robot again, with its account and its files; one that is at work is ended in good order first."""
+        """Start a robot again, with its account and its files; one that is at work is ended in good order first.
+
+        What it failed with, as with a full disk, is logged.
+        """
         host = self._hosts.get(id(robot))
         if host is None:
             raise ClosedError("the agent is not at work here", hint="use `async with market.robot(agent)`")
-        await host.end()
+        try:
+            await host.end()
+        except Exception as error:
+            log.warning("the robot had failed: %s", error, extra=log_event("robot-failed"), exc_info=True)
         await host.start()
 
     async def mine(self, blocks: int = 1) -> None:
@@ -379,6 +404,36 @@ class Market(Lifecycle):
     async def node_down(self) -> AsyncIterator[None]:
         """Meanwhile no node answers, neither the robots and people nor the provider; `mine` and `reorg` still work."""
         with self.chain.line.down():
+            yield
+
+    @asynccontextmanager
+    async def partition(self, robot: Agent) -> AsyncIterator[None]:
+        """Meanwhile a robot has no connection to the market's router, but to the node; afterwards it is back.
+
+        Raises `ClosedError` for an agent that is not at work.
+        """
+        host = self._host_of(robot)
+        host.cable.cut()
+        try:
+            await _until(lambda: _is(not robot.network.connected), PATIENCE)
+            yield
+        finally:
+            host.cable.mend()
+        await _until(lambda: _is(robot.network.connected), PATIENCE)
+
+    @contextmanager
+    def disk_full(self, robot: Agent) -> Iterator[None]:
+        """Meanwhile no byte is left on the disk of a robot, which has one of its own: `market.robot(agent, disk=…)`.
+
+        Raises `InputError` (`no-disk`) for one that has none, and `ClosedError` for one that is not in this market.
+        """
+        host = self._hosts.get(id(robot))
+        if host is None:
+            raise ClosedError("the agent is not at work here", hint="use `async with market.robot(agent)`")
+        folder = self._folder / host.account.address
+        if not folder.is_mount():
+            raise InputError("the robot has no disk of its own", hint="use market.robot(agent, disk=…)", code="no-disk")
+        with full(folder):
             yield
 
     async def _default_customer(self) -> Agent:
@@ -417,10 +472,11 @@ class _Host:
     """Where an agent is at work: in a task of its own, so that it can end without those who use it."""
 
     def __init__(
-        self, agent: Agent, account: Account, chain: Chain, place: dict[str, Any], session: zenoh.Session
+        self, agent: Agent, account: Account, chain: Chain, place: dict[str, Any], cable: Cable, session: zenoh.Session
     ) -> None:
         self.agent = agent
         self.account = account
+        self.cable = cable
         self._chain = chain
         self._place = place
         self._session = session
@@ -500,6 +556,10 @@ async def _router(stack: AsyncExitStack) -> str:
         except PortUnavailable:  # somebody was faster
             continue
         return endpoint
+
+
+async def _is(state: bool) -> bool:
+    return state
 
 
 async def _block_number(node: EmbeddedChain) -> int:

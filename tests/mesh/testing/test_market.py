@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -115,7 +116,7 @@ async def test_a_robot_has_its_own_settings_again_afterwards(market: Market) -> 
     robot = Agent(settings=own)
     async with market.robot(robot):
         assert robot.settings.name == "Alice"
-        assert robot.settings.connect == (market.endpoint,)
+        assert robot.settings.connect != own.connect
     assert robot.settings == own
 
 
@@ -225,3 +226,85 @@ async def test_a_job_that_ends_without_a_node_is_paid_when_the_node_is_back(mark
                 await xrt_of(forklift)
             forklift.released.set()
         assert_paid(await market.outcome(contract))
+
+
+async def test_a_robot_without_a_connection_is_paid_once_it_is_back(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        contract = await market.demand(forklift, [("/lift", 0.0)], cost=PRICE)
+        await market.running(contract)
+        async with market.partition(forklift):
+            assert not forklift.network.connected
+            forklift.released.set()
+            with pytest.raises(AiraError) as caught:
+                await market.outcome(contract, timeout=0.5)
+            assert caught.value.code == "no-outcome"
+        assert_paid(await market.outcome(contract))
+
+
+async def test_a_robot_without_a_connection_gets_no_orders(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift), market.partition(forklift):
+        with pytest.raises(AiraError) as caught:
+            await market.order(ANYTHING, [("/lift", 1.0)], cost=PRICE, timeout=0.5)
+        assert caught.value.code == "no-contract"
+
+
+async def test_a_robot_with_a_full_disk_fails_and_goes_on_when_there_is_room(
+    market: Market, forklift: Forklift
+) -> None:
+    async with market.robot(forklift, disk=16 * 1024 * 1024):
+        contract = await market.demand(forklift, [("/lift", 0.0)], cost=PRICE)
+        await market.running(contract)
+        with market.disk_full(forklift):
+            forklift.released.set()
+            with pytest.raises(AiraError) as caught:
+                await market.outcome(contract, timeout=0.5)
+            assert caught.value.code == "no-outcome"
+        await market.restart(forklift)
+        assert_paid(await market.outcome(contract))
+
+
+async def test_only_a_disk_of_its_own_is_filled(market: Market, forklift: Forklift) -> None:
+    async with market.robot(forklift):
+        with pytest.raises(AiraError) as caught, market.disk_full(forklift):
+            """It does not come here."""
+        assert caught.value.code == "no-disk"
+
+
+async def test_the_clock_is_brought_forward_for_handlers_and_for_the_chain(market: Market) -> None:
+    robot, woke = Agent(ANYTHING), list[str]()
+    robot.on_demand(lambda demand: robot.offer(demand))
+
+    @robot.on("/wait", float)
+    async def wait(job: Job, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+        woke.append(f"{seconds:g}")
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await asyncio.Event().wait()
+        job.publish("/waited", 2 * seconds)
+
+    async with market.robot(robot):
+        contract = await market.demand(robot, [("/wait", 300.0), ("/wait", 100.0)], cost="1 XRT")
+        await market.running(contract)
+        before = await robot.chain.block_number()
+        await market.clock.advance(200)
+        assert woke == []
+        assert await robot.chain.block_number() == before + 200
+        await market.clock.advance(100)
+        assert woke == ["300"]
+        await market.clock.advance(500)
+        outcome = await market.outcome(contract)
+        assert_paid(outcome)
+        assert outcome.recording.values("/waited") == [600.0, 200.0]
+    with pytest.raises(AiraError) as caught:
+        await market.clock.advance(-1)
+    assert caught.value.code == "not-a-time"
+
+
+async def test_orders_expire_when_the_clock_is_brought_forward(market: Market) -> None:
+    person = await market.person()
+    order = await person.order([("/lift", 1.0)], model=ANYTHING, lifetime=5)
+    await market.clock.advance(6)
+    with pytest.raises(AiraError) as caught:
+        await order.contract(wait=True)
+    assert caught.value.code == "order-expired"

@@ -1,0 +1,136 @@
+"""The clock of a market in a test: what handlers wait for, and the chain's blocks, can be brought forward."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+from mesh.agent.jobs import job_of_handler
+from mesh.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+PATIENCE: Final = 1.0
+"""Seconds for which handlers may be at work, or wait for something else than the clock, before time passes anyway."""
+PAUSE: Final = 0.002
+"""Seconds between two looks at what they do."""
+MOST: Final = 24 * 3600.0
+"""Seconds that pass at once."""
+BLOCKS_AT_ONCE: Final = 1_000
+
+
+class Timer:
+    """A timer of a handler, as event loops have them."""
+
+    _source_traceback = None
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, when: float, call: Callable[[], object]) -> None:
+        self._call = call
+        self._loop = loop
+        self._set(when)
+
+    def _set(self, when: float) -> None:
+        self._when = when
+        self._handle = _call_at(self._loop, when, self._call)
+
+    def when(self) -> float:
+        """When it is due, by the loop's clock."""
+        return self._when
+
+    def cancel(self) -> None:
+        """It is not called."""
+        self._handle.cancel()
+
+    def cancelled(self) -> bool:
+        """Whether it was cancelled."""
+        return self._handle.cancelled()
+
+    @property
+    def is_set(self) -> bool:
+        """Whether it is still to be called."""
+        return not self._handle.cancelled() and self._when > self._loop.time()
+
+    def bring_forward(self, seconds: float) -> None:
+        """It is due earlier."""
+        self._handle.cancel()
+        self._set(self._when - seconds)
+
+
+def _call_at(loop: asyncio.AbstractEventLoop, when: float, call: Callable[[], object]) -> asyncio.TimerHandle:
+    handle: asyncio.TimerHandle = type(loop).call_at(loop, when, call)
+    return handle
+
+
+class MarketClock:
+    """The clock of a market: `await market.clock.advance(20)`.
+
+    It moves two things: the timers of handlers of jobs (`asyncio.sleep`, `asyncio.timeout`), and the chain, by a block
+    for each second. All else goes by the clock of the machine: connections, messages that are sent again, `time.time`,
+    threads, and simulated boards.
+    """
+
+    def __init__(self, mine: Callable[[int], Awaitable[None]], busy: Callable[[], set[str]]) -> None:
+        self._mine = mine
+        self._busy = busy
+        self._timers: dict[str, set[Timer]] = {}
+        """Those of handlers, by the address of the job."""
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Meanwhile it knows the timers that handlers set in this event loop."""
+        loop: Any = asyncio.get_running_loop()
+
+        def call_at(when: float, callback: Any, *arguments: Any, context: Any = None) -> Any:
+            if not (job := job_of_handler()):
+                return type(loop).call_at(loop, when, callback, *arguments, context=context)
+            timers = self._timers.setdefault(job, set())
+            timers -= {timer for timer in timers if not timer.is_set}
+            timer = Timer(loop, when, lambda: loop.call_soon(callback, *arguments, context=context))
+            timers.add(timer)
+            return timer
+
+        loop.call_at = call_at
+        try:
+            yield
+        finally:
+            del loop.call_at
+
+    async def advance(self, seconds: float) -> None:
+        """Let that many seconds pass at once, for the handlers of jobs that run here, and for the chain.
+
+        A handler that sleeps more than once sleeps on from where it is. Handlers that compute, or wait for something
+        else, get `PATIENCE` for it. Raises `InputError` for less than 0 s or more than a day.
+        """
+        if not 0 <= seconds <= MOST:
+            raise InputError(f"{seconds:g} s can't pass at once", hint="name 0 to 86400 s", code="not-a-time")
+        left, loop = seconds, asyncio.get_running_loop()
+        while True:
+            await self._until_asleep()
+            timers = [timer for timers in self._timers.values() for timer in timers if timer.is_set]
+            first = min((timer.when() for timer in timers), default=None)
+            step = left if first is None else min(left, max(first - loop.time(), 0.0))
+            for timer in timers:
+                timer.bring_forward(step)
+            left -= step
+            if left <= 0:
+                break
+            if first is None:
+                break
+            await asyncio.sleep(0)
+        await self._until_asleep()
+        blocks = round(seconds)
+        while blocks > 0:
+            await self._mine(min(blocks, BLOCKS_AT_ONCE))
+            blocks -= BLOCKS_AT_ONCE
+
+    async def _until_asleep(self) -> None:
+        """Return when all handlers of running jobs sleep, after `PATIENCE` at the latest."""
+        until = time.monotonic() + PATIENCE
+        while time.monotonic() < until and any(not self._sleeps(job) for job in self._busy()):  # noqa: ASYNC110
+            await asyncio.sleep(PAUSE)
+
+    def _sleeps(self, job: str) -> bool:
+        return any(timer.is_set for timer in self._timers.get(job, ()))
