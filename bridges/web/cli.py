@@ -48,7 +48,7 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option("--token-file", type=FILE, help="file with the token that people log in with")
 @click.option("--operator-token-file", type=FILE, help="file with the token that operators log in with")
 @click.option("--embed", multiple=True, metavar="ORIGIN", help="site that may show the page in a frame")
-@click.option("--explorer", default="", metavar="URL", help="block explorer to link to")
+@click.option("--explorer", default="", metavar="URL", help="block explorer to link to [the chain's]")
 @click.option("--from-block", type=click.IntRange(min=0), default=0, help="first block whose contracts are listed")
 @click.option("--robot", type=FILE, help="page for one robot: a TOML file with model, objective, cost, title, text")
 @click.option("--model", help="page for one robot: its model, a file or a CID")
@@ -124,7 +124,7 @@ def web_options(settings: Settings, options: dict[str, Any]) -> WebOptions:
         proxies=options["proxies"],
         embed=options["embed"],
         robot=robot_of(options),
-        explorer=options["explorer"],
+        explorer=options["explorer"] or settings.profile.explorer,
         from_block=options["from_block"],
     )
 

@@ -44,7 +44,7 @@ from mesh.chain.errors import (
     WrongChain,
 )
 from mesh.chain.metrics import NodeMetrics
-from mesh.chain.rpc import RpcClient
+from mesh.chain.rpc import RpcClient, is_answered
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings.chains import ANY
 from schemas import keccak256
@@ -435,11 +435,6 @@ def decode_answers(returned: bytes, *, number: int) -> list[bytes | None]:
     if len(answers) != number:
         raise SpoiledAnswer(f"there are {len(answers)} answers to {number} calls")
     return answers
-
-
-def is_answered(error: NodeUnreachable | RequestRefused) -> bool:
-    """Whether a node answers, and only lacks what was asked for, as a block or the state of an old one."""
-    return isinstance(error, RequestRefused) or isinstance(error.__cause__, SpoiledAnswer)
 
 
 LOGS_REFUSED: Final = 5

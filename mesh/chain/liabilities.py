@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec.structs import replace
 
 from mesh.chain._contracts import result_arguments
-from mesh.chain._node import getters, is_answered
+from mesh.chain._node import getters
 from mesh.chain.answers import LIABILITY_GETTERS, liability_record
 from mesh.chain.errors import NoContracts, NodeUnreachable, NotALiability, OrderAlreadyUsed, RequestRefused, Reverted
 from mesh.chain.following import (
@@ -26,6 +26,7 @@ from mesh.chain.following import (
     retrying,
     xrt_minted,
 )
+from mesh.chain.rpc import is_answered
 from mesh.errors import InvalidMessage
 from schemas.messages import cancellation_hash, message_hash, order_abi
 from schemas.signing import recover

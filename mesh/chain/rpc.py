@@ -547,6 +547,11 @@ def _may_pass(error: Exception, upstream: Upstream) -> bool:
     return upstream.is_node or isinstance(error, SpoiledAnswer) or not isinstance(error, ValueError | TimeoutError)
 
 
+def is_answered(error: NodeUnreachable | RequestRefused) -> bool:
+    """Whether a node answers, and only lacks what was asked for, as a block or the state of an old one."""
+    return isinstance(error, RequestRefused) or isinstance(error.__cause__, SpoiledAnswer)
+
+
 def _shown(chain: int | RpcFailure) -> str:
     return hex(chain) if isinstance(chain, int) else chain.message
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.amounts import ETH, XRT, Unit
+from mesh.amounts import XRT, Unit
 from mesh.cli.chain_client import READ_ATTEMPTS, open_chain, own_address
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.lighthouse import check_lighthouse
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 
+REFUND_SECONDS: Final = 7 * 86_400
+"""After which a job that nobody finished can be refunded, by default."""
 DEPLOYMENT_GAS: Final = 13_000_000
 """Slightly more than a whole deployment uses where it costs most: 9.9 million today, a fifth more on geth's next fork.
 An account that can't pay for it is rejected at the start."""
@@ -39,9 +41,9 @@ command = LazyGroup(
 @click.option(
     "--refund-delay",
     type=click.IntRange(1, 2**32 - 1),
-    default=50_400,
-    show_default=True,
-    help="blocks until the cost of an unfinished job can be refunded; can't be changed later",
+    default=None,
+    help="blocks until the cost of an unfinished job can be refunded; can't be changed later [a week of the chain's"
+    " blocks; 50400 if none is named]",
 )
 @click.option("--again", is_flag=True, help="deploy even if the chain already has the contracts; the old ones stay")
 @with_json
@@ -52,7 +54,7 @@ async def deploy_contracts(
     lighthouse: str,
     minimal_stake: str,
     timeout_blocks: int,
-    refund_delay: int,
+    refund_delay: int | None,
     again: bool,
     as_json: bool,
 ) -> None:
@@ -70,7 +72,7 @@ async def deploy_contracts(
         lighthouse=lighthouse,
         minimal_stake=XRT.parse(minimal_stake),
         timeout_blocks=timeout_blocks,
-        refund_delay=refund_delay,
+        refund_delay=refund_delay or settings.profile.blocks_in(REFUND_SECONDS),
     )
     check_lighthouse(plan.lighthouse, minimal_stake=plan.minimal_stake)  # it is created last, too late for an error
     account = await asyncio.to_thread(load_account, settings)
@@ -149,6 +151,8 @@ def _print_deployment(settings: Settings, deployment: Deployment, *, chain_id: i
             print_line(f'{name} = "{value}"')
 
 
+MEASURED: Final = 200
+"""Blocks between which their pace is measured."""
 GWEI: Final = Unit("gwei", 9, "wei")
 CONTRACT_FACTS: Final = ("ens", "factory", "xrt", "isOurCode", "lighthouse", "lighthouseName", "wn")
 """The fields that are null in JSON if the chain has no contracts."""
@@ -158,7 +162,8 @@ CONTRACT_FACTS: Final = ("ens", "factory", "xrt", "isOurCode", "lighthouse", "li
 @with_json
 @with_chain_settings("lighthouse_contract")
 async def status(settings: Settings, as_json: bool) -> None:
-    """Show the node and its chain, the contracts and which code they run, and the account's balances.
+    """Show the node and its chain, the settings for it, the contracts and which code they run, and the account's
+    balances.
 
     The exit code is 1 if the chain has no contracts; everything else is still shown.
     """
@@ -167,7 +172,7 @@ async def status(settings: Settings, as_json: bool) -> None:
     account = await asyncio.to_thread(own_address, settings)
     trouble: ChainError | None = None
     async with chain_of(settings, None, attempts=READ_ATTEMPTS).node as node:
-        facts = dict.fromkeys(CONTRACT_FACTS) | await _node_facts(node, account)
+        facts = dict.fromkeys(CONTRACT_FACTS) | await _node_facts(node, account) | await _profile_facts(node, settings)
         try:
             async with open_chain(settings) as chain:
                 facts |= await _contract_facts(chain, settings.lighthouse_contract, account)
@@ -189,6 +194,30 @@ async def _node_facts(node: Node, account: str | None) -> dict[str, Any]:
         "baseFee": None if block.base_fee is None else str(block.base_fee),
         "account": account,
         "wei": None if account is None else str(await node.eth_balance(account)),
+    }
+
+
+async def _profile_facts(node: Node, settings: Settings) -> dict[str, Any]:
+    """What is known of the chain, what the settings make of it, and how fast its blocks come."""
+    from mesh.settings.chains import FILLED, profile_of
+
+    profile, known = settings.profile, profile_of(node.chain_id)
+    used = {name: getattr(settings, name) for name in FILLED}
+    head = await node.block_number()
+    seconds = await node.heads.block_time(MEASURED)
+    return {
+        "chain": profile.name or None,
+        "title": profile.title if profile.name else known and known.title,
+        "knownAs": known and known.name,
+        "settings": used,
+        "overridden": {name: getattr(profile, name) for name, value in used.items() if value != getattr(profile, name)},
+        "finality": settings.finality,
+        "final": max(0, await node.counted(head)),
+        "blockSeconds": None if seconds is None else round(seconds, 2),
+        "expectedBlockSeconds": profile.block_seconds if profile.chain_id else None,
+        "coin": profile.coin,
+        "tokens": dict(profile.tokens),
+        "explorer": profile.explorer or None,
     }
 
 
@@ -214,9 +243,16 @@ def _readable_status(facts: dict[str, Any]) -> dict[str, str | None]:
     """The status for people."""
     shown: dict[str, str | None] = {
         "node": f"{facts['node']}  {facts['client']}",
-        "chain id": str(facts["chainId"]),
+        "chain id": f"{facts['chainId']}{_named(facts)}",
         "block": f"{facts['blockNumber']:,}, {_ago(facts['blockTime'])}",
         "base fee": None if facts["baseFee"] is None else GWEI.show(int(facts["baseFee"])),
+    }
+    shown |= {
+        "pace": _pace(facts),
+        "settings": _used(facts),
+        "finality": f"{facts['finality']}: what happened up to block {facts['final']:,} counts",
+        "tokens": ", ".join(f"{symbol} {address}" for symbol, address in facts["tokens"].items()) or None,
+        "explorer": facts["explorer"],
     }
     if facts["factory"] is not None:
         code = "this project's code" if facts["isOurCode"] else "not this project's code"
@@ -229,11 +265,34 @@ def _readable_status(facts: dict[str, Any]) -> dict[str, str | None]:
             "lighthouse": f"{found}  {facts['lighthouseName']}",
         }
     if facts["account"] is not None:
-        amounts = [ETH.show(int(facts["wei"]))]
+        amounts = [Unit(facts["coin"], 18, "wei").show(int(facts["wei"]))]
         if facts["wn"] is not None:
             amounts.append(XRT.show(int(facts["wn"])))
         shown["account"] = f"{facts['account']}  {', '.join(amounts)}"
     return shown
+
+
+def _named(facts: dict[str, Any]) -> str:
+    if facts["chain"] is not None:
+        return f"  {facts['title']} ({facts['chain']})"
+    return f'  {facts["title"]}; chain = "{facts["knownAs"]}" has its settings' if facts["knownAs"] else ""
+
+
+def _pace(facts: dict[str, Any]) -> str | None:
+    """How fast blocks come, and should come."""
+    found, expected = facts["blockSeconds"], facts["expectedBlockSeconds"]
+    if found is None:
+        return None
+    return f"a block every {found:g} s" + ("" if expected is None else f", {expected:g} s expected")
+
+
+def _used(facts: dict[str, Any]) -> str:
+    """The settings that a chain has, and what it has where they differ."""
+    other = facts["overridden"]
+    return ", ".join(
+        f"{name} {value:,}" + (f" (the chain's: {other[name]:,})" if name in other else "")
+        for name, value in facts["settings"].items()
+    )
 
 
 def _ago(timestamp: int) -> str:

@@ -171,6 +171,8 @@ async def print_liability(
     described = describe_liability(liability, units[liability.token], own=own, refundable=words)
     if owed:
         described["owed"] = owed_words(liability, units[liability.token], owed)
+    if chain.node.profile.explorer:
+        described["explorer"] = f"{chain.node.profile.explorer}/address/{liability.address}"
     if failure is not None:
         text = f"{printable(failure.text)} ({failure.code})"
         described["reason"] = text if failure.text else "the recording has none"
@@ -508,7 +510,7 @@ async def _claimed(chain: Chain, liability: Liability, account: str, to: str | N
     "--from-block", type=click.IntRange(min=0), help="without ADDRESS: the first block to read [the next one]"
 )
 @with_json
-@with_chain_settings(NetworkSettings, "lighthouse_contract", "confirmations", "poll_interval")
+@with_chain_settings(NetworkSettings, "lighthouse_contract", "confirmations", "finality", "poll_interval")
 async def watch(settings: Settings, address: str | None, from_block: int | None, as_json: bool) -> None:
     """Wait until the liability at ADDRESS has ended, then show it. If the node is unreachable, wait for it. If it names
     a validator, print how its jurors judge when they do.

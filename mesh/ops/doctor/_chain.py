@@ -12,25 +12,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from mesh.amounts import ETH, XRT, Unit
-from mesh.chain import GWEI, Account, Chain, FeePolicy, Node, Timing
-from mesh.chain.errors import NoContracts, RequestRefused
+from mesh.chain import GWEI, Account, Chain, FeePolicy, Node, NodeUnreachable, Timing
+from mesh.chain.errors import FinalityNotOffered, NoContracts, RequestRefused
+from mesh.chain.rpc import is_answered
 from mesh.market.transactions import least_cost
 from mesh.ops.doctor._machine import RECENT, TOLERATED, compare_chain_clock, compare_clock, duration
 from mesh.ops.doctor.checks import CheckResult, failed, in_thread, passed, warning
+from mesh.settings.chains import profile_of
 from schemas.address import ZERO_ADDRESS
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable
+    from collections.abc import AsyncIterator, Awaitable
     from contextlib import AsyncExitStack
 
     from mesh.ops.doctor.checks import DoctorContext
     from mesh.settings import Settings
+    from mesh.settings.chains import ChainProfile
 
 
 T = TypeVar("T")
 
 QUICK: Final = Timing(request_timeout=3.0, attempts=1)
 """No retries: a node that does not answer at once is a result."""
+MEASURED: Final = 200
+"""Blocks between which their pace is measured."""
 DEVELOPMENT: Final = ("anvil", "eth-tester", "ethereumtester", "hardhat", "ganache", "aira")
 """Client names of development chains, in lower case. They mine a block only when there are transactions."""
 
@@ -47,7 +52,7 @@ class ChainChecks:
         self._stack = stack
         self._expected = expected
         fees = FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI))
-        self.node = Node(settings.node, timing=QUICK, fees=fees)
+        self.node = Node(settings.node, timing=QUICK, fees=fees, profile=settings.profile)
         self.chain = Chain(
             self.node,
             ens=settings.ens_contract,
@@ -97,6 +102,60 @@ class ChainChecks:
                 hint="give a node of the expected chain with --web3-http-provider",
             )
         return passed(f"{found}, genesis 0x{(await self.node.block_hash(0)).hex()[:16]}…")
+
+    async def check_profile(self) -> CheckResult:
+        """Whether the chain is named, and the node is as a node of that chain."""
+        node, profile = self.node, self._settings.profile
+        known = profile_of(node.chain_id)
+        finality = self._settings.finality
+        if finality != "latest" and finality not in await self._tags():
+            raise FinalityNotOffered(node.endpoint, finality, "it names no such block")
+        if not profile.name and known is not None:
+            return warning(
+                f"the node is on {known.title}, and the settings name no chain",
+                code="chain-not-named",
+                hint=f'set chain = "{known.name}": confirmations, the pace of polling and deadlines then suit it',
+            )
+        if not profile.chain_id:
+            return passed("no public chain is named" if profile.name else "no chain is named, and this is no known one")
+        unlike = [text async for text in self._unlike(profile)]
+        if unlike:
+            return warning(
+                f"the node is not as nodes of {profile.title} are: {'; '.join(unlike)}",
+                code="unlike-chain",
+                hint="compare with another node; it works, with more requests or other waiting times",
+            )
+        return passed(f"{profile.title}, and the node is as expected; finality is {finality}")
+
+    async def _unlike(self, profile: ChainProfile) -> AsyncIterator[str]:
+        """How the node differs from what is known of the chain, in words."""
+        node, head = self.node, await self.node.heads.look()
+        seconds = await node.heads.block_time(MEASURED)
+        if seconds is not None and not profile.block_seconds / 2 <= seconds <= 2 * profile.block_seconds:
+            yield f"a block comes every {seconds:.2g} s, not every {profile.block_seconds:g} s"
+        if profile.has_blooms and head.logs_bloom is None:
+            yield "its blocks have no Bloom filters"
+        if profile.has_priority_fee and head.base_fee is None:
+            yield "its blocks have no base fee"
+        if lacking := [tag for tag in ("safe", "finalized") if tag not in await self._tags()]:
+            yield f"it does not say which block is {' or '.join(lacking)}"
+        try:
+            first = max(0, head.number - profile.log_range + 1)
+            await node.logs(first, head.number, addresses=[ZERO_ADDRESS], topics=["0x" + "00" * 32])
+        except RequestRefused:
+            yield f"it refuses the logs of {profile.log_range:,} blocks at once"
+
+    async def _tags(self) -> set[str]:
+        """Which of `safe` and `finalized` the node has a block for."""
+        found = set()
+        for tag in ("safe", "finalized"):
+            try:
+                if await self.node.request("eth_getBlockByNumber", tag, False):
+                    found.add(tag)
+            except (RequestRefused, NodeUnreachable) as error:
+                if not is_answered(error):
+                    raise
+        return found
 
     async def check_clock(self) -> CheckResult:
         """Compare this clock with the newest block."""

@@ -134,6 +134,7 @@ def _chain_checks(context: DoctorContext, stack: AsyncExitStack) -> list[Check]:
     checks = ChainChecks(settings, stack, expected=context.chain_id)
     nodes = [Check("node", partial(checks.check_node, endpoint)) for endpoint in nodes_of(settings)]
     chain = Check("chain", checks.check_chain, needs=(tuple(nodes),))
+    profile = Check("chain profile", checks.check_profile, needs=_all_of(chain))
     clocks = [
         Check("node clock", partial(check_node_clock, endpoint), needs=_all_of(node))
         for endpoint, node in zip(nodes_of(settings), nodes, strict=True)
@@ -149,7 +150,7 @@ def _chain_checks(context: DoctorContext, stack: AsyncExitStack) -> list[Check]:
     socket = settings.web3_ws_provider.strip()
     is_given = socket not in ("", DEFAULTS.web3_ws_provider) and settings.web3_http_provider.strip()
     sockets = [Check("websocket", partial(checks.check_node, socket))] if is_given else []
-    return [*nodes, *sockets, chain, *clocks, clock, contracts, *on_chain, *money]
+    return [*nodes, *sockets, chain, profile, *clocks, clock, contracts, *on_chain, *money]
 
 
 def _account_checks(context: DoctorContext, chain_checks: ChainChecks, chain: Check, contracts: Check) -> list[Check]:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.amounts import InvalidAmount
-from mesh.chain import XRT, Account, Chain, DeploymentPlan, TransactionSender, deploy, new_private_key
+from mesh.chain import XRT, Account, Chain, DeploymentPlan, Node, TransactionSender, deploy, new_private_key
 from mesh.chain._abi import is_code_of, load_artifact
 from mesh.chain.errors import InsufficientFunds, NoContracts, NodeUnreachable, RequestRefused
 from mesh.chain.rpc import HttpTransport
 from mesh.cli.chain import DEPLOYMENT_GAS
 from mesh.errors import ConfigurationError, InvalidAddress
+from mesh.settings.chains import CHAINS
 from tests.mesh.chain.conftest import OneAtATime
 from tests.mesh.cli.served_chain import ServedChain, columns, write_quick_keyfile
 from tests.support.commands import invoke, refused
@@ -248,3 +249,56 @@ def test_an_unreachable_node_is_one_clear_line(served: ServedChain, command: tup
 def test_a_server_that_is_no_node_is_one_clear_line(served: ServedChain) -> None:
     refused(served.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER="localhost"), ConfigurationError, "localhost")
     refused(served.aira("xrt", "balance", AIRA_ENS_CONTRACT="0x12"), InvalidAddress, "0x12")
+
+
+@pytest.fixture
+def gnosis(bare: ServedChain) -> Iterator[Anvil]:
+    """A node of a chain with the number and the pace of Gnosis Chain."""
+
+    async def mine() -> None:
+        async with Node(anvil.url) as node:
+            await node.request("anvil_mine", "0x32", "0x5")
+
+    with Anvil(arguments=("--chain-id", "100")) as anvil:
+        bare.run(mine())
+        yield anvil
+
+
+def test_the_status_shows_what_is_known_of_the_chain_and_what_overrides_it(bare: ServedChain, gnosis: Anvil) -> None:
+    named = {"AIRA_WEB3_HTTP_PROVIDER": gnosis.url, "AIRA_CHAIN": "gnosis", "AIRA_POLL_INTERVAL": "3"}
+    shown = bare.aira("chain", "status", AIRA_CONFIRMATIONS="7", AIRA_FINALITY="latest", **named)
+    said = columns(shown.stdout)
+    assert said["chain id"] == "100  Gnosis Chain (gnosis)"
+    assert said["pace"] == "a block every 5 s, 5 s expected"
+    assert "confirmations 7 (the chain's: 3), reorg_depth 48, poll_interval 3.0 (the chain's: 1.0)" in said["settings"]
+    assert said["finality"] == "latest: what happened up to block 44 counts"
+    assert said["explorer"] == "https://gnosisscan.io"
+    assert said["account"].endswith(" xDAI")
+    printed = json.loads(bare.aira("chain", "status", "--json", **named).stdout.splitlines()[0])
+    assert (printed["chain"], printed["overridden"], printed["coin"]) == ("gnosis", {"poll_interval": 1.0}, "xDAI")
+    assert printed["tokens"] == dict(CHAINS["gnosis"].tokens)
+
+
+def test_the_status_of_a_known_chain_that_is_not_named_says_its_name(bare: ServedChain, gnosis: Anvil) -> None:
+    said = columns(bare.aira("chain", "status", AIRA_WEB3_HTTP_PROVIDER=gnosis.url).stdout)
+    assert said["chain id"] == '100  Gnosis Chain; chain = "gnosis" has its settings'
+    assert said["pace"] == "a block every 5 s"
+
+
+def test_a_node_of_another_chain_is_refused_in_one_line(bare: ServedChain, gnosis: Anvil) -> None:
+    hint = refused(
+        bare.aira("chain", "status", AIRA_WEB3_HTTP_PROVIDER=gnosis.url, AIRA_CHAIN="base"),
+        "wrong-chain",
+        "is on Gnosis Chain (100), not on Base (8453)",
+    )
+    assert "set chain to gnosis" in hint
+
+
+def test_a_job_is_refunded_after_a_week_of_the_chains_blocks(bare: ServedChain) -> None:
+    deployed = bare.run_json(*DEPLOY, by="provider", AIRA_CHAIN="local")
+
+    async def delay(chain: Chain) -> int:
+        factory = chain.node.contract("Factory", deployed["factory"])
+        return int(await chain.node.read(factory.refundDelay()))
+
+    assert bare.ask("provider", delay) == 7 * 86_400

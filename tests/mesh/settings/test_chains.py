@@ -42,6 +42,6 @@ def test_each_profile_fits_itself(profile: ChainProfile) -> None:
 
 def test_times_are_counted_in_the_blocks_that_contracts_see() -> None:
     assert CHAINS["ethereum"].deadline_limit == 7200
-    assert CHAINS["base"].deadline_limit == 43_200
+    assert CHAINS["base"].deadline_limit == 432_000
     assert CHAINS["arbitrum"].deadline_limit == 7200, "contracts see the blocks of Ethereum there"
     assert CHAINS["base"].blocks_in(0.01) == 1

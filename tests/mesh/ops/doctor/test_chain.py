@@ -15,6 +15,8 @@ from tests.support.nodes import Anvil
 from tests.support.ports import free_port
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from tests.mesh.ops.doctor.machines import Machine
 
 
@@ -169,3 +171,43 @@ def ask(anvil: Anvil, method: str, *parameters: object) -> None:
     request = urllib.request.Request(anvil.url, body, {"Content-Type": "application/json"})
     with urllib.request.urlopen(request, timeout=30) as answer:
         assert "error" not in json.load(answer)
+
+
+@pytest.fixture
+async def gnosis() -> AsyncIterator[Anvil]:
+    """A node of a chain with the number and the pace of Gnosis Chain."""
+    async with Anvil(arguments=("--chain-id", "100")) as node:
+        _ask(node, "anvil_mine", "0x32", "0x5")
+        yield node
+
+
+def _ask(node: Anvil, method: str, *params: str) -> None:
+    body = json.dumps({"jsonrpc": "2.0", "id": 1, "method": method, "params": params}).encode()
+    urllib.request.urlopen(urllib.request.Request(node.url, body, {"Content-Type": "application/json"})).read()
+
+
+async def test_a_known_chain_should_be_named(machine: Machine, gnosis: Anvil) -> None:
+    found = await machine.examined("bridge", web3_http_provider=gnosis.url)
+    assert (found.one("chain profile").status, found.one("chain profile").code) == (CheckStatus.WARN, "chain-not-named")
+    assert 'chain = "gnosis"' in found.one("chain profile").hint
+
+
+async def test_a_node_like_the_named_chains_passes(machine: Machine, gnosis: Anvil) -> None:
+    for finality in ("latest", "safe", "finalized"):
+        found = await machine.examined("bridge", web3_http_provider=gnosis.url, chain="gnosis", finality=finality)
+        assert found.one("chain profile").status is CheckStatus.OK, found.one("chain profile")
+        assert f"finality is {finality}" in found.one("chain profile").message
+
+
+async def test_a_node_of_another_chain_than_the_named_one_fails(machine: Machine, gnosis: Anvil) -> None:
+    found = await machine.examined("bridge", web3_http_provider=gnosis.url, chain="polygon")
+    assert (found.one("chain").status, found.one("chain").code) == (CheckStatus.FAIL, "wrong-chain")
+    assert "chain profile" not in found
+
+
+async def test_another_pace_than_the_chains_is_a_warning(machine: Machine) -> None:
+    async with Anvil(arguments=("--chain-id", "100")) as node:
+        _ask(node, "anvil_mine", "0x32", "0x3c")
+        found = await machine.examined("bridge", web3_http_provider=node.url, chain="gnosis")
+    assert (found.one("chain profile").status, found.one("chain profile").code) == (CheckStatus.WARN, "unlike-chain")
+    assert "a block comes every 60 s, not every 5 s" in found.one("chain profile").message
