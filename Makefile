@@ -21,7 +21,7 @@ COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 RERUNS := --reruns 1 --max-suite-reruns 3 --rerun-show-tracebacks
 
 .PHONY: help setup demo test simulate simulate-mutants compose-test crash-test lint peers bench contracts contracts-check \
-	page page-check slither firmware docs lock release upgrade-sample clean
+	page page-check slither firmware docs pictures lock release upgrade-sample clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -119,6 +119,12 @@ $(DOCS_TOOLS): requirements/docs.txt
 
 docs: $(INSTALLED) $(DOCS_TOOLS) ## the documentation as a site, in build/docs/site; a warning or a broken link fails
 	@$(BIN)/python -m documentation
+
+pictures: $(INSTALLED) ## the pictures of the page in docs/pictures, from its tests in Chromium (`make peers` installs it)
+	@mkdir -p build/pictures
+	@CI=true PAGE_PICTURES=$(CURDIR)/build/pictures $(BIN)/pytest -q -n $(JOBS) --dist loadfile tests/web/test_page.py \
+		tests/web/test_robots.py tests/web/test_order_form.py
+	@$(BIN)/python -m documentation.pictures build/pictures
 
 COMPILE_FLAGS := --universal --python-version 3.11 --generate-hashes --upgrade --quiet \
 	--no-header --no-annotate --no-emit-index-url --no-emit-find-links

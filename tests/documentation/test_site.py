@@ -13,6 +13,7 @@ import pytest
 from documentation.checks import problems
 from documentation.navigation import navigation
 from documentation.performance import BARS, constants, performance
+from documentation.pictures import screenshot
 from documentation.reference import reference
 from documentation.staging import ROOT, places, relinked
 from mesh.cli import main
@@ -130,3 +131,15 @@ def test_every_bar_is_a_number_of_its_benchmark() -> None:
     for name, bars in BARS.items():
         known = constants(ast.parse((ROOT / "bench" / f"{name}.py").read_text()))
         assert [bar for bar in bars.values() if re.split(r"[: \[]+", bar)[2] not in known] == []
+
+
+def test_every_picture_is_a_screenshot_of_a_test() -> None:
+    tests = "".join(path.read_text() for path in sorted((ROOT / "tests" / "web").glob("test_*.py")))
+    made = ('"{}": ', "{}-{{look}}", '/ "{}"')
+    assert [page for page in pages_in_pictures() if not any(form.format(page) in tests for form in made)] == []
+
+
+def pages_in_pictures() -> set[str]:
+    """What the screenshots of all pictures are of: a file's name, or that of a page in several sizes."""
+    files = {screenshot(path.name) for path in (ROOT / "docs" / "pictures").iterdir()}
+    return {re.sub(r"-(phone|desktop)-(light|dark)\.png$", "", name) for name in files}
