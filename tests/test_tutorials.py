@@ -39,7 +39,8 @@ def order(tutorial: str, reader: Reader, tmp_path: Path) -> str:
         for number, label in re.findall(r"(?:Write (\d+) under )?\*([^*]+)\*", steps):
             browser.type(label, number) if number else browser.press(label)
         browser.sees("The work is done, and the robot was paid.")
-        browser.sees("All messages")  # so the recording is here
+        browser.sees("All messages")
+        browser.until(lambda: "Loading" not in browser.text(), "the recording")
         folder = Path(os.environ.get("PAGE_PICTURES") or tmp_path)
         browser.picture(folder / f"{tutorial.removesuffix('.md')}.png")
         return browser.text()
