@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import urllib.request
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -69,10 +69,47 @@ def facts(site: Site, path: str) -> Any:
         return json.load(response)
 
 
+OVERLAPS: Final = """
+const page = [...document.querySelectorAll("dialog[open]")].at(-1) ?? document.getElementById("page") ?? document.body;
+const blockOf = (one) => (getComputedStyle(one).display === "inline" ? blockOf(one.parentElement) : one);
+const texts = document.createTreeWalker(page, NodeFilter.SHOW_TEXT), boxes = [];
+while (texts.nextNode()) {
+  const { currentNode: node } = texts, element = node.parentElement;
+  if (!node.data.trim() || !element.checkVisibility({ opacityProperty: true, visibilityProperty: true })) continue;
+  if (element.closest("nav, .notes, .hidden, .skip, .states, .u-wrap, details:not([open]) > :not(summary)")) continue;
+  const range = document.createRange();
+  range.selectNodeContents(node);
+  let { left, top, right, bottom } = range.getBoundingClientRect();
+  for (let one = element; one && one !== page; one = one.parentElement) {  // what is cut off covers nothing
+    const style = getComputedStyle(one);
+    if (style.overflow === "visible" && style.clipPath === "none") continue;
+    const box = one.getBoundingClientRect();
+    [left, top] = [Math.max(left, box.left), Math.max(top, box.top)];
+    [right, bottom] = [Math.min(right, box.right), Math.min(bottom, box.bottom)];
+  }
+  const text = node.data.trim().slice(0, 40), block = blockOf(element);
+  if (right - left > 4 && bottom - top > 4) boxes.push({ text, block, left, top, right, bottom });
+}
+const found = [];
+boxes.forEach((one, place) => {
+  for (const other of boxes.slice(place + 1)) {
+    const wide = Math.min(one.right, other.right) - Math.max(one.left, other.left);
+    const high = Math.min(one.bottom, other.bottom) - Math.max(one.top, other.top);
+    const isOneText = one.block.contains(other.block) || other.block.contains(one.block);  // its lines may be broken
+    if (wide > 4 && high > 6 && !isOneText) found.push(`${one.text} | ${other.text}`);
+  }
+});
+return found;
+"""
+"""Texts that cover each other."""
+
+
 def check(browser: Browser, picture: Path) -> None:
-    """No violations; on a phone nothing to scroll sideways, not even a table; and a screenshot for people."""
+    """No violations, no text over another; on a phone nothing to scroll sideways, not even a table; and a screenshot
+    for people."""
     browser.picture(picture)
     assert browser.violations() == [], picture.stem
+    assert browser.driver.execute_script(OVERLAPS) == [], f"{picture.stem}: texts cover each other"
     wider = browser.driver.execute_script(
         "const all = innerWidth < 600 ? ':root, .scroll' : ':root';"
         "return [...document.querySelectorAll(all)].filter((one) => one.scrollWidth > one.clientWidth)"

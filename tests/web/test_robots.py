@@ -126,6 +126,9 @@ def test_a_wallet_orders_from_one_robot_and_stops_it(browser: Browser, site: Sit
     browser.click("#stop-now")
     browser.sees("You stopped it. The price went back.")
     assert facts(site, f"liabilities/{job}")["liability"]["promisor"] == scout
+    with Browser(site.url) as stranger:
+        stranger.go(f"job/{job}")
+        stranger.sees("Its customer stopped it. The price went back.")
 
 
 def test_an_owner_changes_the_price_sees_the_notification_and_its_job_and_downloads_the_statement(
@@ -170,6 +173,12 @@ def test_an_owner_changes_the_price_sees_the_notification_and_its_job_and_downlo
         browser.go(f"robot/{scout}")
         browser.click("#pause")
         browser.sees("It takes jobs.")
+        agents = facts(site, "agents")["agents"]
+        other = next(one["address"] for one in agents if one["profile"] and one["address"] != scout)
+        browser.go(f"robot/{other}")  # nobody is told what happens to this one
+        browser.sees("They are sent to nobody.")
+        browser.sees("notify = [")
+        check(browser, pictures / "owner-nobody-told.png")
 
 
 def test_a_robot_that_left_stands_as_away_with_what_it_read_and_did_before_anybody_looked(

@@ -165,6 +165,17 @@ export function useTopic(topic: string | null, listener: (event: StreamEvent) =>
   useEffect(() => (topic ? stream.on(topic, (event) => latest.current(event)) : undefined), [topic]);
 }
 
+/** Calls `act` each time so many milliseconds have passed, as long as the component is shown and `on`. */
+export function useEvery(milliseconds: number, act: () => void, on = true): void {
+  const latest = useRef(act);
+  latest.current = act;
+  useEffect(() => {
+    if (!on) return;
+    const timer = setInterval(() => latest.current(), milliseconds);
+    return () => clearInterval(timer);
+  }, [milliseconds, on]);
+}
+
 export function useLive(): boolean {
   const [live, setLive] = useState(stream.live);
   useEffect(() => stream.watch(setLive), []);
@@ -196,8 +207,8 @@ export interface Loaded<T> {
   reload: () => void;
 }
 
-/** What the server answers at `path`; read again by `reload`, which keeps what is shown meanwhile. */
-export function useData<T>(path: string | null): Loaded<T> {
+/** What the server answers at `path`; read again by `reload`, and at each event of `topic`, which keeps what is shown meanwhile. */
+export function useData<T>(path: string | null, topic: string | null = null): Loaded<T> {
   const [state, setState] = useState<{ path: string | null; data: T | null; error: unknown; loading: boolean }>({
     path, data: null, error: null, loading: path !== null,
   });
@@ -221,6 +232,7 @@ export function useData<T>(path: string | null): Loaded<T> {
       setTurn((known) => known + 1);
     }, 60);
   }, []);
+  useTopic(topic, reload);
   const current = state.path === path;
   return { data: current ? state.data : null, error: current ? state.error : null, loading: !current || state.loading, reload };
 }

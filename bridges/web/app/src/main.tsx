@@ -2,7 +2,7 @@ import { render } from "preact";
 import { useEffect, useState } from "preact/hooks";
 import { isAddress } from "viem";
 import { ApiError } from "./api";
-import { AppProvider, useApp, useData, useLive, wordsOf } from "./app";
+import { AppProvider, useApp, useData, useEvery, useLive, wordsOf } from "./app";
 import { isCid } from "./cid";
 import { plain } from "./format";
 import { postAgain } from "./ordering";
@@ -52,10 +52,7 @@ function Page() {
 
 /** Tries again by itself, because a server that starts needs a moment. */
 function Broken(props: { error: unknown; retry: () => void }) {
-  useEffect(() => {
-    const timer = setInterval(props.retry, 3000);
-    return () => clearInterval(timer);
-  }, []);
+  useEvery(3_000, props.retry);
   return <div class="problem" role="alert"><p>{wordsOf(props.error)}</p><button type="button" class="button small" onClick={props.retry}>{texts.again}</button></div>;
 }
 
@@ -144,10 +141,7 @@ function Content({ route }: { route: string[] }) {
 function Connection() {
   const { market, block, reloadMarket } = useApp();
   const live = useLive();
-  useEffect(() => {
-    const timer = setInterval(reloadMarket, 10_000);
-    return () => clearInterval(timer);
-  }, []);
+  useEvery(10_000, reloadMarket);
   useEffect(() => {
     if (!live) return;
     reloadMarket();

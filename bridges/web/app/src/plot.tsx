@@ -36,7 +36,7 @@ export function plotColors(element: HTMLElement): { ink: string; grid: string; g
 }
 
 /** Changes when the colours do. */
-function useScheme(): boolean {
+export function useScheme(): boolean {
   const query = useMemo(() => matchMedia("(prefers-color-scheme: dark)"), []);
   const [dark, setDark] = useState(query.matches);
   useEffect(() => {

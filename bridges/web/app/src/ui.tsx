@@ -117,6 +117,15 @@ export function Field(props: { label: ComponentChildren; hint?: ComponentChildre
   );
 }
 
+/** A field for one word: an address, a CID, a name. */
+export function WordField(props: { label: ComponentChildren; text: string; change: (text: string) => void; error?: string; hint?: ComponentChildren; placeholder?: string }) {
+  return (
+    <Field label={props.label} error={props.error} hint={props.hint}>
+      {(id, described) => <input id={id} aria-describedby={described} class="wide" spellcheck={false} value={props.text} placeholder={props.placeholder} onInput={(event) => props.change(event.currentTarget.value.trim())} />}
+    </Field>
+  );
+}
+
 /** A field for a number: it keeps the text as it is typed, and says what it means where that is not plain. */
 export function NumberField(props: { label: ComponentChildren; text: string; change: (text: string) => void; error?: string; hint?: ComponentChildren; class?: string; signed?: boolean }) {
   const number = /[^\d.\s-]/.test(props.text) && !props.error ? parseDecimal(props.text) : null;
@@ -183,6 +192,23 @@ export function Facts(props: { of: [string, ComponentChildren][] }) {
         <div key={name}><dt>{name}</dt><dd>{value}</dd></div>
       ))}
     </dl>
+  );
+}
+
+/** Asks before something is stopped. */
+export function StopDialog(props: { title: string; open: boolean; close: () => void; stop: () => Promise<unknown>; notNow: string; children: ComponentChildren }) {
+  const stop = async () => {
+    await props.stop();
+    props.close();
+  };
+  return (
+    <Dialog title={props.title} open={props.open} onClose={props.close}>
+      {props.children}
+      <p class="row">
+        <Action id="stop-now" class="button danger" run={stop}>{texts.stopNow}</Action>
+        <button type="button" class="button quietly" onClick={props.close}>{props.notNow}</button>
+      </p>
+    </Dialog>
   );
 }
 

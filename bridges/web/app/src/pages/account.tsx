@@ -1,5 +1,5 @@
 import { useState, useEffect } from "preact/hooks";
-import { useApp, useData, useModel, useTopic } from "../app";
+import { useApp, useData, useModel } from "../app";
 import { clock, ether, plain, short } from "../format";
 import { withdraw } from "../ordering";
 import { texts } from "../texts";
@@ -59,8 +59,7 @@ export function AccountControl() {
 
 export function AccountPage(props: { address: string }) {
   const { market, account } = useApp();
-  const loaded = useData<AccountState>(`accounts/${props.address}`);
-  useTopic("chain", loaded.reload);
+  const loaded = useData<AccountState>(`accounts/${props.address}`, "chain");
   return (
     <>
       <h1>{account?.address === props.address ? texts.myAccount : texts.account} <Name text={props.address} label={short(props.address)} /></h1>
@@ -118,8 +117,7 @@ export function JobTable(props: { liabilities: Liability[] }) {
 
 /** The latest jobs of an account, which stay up to date. */
 export function LatestJobs(props: { of: string }) {
-  const jobs = useData<{ liabilities: Liability[] }>(`liabilities?party=${props.of}&limit=20`);
-  useTopic("chain", jobs.reload);
+  const jobs = useData<{ liabilities: Liability[] }>(`liabilities?party=${props.of}&limit=20`, "chain");
   return <Show of={jobs}>{({ liabilities }) => <JobTable liabilities={liabilities} />}</Show>;
 }
 

@@ -14,8 +14,7 @@ import { isUsable } from "./order";
 /** An order from its publication to its contract; then the page of the job takes over. */
 export function FollowPage(props: { hash: string }) {
   const { account } = useApp();
-  const posted = useData<PostedOrder>(`orders/${props.hash}`);
-  useTopic(`order/${props.hash}`, posted.reload);
+  const posted = useData<PostedOrder>(`orders/${props.hash}`, `order/${props.hash}`);
   useTopic("chain", () => (posted.data?.state ?? "open") === "open" && posted.reload());
   const [lie, setLie] = useState<unknown>(null);
   const { data } = posted;

@@ -10,7 +10,7 @@ import { stopJob } from "../ordering";
 import { texts } from "../texts";
 import { checkJob } from "../trust";
 import type { Finding, Job, Step } from "../types";
-import { Action, Badge, Copy, Dialog, Facts, Money, Name, Picture, Show, Strange } from "../ui";
+import { Action, Badge, Copy, Facts, Money, Name, Picture, Show, StopDialog, Strange } from "../ui";
 import { JobState } from "./account";
 import { Steps } from "./follow";
 import { nameOf } from "./robots";
@@ -104,21 +104,16 @@ function Stop({ job, changed }: { job: Job; changed: () => void }) {
   if (liability.isFinalized || account?.address !== liability.promisee || job.phase === "complete") return null;
   const stop = async () => {
     await stopJob(liability.address, "", account);
-    setOpen(false);
     notify(texts.stopSent);
     changed();
   };
   return (
     <>
       <button type="button" id="stop" class="button danger huge" onClick={() => setOpen(true)}>{texts.stop}</button>
-      <Dialog title={texts.stopTitle} open={open} onClose={() => setOpen(false)}>
+      <StopDialog title={texts.stopTitle} open={open} close={() => setOpen(false)} stop={stop} notNow={texts.goOnWorking}>
         <p>{texts.stopHint}</p>
         <p><strong>{texts.stopCosts[job.onStop] ?? texts.stopCosts[""]}</strong></p>
-        <p class="row">
-          <Action id="stop-now" class="button danger" run={stop}>{texts.stopNow}</Action>
-          <button type="button" class="button quietly" onClick={() => setOpen(false)}>{texts.goOnWorking}</button>
-        </p>
-      </Dialog>
+      </StopDialog>
     </>
   );
 }

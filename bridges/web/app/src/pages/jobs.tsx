@@ -1,10 +1,10 @@
 import { useState } from "preact/hooks";
 import { isAddress } from "viem";
 import { query } from "../api";
-import { useApp, useData, useTopic } from "../app";
+import { useApp, useData } from "../app";
 import { texts } from "../texts";
 import type { Liability } from "../types";
-import { Field, Show } from "../ui";
+import { Field, Show, WordField } from "../ui";
 import { JobTable } from "./account";
 
 /** All jobs, or those of the account; newest first. */
@@ -14,8 +14,7 @@ export function JobsPage() {
   const [mine, setMine] = useState(true);
   const [wanted, setWanted] = useState("");
   const party = mine ? account?.address : undefined;
-  const jobs = useData<{ liabilities: Liability[]; more: boolean; phases: Record<string, number> }>(`liabilities${query({ phase, party, limit: 100 })}`);
-  useTopic("chain", jobs.reload);
+  const jobs = useData<{ liabilities: Liability[]; more: boolean; phases: Record<string, number> }>(`liabilities${query({ phase, party, limit: 100 })}`, "chain");
   return (
     <>
       <h1>{texts.jobs}</h1>
@@ -31,9 +30,7 @@ export function JobsPage() {
         {account ? (
           <label class="check"><input type="checkbox" checked={mine} onChange={(event) => setMine(event.currentTarget.checked)} /> {texts.onlyMine}</label>
         ) : null}
-        <Field label={texts.byAddress}>
-          {(id) => <input id={id} class="wide" placeholder="0x…" spellcheck={false} value={wanted} onInput={(event) => setWanted(event.currentTarget.value.trim())} />}
-        </Field>
+        <WordField label={texts.byAddress} text={wanted} change={setWanted} placeholder="0x…" />
         <button class="button small" disabled={!isAddress(wanted)}>{texts.show}</button>
       </form>
       <Show of={jobs}>{({ liabilities, more }) => <><JobTable liabilities={liabilities} />{more ? <p class="hint">{texts.moreJobs}</p> : null}</>}</Show>

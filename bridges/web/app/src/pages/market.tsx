@@ -7,7 +7,7 @@ import { amount, clock, plain, short } from "../format";
 import { texts } from "../texts";
 import type { Order, PastJob, StreamEvent, Token } from "../types";
 import { Badge, Show } from "../ui";
-import { plotColors } from "../plot";
+import { plotColors, useScheme } from "../plot";
 import { ModelFilter, robotsOf } from "./robots";
 
 const SHOWN = 60;
@@ -81,6 +81,7 @@ function share(jobs: PastJob[]): string {
 /** Each job as a point: when, and for how much. */
 function Prices({ jobs, token }: { jobs: PastJob[]; token: Token }) {
   const box = useRef<HTMLDivElement>(null);
+  const dark = useScheme();
   const points = useMemo(() => jobs.filter((job) => job.at !== null).map((job) => [job.at!, Number(formatUnits(BigInt(job.cost), token.decimals))]).reverse(), [jobs]);
   useEffect(() => {
     if (!box.current || points.length < 2) return;
@@ -89,7 +90,7 @@ function Prices({ jobs, token }: { jobs: PastJob[]; token: Token }) {
       scales: { y: { range: (_, __, most) => [0, most * 1.15 || 1] } },
       series: [{}, { stroke: line, paths: () => null, points: { show: true, size: 7, fill: line } }],
     }), [points.map(([at]) => at), points.map(([, price]) => price)]).stop;
-  }, [points]);
+  }, [points, dark]);
   if (points.length < 2) return <p class="quiet">{texts.noPrices}</p>;
   return (
     <>
@@ -215,6 +216,7 @@ function chart(frame: HTMLElement, height: number, look: Look, data: uPlot.Align
 /** Orders in each of the last sixty seconds. */
 function Rate(props: { perSecond: number[] }) {
   const box = useRef<HTMLDivElement>(null);
+  const dark = useScheme();
   useEffect(() => {
     const seconds = Array.from({ length: SECONDS }, (_, place) => place - SECONDS + 1);
     const { plot, stop } = chart(box.current!, 110, ({ axis, line }) => ({
@@ -231,6 +233,6 @@ function Rate(props: { perSecond: number[] }) {
       clearInterval(timer);
       stop();
     };
-  }, []);
+  }, [dark]);
   return <div class="plot" ref={box} role="img" aria-label={texts.ordersPerSecond} />;
 }

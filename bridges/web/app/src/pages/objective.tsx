@@ -6,7 +6,7 @@ import { duration, size } from "../format";
 import { texts } from "../texts";
 import { checkUpload } from "../trust";
 import type { Model, ModelTopic, Objective, Summary, ValueSchema } from "../types";
-import { Badge, Field, Name, NumberField, Strange } from "../ui";
+import { Badge, Field, Name, NumberField, Strange, WordField } from "../ui";
 import { initialEntry, rangeWords, readEntry, readNumber } from "../values";
 import type { Entry } from "../values";
 
@@ -110,9 +110,7 @@ export function ObjectiveChoice(props: { model: Model; choice: Choice; make: Mak
       {choice.way === "form" ? <DescribedForm model={model} lines={choice.lines} change={(lines) => change({ ...choice, lines })} /> : null}
       {choice.way === "file" ? <FileChoice file={choice.file} change={(file) => change({ ...choice, file })} /> : null}
       {choice.way === "cid" ? (
-        <Field label={texts.objectiveCid} error={choice.cid && !isCid(choice.cid) ? texts.notACid : ""} hint={texts.objectiveCidHint}>
-          {(id, hint) => <input id={id} aria-describedby={hint} class="wide" spellcheck={false} value={choice.cid} onInput={(event) => change({ ...choice, cid: event.currentTarget.value.trim() })} />}
-        </Field>
+        <WordField label={texts.objectiveCid} text={choice.cid} change={(cid) => change({ ...choice, cid })} error={choice.cid && !isCid(choice.cid) ? texts.notACid : ""} hint={texts.objectiveCidHint} />
       ) : null}
       {choice.way === "none" ? <p class="hint">{texts.noObjectiveHint}</p> : null}
       {choice.way === "file" || choice.way === "cid" ? <Preview make={props.make} described={model.described} /> : null}

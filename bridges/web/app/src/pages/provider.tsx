@@ -1,18 +1,17 @@
 import { useState } from "preact/hooks";
-import { useApp, useData, useTopic } from "../app";
+import { useApp, useData } from "../app";
 import { calls } from "../contracts";
 import { amount, duration, ether } from "../format";
 import { parseAmount } from "../numbers";
 import { texts } from "../texts";
 import type { AccountState, Lighthouse as Turns, Order } from "../types";
-import { Action, Badge, Facts, Field, Money, Name, NumberField, Show, Strange, Table } from "../ui";
+import { Action, Badge, Facts, Money, Name, NumberField, Show, Strange, Table, WordField } from "../ui";
 
 /** The lighthouse for those who run it: providers, turns, gas and earnings, stakes, the order book. */
 export function Lighthouse() {
   const { market, account } = useApp();
-  const lighthouse = useData<Turns>("lighthouse");
-  const orders = useData<{ orders: Order[]; dropped: number }>("orders?limit=100");
-  useTopic("chain", () => { lighthouse.reload(); orders.reload(); });
+  const lighthouse = useData<Turns>("lighthouse", "chain");
+  const orders = useData<{ orders: Order[]; dropped: number }>("orders?limit=100", "chain");
   return (
     <>
       <Show of={lighthouse}>
@@ -120,9 +119,7 @@ function CreateLighthouse(props: { done: (text: string) => void }) {
     <details class="more">
       <summary>{texts.createLighthouse}</summary>
       <div class="fields">
-        <Field label={texts.name} hint={texts.lighthouseNameHint}>
-          {(id, described) => <input id={id} aria-describedby={described} value={name} spellcheck={false} onInput={(event) => setName(event.currentTarget.value.trim())} />}
-        </Field>
+        <WordField label={texts.name} hint={texts.lighthouseNameHint} text={name} change={setName} />
         <NumberField label={texts.minimalStake} text={stake} change={setStake} error={units === null ? texts.notAnAmount : ""} />
         <NumberField label={texts.turnLength} text={blocks} change={setBlocks} error={turn ? "" : texts.notBlocks} hint={turn ? duration(Number(turn) * market.blockTime) : ""} />
       </div>

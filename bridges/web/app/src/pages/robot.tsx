@@ -1,13 +1,13 @@
-import { useEffect, useState } from "preact/hooks";
+import { useState } from "preact/hooks";
 import { isAddress } from "viem";
 import type { Address } from "viem";
 import { ApiError, post } from "../api";
-import { useApp, useData, useModel } from "../app";
+import { useApp, useData, useEvery, useModel } from "../app";
 import { amount, clock, ether, plain, since } from "../format";
 import { Readings } from "../live";
 import { texts } from "../texts";
 import type { Agent, Entry, OwnerRules, RobotEvent, Token } from "../types";
-import { Action, Badge, Dialog, Facts, Field, Name, NumberField, Picture, Show, Strange } from "../ui";
+import { Action, Badge, Facts, Name, NumberField, Picture, Show, StopDialog, Strange, WordField } from "../ui";
 import { LatestJobs } from "./account";
 import { Doing, Title, nameOf, priceOf, recordOf } from "./robots";
 import { Health, Log, OperatorLogin } from "./services";
@@ -73,10 +73,7 @@ function RobotView({ robot }: { robot: Agent }) {
 function Owner({ robot }: { robot: Agent }) {
   const isAway = robot.health === "away";
   const rules = useData<OwnerRules>(isAway ? null : `agents/${robot.address}/settings`);
-  useEffect(() => {
-    const timer = setInterval(rules.reload, 3_000);
-    return () => clearInterval(timer);
-  }, []);
+  useEvery(3_000, rules.reload, !isAway);
   const isClosed = rules.error instanceof ApiError && rules.error.code === "service-failed";
   return (
     <section class="panel owner">
@@ -137,8 +134,6 @@ type Rules = Omit<OwnerRules, "notify" | "events">;
 function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
   const { robot, rules, changed } = props;
   const { notify, market } = useApp();
-  const [price, setPrice] = useState(rules.price);
-  const [least, setLeast] = useState(rules.leastPrice);
   const [banned, setBanned] = useState("");
   const [stopping, setStopping] = useState(false);
   const path = `agents/${robot.address}`;
@@ -149,7 +144,6 @@ function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
   };
   const stop = async () => {
     await post(`${path}/stop`, { why: texts.stoppedByOwner });
-    setStopping(false);
     changed();
   };
   return (
@@ -161,22 +155,10 @@ function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
         <Action id="pause" class="button quietly" run={change({ paused: !rules.paused })}>{rules.paused ? texts.takeJobs : texts.pauseJobs}</Action>
         <span class="hint">{rules.held ? texts.isHeld : rules.paused ? texts.isPaused : texts.isOpen}</span>
       </div>
-      <Dialog title={texts.stopRobot} open={stopping} onClose={() => setStopping(false)}>
-        <p>{texts.stopRobotHint}</p>
-        <p class="row">
-          <Action id="stop-now" class="button danger" run={stop}>{texts.stopNow}</Action>
-          <button type="button" class="button quietly" onClick={() => setStopping(false)}>{texts.notNow}</button>
-        </p>
-      </Dialog>
+      <StopDialog title={texts.stopRobot} open={stopping} close={() => setStopping(false)} stop={stop} notNow={texts.notNow}><p>{texts.stopRobotHint}</p></StopDialog>
       <div class="fields owner-fields">
-        <form class="row end" onSubmit={(event) => event.preventDefault()}>
-          <NumberField label={texts.priceOfJob} text={price} change={setPrice} hint={texts.priceOfJobHint(plain(market.token.symbol, 12))} />
-          <Action id="set-price" class="button small" disabled={price === rules.price} run={change({ price: withUnit(price, market.token) })}>{texts.save}</Action>
-        </form>
-        <form class="row end" onSubmit={(event) => event.preventDefault()}>
-          <NumberField label={texts.leastPrice} text={least} change={setLeast} hint={texts.leastPriceHint} />
-          <Action id="set-least" class="button small" disabled={least === rules.leastPrice} run={change({ leastPrice: withUnit(least, market.token) })}>{texts.save}</Action>
-        </form>
+        <PriceSetting id="set-price" label={texts.priceOfJob} hint={texts.priceOfJobHint(plain(market.token.symbol, 12))} now={rules.price} save={(price) => change({ price })()} />
+        <PriceSetting id="set-least" label={texts.leastPrice} hint={texts.leastPriceHint} now={rules.leastPrice} save={(leastPrice) => change({ leastPrice })()} />
       </div>
       <h3>{texts.refused}</h3>
       <ul class="plain">
@@ -185,29 +167,31 @@ function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
         ))}
       </ul>
       <form class="row end" onSubmit={(event) => event.preventDefault()}>
-        <Field label={texts.refuseCustomer} error={banned && !isAddress(banned) ? texts.notAnAccount : ""}>
-          {(id, described) => <input id={id} aria-describedby={described} class="wide" spellcheck={false} value={banned} placeholder="0x…" onInput={(event) => setBanned(event.currentTarget.value.trim())} />}
-        </Field>
+        <WordField label={texts.refuseCustomer} text={banned} change={setBanned} placeholder="0x…" error={banned && !isAddress(banned) ? texts.notAnAccount : ""} />
         <Action class="button small quietly" disabled={!isAddress(banned)} run={change({ refuse: [...rules.refuse, banned as Address] })}>{texts.refuse}</Action>
       </form>
     </>
   );
 }
 
-/** A price with its unit: people write `5` and mean the market's token. */
-function withUnit(text: string, token: Token): string {
-  const trimmed = text.trim();
-  return /^[\d.,]+$/.test(trimmed) ? `${trimmed} ${token.symbol}` : trimmed;
+/** A price that may be changed: people write `5` and mean the market's token. */
+function PriceSetting(props: { id: string; label: string; hint: string; now: string; save: (price: string) => Promise<void> }) {
+  const { market } = useApp();
+  const [text, setText] = useState(props.now);
+  const price = /^[\d.,]+$/.test(text.trim()) ? `${text.trim()} ${market.token.symbol}` : text.trim();
+  return (
+    <form class="row end" onSubmit={(event) => event.preventDefault()}>
+      <NumberField label={props.label} text={text} change={setText} hint={props.hint} />
+      <Action id={props.id} class="button small" disabled={text === props.now} run={() => props.save(price)}>{texts.save}</Action>
+    </form>
+  );
 }
 
 /** Income per week as bars, its sum, and the statement as a file. */
 function Income({ address }: { address: Address }) {
   const { market } = useApp();
   const statement = useData<{ contracts: Entry[] }>(`accounts/${address}/statement`);
-  useEffect(() => {
-    const timer = setInterval(statement.reload, 15_000);
-    return () => clearInterval(timer);
-  }, []);
+  useEvery(15_000, statement.reload);
   return (
     <>
       <div class="row between">

@@ -4,7 +4,7 @@ import { isCid } from "../cid";
 import { duration, plain, short, since } from "../format";
 import { texts } from "../texts";
 import type { Agent, Description, JobRecord } from "../types";
-import { Badge, Field, Picture, Strange } from "../ui";
+import { Badge, Picture, Strange, WordField } from "../ui";
 
 /** The robots of an owner, not the programs of people who order. */
 export function robotsOf(agents: Agent[] | undefined): Agent[] {
@@ -173,9 +173,7 @@ function ByModel() {
     <details class="more">
       <summary>{texts.otherModel}</summary>
       <form class="row end" onSubmit={go}>
-        <Field label={texts.modelCid} error={cid && !isCid(cid) ? texts.notACid : ""} hint={texts.modelCidHint}>
-          {(id, described) => <input id={id} aria-describedby={described} class="wide" value={cid} spellcheck={false} onInput={(event) => setCid(event.currentTarget.value.trim())} />}
-        </Field>
+        <WordField label={texts.modelCid} text={cid} change={setCid} error={cid && !isCid(cid) ? texts.notACid : ""} hint={texts.modelCidHint} />
         <button class="button" disabled={!isCid(cid)}>{texts.goOn}</button>
       </form>
     </details>

@@ -1,11 +1,11 @@
-import { useEffect, useState } from "preact/hooks";
+import { useState } from "preact/hooks";
 import type { Address } from "viem";
 import { post, query } from "../api";
-import { useApp, useData, useTopic } from "../app";
+import { useApp, useData, useEvery } from "../app";
 import { amount, clock, duration, ether, size } from "../format";
 import { texts } from "../texts";
 import type { AccountState, Agent, Agents, LogEvent } from "../types";
-import { Action, Badge, Facts, Field, Money, Name, Show, Strange, Table } from "../ui";
+import { Action, Badge, Facts, Field, Money, Name, Show, Strange, Table, WordField } from "../ui";
 import { LatestJobs } from "./account";
 import { LoginForm } from "./login";
 
@@ -86,8 +86,7 @@ function AgentDetails({ agent }: { agent: Agent }) {
 export function Health({ agent }: { agent: Agent }) {
   const { market } = useApp();
   const { status } = agent;
-  const account = useData<AccountState>(`accounts/${agent.address}`);
-  useTopic("chain", account.reload);
+  const account = useData<AccountState>(`accounts/${agent.address}`, "chain");
   return (
     <div class="columns three">
       <div>
@@ -139,11 +138,7 @@ export function Log(props: { address: Address }) {
   const [open, setOpen] = useState(false);
   const [level, setLevel] = useState("info");
   const log = useData<{ events: LogEvent[]; answered: boolean }>(open ? `agents/${props.address}/logs${query({ level, lines: 200 })}` : null);
-  useEffect(() => {
-    if (!open) return;
-    const timer = setInterval(log.reload, 3000);
-    return () => clearInterval(timer);
-  }, [open]);
+  useEvery(3_000, log.reload, open);
   return (
     <details class="more" id="log" open={open} onToggle={(event) => setOpen(event.currentTarget.open)}>
       <summary>{texts.log}</summary>
@@ -194,9 +189,7 @@ function OperateByAddress(props: { robot: Address }) {
   const [job, setJob] = useState("");
   return (
     <div class="row end">
-      <Field label={texts.jobAddress}>
-        {(id) => <input id={id} class="wide" spellcheck={false} value={job} onInput={(event) => setJob(event.currentTarget.value.trim())} />}
-      </Field>
+      <WordField label={texts.jobAddress} text={job} change={setJob} />
       <Operate robot={props.robot} job={job} />
     </div>
   );

@@ -10,7 +10,7 @@ import { parseAmount } from "../numbers";
 import { texts } from "../texts";
 import { checkValidator } from "../trust";
 import type { Agents, Market, Validator } from "../types";
-import { Facts, Field, Name, NumberField, Problem, Show, Strange } from "../ui";
+import { Facts, Name, NumberField, Problem, Show, Strange, WordField } from "../ui";
 
 /** The validator that an order names, and its fee in the smallest unit of XRT. */
 export interface Judge {
@@ -77,9 +77,7 @@ export function ValidatorChoice(props: { choose: (judge: Judge | null) => void }
       <summary>{texts.withValidator}</summary>
       <PresentValidators choose={setNamed} />
       <div class="fields">
-        <Field label={texts.validator} error={named && !isName ? texts.notAnAddress : ""} hint={texts.validatorHint}>
-          {(id, described) => <input id={id} aria-describedby={described} class="wide" spellcheck={false} value={named} onInput={(event) => setNamed(event.currentTarget.value.trim())} />}
-        </Field>
+        <WordField label={texts.validator} text={named} change={setNamed} error={named && !isName ? texts.notAnAddress : ""} hint={texts.validatorHint} />
         <NumberField label={texts.validatorFee} text={fee} change={setFee} error={offered === null ? texts.notAnAmount : fee && !named ? texts.feeWithoutValidator : ""} hint={texts.validatorFeeHint} />
       </div>
       <div aria-live="polite">
