@@ -123,7 +123,7 @@ docs: $(INSTALLED) $(DOCS_TOOLS) ## the documentation as a site, in build/docs/s
 pictures: $(INSTALLED) ## the pictures of the page in docs/pictures, from its tests in Chromium (`make peers` installs it)
 	@mkdir -p build/pictures
 	@CI=true PAGE_PICTURES=$(CURDIR)/build/pictures $(BIN)/pytest -q -n $(JOBS) --dist loadfile tests/web/test_page.py \
-		tests/web/test_robots.py tests/web/test_order_form.py
+		tests/web/test_robots.py tests/web/test_order_form.py tests/test_tutorials.py
 	@$(BIN)/python -m documentation.pictures build/pictures
 
 COMPILE_FLAGS := --universal --python-version 3.11 --generate-hashes --upgrade --quiet \

@@ -23,9 +23,14 @@ MOMENTS: Final = {
 
 
 def screenshot(picture: str) -> str:
-    """The file that a test writes for a picture: `page-job-done-phone-dark.webp` is that of a job, on a phone, dark."""
+    """The file that a test writes for a picture: `page-job-done-phone-dark.webp` is that of a job, on a phone, dark.
+
+    What a tutorial ends with has the tutorial's name.
+    """
     if picture in MOMENTS:
         return MOMENTS[picture]
+    if (ROOT / "docs" / "tutorials" / picture).with_suffix(".md").exists():
+        return f"{Path(picture).stem}.png"
     found = re.fullmatch(r"page-([a-z]+)(?:-done)?(-phone)?(-dark)?\.webp", picture)
     if not found:
         raise ValueError(f"{picture}: no test makes a picture of this name")
@@ -35,7 +40,7 @@ def screenshot(picture: str) -> str:
 def main(screenshots: Path) -> int:
     """Write each picture again of which there is a screenshot; what to exit with."""
     missing = []
-    for picture in sorted(PICTURES.glob("page-*.webp")):
+    for picture in sorted(PICTURES.glob("*.webp")):
         source = screenshots / screenshot(picture.name)
         if source.exists():
             with Image.open(source) as image:
