@@ -118,7 +118,8 @@ async def _check_affordable(node: Node, account: Account) -> None:
 
 
 def _print_deployment(settings: Settings, deployment: Deployment, *, chain_id: int, as_json: bool) -> None:
-    options = {
+    named = {"chain": settings.chain} if settings.chain else {}
+    options = named | {
         "web3_http_provider": settings.web3_http_provider,
         "ens_contract": deployment.ens,
         "lighthouse_contract": deployment.lighthouse_name,

@@ -8,6 +8,7 @@ import pytest
 
 from mesh.settings.chains import CHAINS, ChainProfile, profile_of
 from schemas.address import parse_address
+from tests.support.content import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -45,3 +46,26 @@ def test_times_are_counted_in_the_blocks_that_contracts_see() -> None:
     assert CHAINS["base"].deadline_limit == 432_000
     assert CHAINS["arbitrum"].deadline_limit == 7200, "contracts see the blocks of Ethereum there"
     assert CHAINS["base"].blocks_in(0.01) == 1
+
+
+def test_the_page_has_the_table() -> None:
+    page = (ROOT / "docs" / "guides" / "chains.md").read_text()
+    rows = [
+        tuple(cell.strip() for cell in line.strip("|").split("|")) for line in page.splitlines() if line[:3] == "| `"
+    ]
+    assert [row for row in rows if row[0] != "`chain`"] == [
+        (
+            f"`{one.name}`",
+            one.title,
+            str(one.chain_id or "any"),
+            f"{one.block_seconds:g} s",
+            str(one.confirmations),
+            str(one.reorg_depth),
+            f"{one.deadline_limit:,}",
+            one.coin,
+            ", ".join(f"{symbol} `{address}`" for symbol, address in one.tokens.items()) or "none",
+            one.explorer or "none",
+        )
+        for one in CHAINS.values()
+    ]
+    assert [f"- {one.title}: {one.finalized}." in page for one in CHAINS.values()] == [True] * len(CHAINS)
