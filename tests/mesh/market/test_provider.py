@@ -278,8 +278,7 @@ async def test_no_more_transactions_than_the_limit_wait_to_be_mined(local: Local
             for _ in range(5):
                 demand = local.demand()
                 local.publish(demand, local.offer())
-            await until(lambda: provider.queue.waiting == 3)
-            await asyncio.sleep(1)
+            await until(lambda: node.waiting["eth_getTransactionReceipt"] == 2)
             assert provider.queue.waiting == 3
             assert len(await local.chain.liabilities.list()) == before + 2
         await until(lambda: provider.earnings().created == 5)
