@@ -201,6 +201,7 @@ class Api(Lifecycle):
         await stack.enter_async_context(self._publisher)
         tasks = await stack.enter_async_context(Background())
         tasks.start(self._show_agents(), "page: agents")
+        tasks.start(self._show_connection(), "page: connection")
         tasks.start(self._parts.drops.run(), "page: drops")
 
     def routes(self) -> list[web.RouteDef]:
@@ -263,9 +264,12 @@ class Api(Lifecycle):
                 "block": self._market.head,
                 "account": None if agent is None else agent.address,
                 "role": self._logins.role_of(request),
-                "connected": {"router": self._parts.network.connected, "chain": await self.has_chain()},
+                "connected": await self._connected(),
             }
         )
+
+    async def _connected(self) -> dict[str, bool]:
+        return {"router": self._parts.network.connected, "chain": await self.has_chain()}
 
     async def _market_facts(self) -> dict[str, Any]:
         """What changes seldom, a few seconds old; the last known while the node does not answer."""
@@ -547,12 +551,20 @@ class Api(Lifecycle):
     async def rpc(self, request: web.Request) -> web.Response:
         return answer(await _answer_rpc(self._parts.chain.node, await request.read()))
 
+    async def _show_connection(self) -> None:
+        """Publish when the router or the node is lost, and when it is back."""
+        last = None
+        while True:
+            if (connected := await self._connected()) != last:
+                last = connected
+                self.stream.publish("connection", "connection", connected)
+            await asyncio.sleep(0.5)  # seconds between two looks
+
     async def _show_agents(self) -> None:
         """Publish the agents while somebody looks at them."""
         last, asked = b"", float("-inf")
         while True:
             await asyncio.sleep(AGENTS_INTERVAL)
-            await self.has_chain()
             if not self.stream.has_subscribers("agents") and time.monotonic() - asked < UNSEEN_INTERVAL:
                 continue
             asked = time.monotonic()

@@ -77,6 +77,8 @@ LISTED: Final = 200
 """Jobs and orders in one answer."""
 AGENTS: Final = 256
 """Agents in one answer."""
+REJOINING: Final = 10.0
+"""Seconds in which agents have found the router again."""
 
 
 _ORDER: Final = ("created", "ready", "playing", "result", "judged", "reverted", "paid", "refunded")
@@ -110,6 +112,8 @@ class Views:
         self._asking = asyncio.Lock()
         self._agents: dict[str, Any] | None = None
         self._agents_at = float("-inf")
+        self._alone_at = float("-inf")
+        """When the router was last seen to be lost."""
 
     async def job(self, address: str) -> dict[str, Any]:
         """A job: terms, parties, phase, timeline. Raises `NotALiability`, `ChainError`."""
@@ -261,11 +265,21 @@ class Views:
         """Who is present, with status, offers and record, and which robots are away; a few seconds old at most."""
         loop = asyncio.get_running_loop()
         async with self._asking:
+            if not self._parts.network.connected:
+                self._alone_at = loop.time()
             # Seconds for which a list of agents is used.
             if self._agents is None or loop.time() - self._agents_at > 3.0:
-                self._agents = await self._ask_agents()
+                self._agents = self._with_lost(await self._ask_agents())
                 self._agents_at = loop.time()
             return self._agents
+
+    def _with_lost(self, found: dict[str, Any]) -> dict[str, Any]:
+        """With the agents that could not be found because the router is lost, or that must still find it again."""
+        if self._agents is None or asyncio.get_running_loop().time() - self._alone_at > REJOINING:
+            return found
+        listed = {(one["role"], one["address"]): one for one in (*self._agents["agents"], *found["agents"])}
+        away = [one for one in found["away"] if ("agent", one["address"]) not in listed]
+        return found | {"agents": list(listed.values()), "away": away}
 
     async def _ask_agents(self) -> dict[str, Any]:
         parts, market = self._parts, self._market

@@ -412,7 +412,7 @@ class Market(Lifecycle):
         """An agent says that its job took a step. Of a liability that was not read yet, it is kept until then."""
         if (job := self.jobs.get(address)) is None:
             said = self._said.get(address) or []
-            if len(said) < STEPS:
+            if len(said) < STEPS and (agent, kind, detail) not in said:
                 self._said[address] = [*said, (agent, kind, detail)]
         elif job.liability.promisor == agent and all(step["kind"] != kind for step in job.steps):
             self._step(job, kind, agent=agent, detail=detail, at=self._clock())
@@ -432,8 +432,11 @@ class Market(Lifecycle):
 
     async def _follow_playbacks(self, reports: Pump[tuple[ProgressKey, PlaybackPosition]]) -> None:
         async for key, position in reports:
-            if (job := self.jobs.get(parse_address(key.liability))) is not None:
-                self._take_position(job, parse_address(key.agent), position)
+            address, agent = parse_address(key.liability), parse_address(key.agent)
+            if (job := self.jobs.get(address)) is not None:
+                self._take_position(job, agent, position)
+            else:
+                self._say_playing(address, agent)
 
     async def _recall(self, job: SeenJob) -> None:
         """Ask the promisor for the phase, which it may have published before the job was read here."""
@@ -449,12 +452,14 @@ class Market(Lifecycle):
     def _take_position(self, job: SeenJob, agent: str, position: PlaybackPosition) -> None:
         if job.liability.promisor != agent or not self._limiter.allow(agent):
             return
-        if job.playback is None:
-            self._say(job.liability.address, agent, "ready", "")
-            self._step(job, "playing", agent=agent, at=self._clock())
+        self._say_playing(job.liability.address, agent)
         job.playback = position
         about = {"position": position.position, "total": position.total}
         self._stream.publish(f"liability/{job.liability.address}", "playing", about)
+
+    def _say_playing(self, address: str, agent: str) -> None:
+        for kind in ("ready", "playing"):
+            self._say(address, agent, kind, "")
 
     async def _follow_chain(self) -> None:
         async with aclosing(self._parts.chain.follow(self._from_block, parties=())) as blocks:

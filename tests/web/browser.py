@@ -296,6 +296,11 @@ class Browser:
         """What the console has said since the last call."""
         return [entry["message"] for entry in self.driver.get_log("browser")]  # type: ignore[no-untyped-call]
 
+    def errors(self) -> list[str]:
+        """What the console has said since the last call, but for requests that nobody answered."""
+        entries = self.driver.get_log("browser")  # type: ignore[no-untyped-call]
+        return [str(entry) for entry in entries if entry["source"] != "network"]
+
     def connect(self) -> None:
         """Connect the test's wallet by clicks."""
         self.click("#connect")

@@ -51,12 +51,16 @@ class Site:
     def page(self, *options: str, keyfile: bool = False, port: int = 0) -> Iterator[str]:
         """Another server of the page; gives its address."""
         port = port or free_port()
+        with self.page_server(*options, keyfile=keyfile, port=port):
+            yield f"http://127.0.0.1:{port}"
+
+    def page_server(self, *options: str, keyfile: bool = False, port: int) -> Serving:
+        """The process of another server of the page, not yet running."""
         variables = dict(self.variables) | {"AIRA_DATA_DIR": str(self.folder / f"web-{port}")}
         if keyfile:
             variables["AIRA_KEYFILE"] = f"{self.folder}/development/person.json"
         command = ("web", "--listen", f"127.0.0.1:{port}", *options)
-        with Serving(*AIRA, *command, says="page  ", variables=variables):
-            yield f"http://127.0.0.1:{port}"
+        return Serving(*AIRA, *command, says="page  ", variables=variables)
 
     @contextmanager
     def validator(self, *options: str, role: str = "provider") -> Iterator[None]:

@@ -63,6 +63,16 @@ def order(browser: Browser, site: Site, *, direction: str = "left", seconds: flo
     return sign(browser)
 
 
+def order_locally(browser: Browser, site: Site, *, seconds: float) -> None:
+    """The same with the local account of the server."""
+    browser.go()
+    browser.find("#account")
+    fill_in(browser, site, seconds=seconds)
+    browser.click("#order:not([disabled])")
+    browser.click("#sign")
+    browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
+
+
 def facts(site: Site, path: str) -> Any:
     """What the page's server answers."""
     with urllib.request.urlopen(f"{site.url}/api/v1/{path}", timeout=30) as response:

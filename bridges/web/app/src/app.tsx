@@ -176,28 +176,57 @@ export function useEvery(milliseconds: number, act: () => void, on = true): void
   }, [milliseconds, on]);
 }
 
-export function useLive(): boolean {
+/** Whether the server's events come; null until that is known. */
+export function useLive(): boolean | null {
   const [live, setLive] = useState(stream.live);
   useEffect(() => stream.watch(setLive), []);
   return live;
+}
+
+/** Whether only the connection is to blame, of which the page says everywhere that it is lost. */
+export function isUnreachable(error: unknown): boolean {
+  return error instanceof ApiError && error.code === "unreachable";
+}
+
+/** Calls `again` when the connection is back, if that is what made it fail. */
+export function useReturn(error: unknown, again: () => void): void {
+  const live = useLive();
+  useEffect(() => {
+    if (live && isUnreachable(error)) again();
+  }, [live]);
+}
+
+const typedHere = () => `aira-typed ${location.hash} `;
+
+/** The state of a form, which is still there when the page at this address is loaded again or returned to. */
+export function useTyped<T>(name: string, initial: () => T): [T, (value: T) => void] {
+  const key = useMemo(() => typedHere() + name, []);
+  const [value, setValue] = useState<T>(() => JSON.parse(sessionStorage.getItem(key) ?? "null") ?? initial());
+  useEffect(() => sessionStorage.setItem(key, JSON.stringify(value, (_, one) => (one instanceof File ? null : one))), [value]);
+  return [value, setValue];
+}
+
+/** Forgets what was typed at this address: it is ordered. */
+export function forgetTyped(): void {
+  for (const key of Object.keys(sessionStorage)) if (key.startsWith(typedHere())) sessionStorage.removeItem(key);
 }
 
 const models = new Map<string, Promise<Model>>();
 
 /** The model with a CID, read once; null until it is known. */
 export function useModel(cid: string): Model | null {
+  const live = useLive();
   const [found, setFound] = useState<Model | null>(null);
   useEffect(() => {
     let current = true;
-    setFound(null);
     if (!cid) return;
     if (!models.has(cid)) models.set(cid, get<Model>(`models/${cid}`));
     models.get(cid)!.then((model) => current && setFound(model), () => models.delete(cid));
     return () => {
       current = false;
     };
-  }, [cid]);
-  return found;
+  }, [cid, live]);
+  return found?.cid === cid ? found : null;
 }
 
 export interface Loaded<T> {
@@ -233,6 +262,7 @@ export function useData<T>(path: string | null, topic: string | null = null): Lo
     }, 60);
   }, []);
   useTopic(topic, reload);
+  useReturn(state.error, reload);
   const current = state.path === path;
   return { data: current ? state.data : null, error: current ? state.error : null, loading: !current || state.loading, reload };
 }

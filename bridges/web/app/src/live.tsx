@@ -3,7 +3,7 @@
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Address } from "viem";
 import { get, getExact, query } from "./api";
-import { useData, useTopic } from "./app";
+import { isUnreachable, useData, useReturn, useTopic } from "./app";
 import { clock, duration, plain, shown, size } from "./format";
 import "./live.css";
 import { Path, Plot } from "./plot";
@@ -62,10 +62,9 @@ function Following<T>(props: { path: string; topic: string; model: Description |
     setError(null);
     get<T>(path, stopped.signal).then(
       (answer) => {
-        const made = new Gathered(!props.clock);
-        for (const sample of props.samplesOf(answer)) made.add(sample);
-        // What came meanwhile is in the answer, too, up to the last one of its topic there.
-        for (const sample of waiting.current ?? []) if (sample.at > made.lastOf(sample.topic, sample.role)) made.add(sample);
+        const made = gathered ?? new Gathered(!props.clock); // a server that has begun anew knows less than this page
+        // What came meanwhile is in the answer, too.
+        for (const sample of [...props.samplesOf(answer), ...(waiting.current ?? [])]) made.addNew(sample);
         waiting.current = null;
         setGathered(made);
       },
@@ -80,7 +79,8 @@ function Following<T>(props: { path: string; topic: string; model: Description |
     const timer = setInterval(() => setSeen(gathered.count), REFRESH);
     return () => clearInterval(timer);
   }, [gathered]);
-  const problem = error ? <Problem error={error} retry={() => setTurn((known) => known + 1)} /> : null;
+  useReturn(error, () => setTurn((known) => known + 1));
+  const problem = error && !(gathered && isUnreachable(error)) ? <Problem error={error} retry={() => setTurn((known) => known + 1)} /> : null;
   if (!gathered) return problem ?? <p class="quiet" aria-busy="true">{texts.loading}</p>;
   if (!gathered.tracks.length) return <p class="empty quiet">{props.empty}</p>;
   const isLong = gathered.to - gathered.from > WINDOW;

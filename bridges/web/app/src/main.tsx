@@ -2,7 +2,7 @@ import { render } from "preact";
 import { useEffect, useState } from "preact/hooks";
 import { isAddress } from "viem";
 import { ApiError } from "./api";
-import { AppProvider, useApp, useData, useEvery, useLive, wordsOf } from "./app";
+import { AppProvider, useApp, useData, useEvery, useLive, useTopic, wordsOf } from "./app";
 import { isCid } from "./cid";
 import { plain } from "./format";
 import { postAgain } from "./ordering";
@@ -61,7 +61,7 @@ function Shell() {
   const route = useRoute();
   const inFrame = window.top !== window.self;
   const onOwnPage = market.robot && (!route.length || inFrame && !["order", "job", "file"].includes(route[0]));
-  if (onOwnPage) return <main><SinglePage robot={market.robot!} /></main>;
+  if (onOwnPage) return <><main><SinglePage robot={market.robot!} /></main><footer><Connection /></footer></>;
   return (
     <>
       <a class="skip" href="#main" onClick={skip}>{texts.skip}</a>
@@ -141,16 +141,16 @@ function Content({ route }: { route: string[] }) {
 function Connection() {
   const { market, block, reloadMarket } = useApp();
   const live = useLive();
-  useEvery(10_000, reloadMarket);
+  useTopic("connection", reloadMarket);
   useEffect(() => {
     if (!live) return;
     reloadMarket();
     postAgain(block);
   }, [live]);
-  const broken = !live ? texts.reconnecting : !market.connected.router ? texts.noRouter : !market.connected.chain ? texts.noChain : "";
+  const broken = live === false ? texts.reconnecting : !market.connected.router ? texts.noRouter : !market.connected.chain ? texts.noChain : "";
   return (
     <span id="connection" role="status" class={broken ? "broken" : ""}>
-      <span class={`dot ${broken ? "bad" : "good"}`} aria-hidden="true" /> {broken || texts.live}<span class="quiet"> · {texts.block(block)}</span>
+      <span class={`dot ${broken ? "bad" : "good"}`} aria-hidden="true" /> {broken || (live ? texts.live : texts.loading)}<span class="quiet"> · {texts.block(block)}</span>
     </span>
   );
 }

@@ -5,7 +5,7 @@ import type { StreamEvent } from "./types";
 type Listener = (event: StreamEvent) => void;
 
 const FIRST_DELAY = 300;
-const LONGEST_DELAY = 10_000;
+const LONGEST_DELAY = 3000;
 
 class Stream {
   private readonly listeners = new Map<string, Set<Listener>>();
@@ -15,7 +15,8 @@ class Stream {
   private seq = 0;
   private id = "";
   private planned = false;
-  live = false;
+  /** Whether the connection is open; null until it has been tried. */
+  live: boolean | null = null;
 
   /** Calls `listener` for each event of a topic, and with kind `gap` when some were missed. Returns what ends it. */
   on(topic: string, listener: Listener): () => void {
@@ -70,9 +71,11 @@ class Stream {
 
   private receive(event: StreamEvent): void {
     if (event.kind === "hello") {
-      if (this.id && this.id !== event.data.stream) this.tellAll({ ...event, kind: "gap" });
+      const known = this.id;
+      if (known === event.data.stream) return;
       this.id = event.data.stream;
-      if (!this.seq) this.seq = event.data.seq;
+      this.seq = event.data.seq;
+      if (known) this.tellAll({ ...event, kind: "gap" });
       return;
     }
     this.seq = Math.max(this.seq, event.seq);

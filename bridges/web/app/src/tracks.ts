@@ -76,10 +76,10 @@ export class Gathered {
     if (at.length) this.cover(at[0], at[at.length - 1]);
   }
 
-  /** The time of the last sample of a topic, as the samples say it. */
-  lastOf(topic: string, role: Sample["role"]): number {
-    const track = this.known.get(`${role} ${topic}`);
-    return track ? lastTime(track) + (this.origin ?? 0) : -Infinity;
+  /** The same, if it is newer than the last of its topic: what comes twice is taken once. */
+  addNew(sample: Sample): void {
+    const track = this.known.get(`${sample.role} ${sample.topic}`);
+    if (!track || sample.at - (this.origin ?? 0) > lastTime(track)) this.add(sample);
   }
 
   private track(topic: string, role: Sample["role"]): Track | undefined {

@@ -4,7 +4,7 @@ import { cloneElement, toChildArray } from "preact";
 import type { ComponentChildren, VNode } from "preact";
 import { useEffect, useId, useRef, useState } from "preact/hooks";
 import { isAddress } from "viem";
-import { useApp, wordsOf } from "./app";
+import { isUnreachable, useApp, wordsOf } from "./app";
 import type { Loaded } from "./app";
 import { amount, plain, short } from "./format";
 import { decimalText, parseDecimal } from "./numbers";
@@ -145,7 +145,7 @@ export function Show<T>(props: { of: Loaded<T>; children: (data: T) => Component
   if (data !== null) {
     return (
       <>
-        {error ? <Problem error={error} retry={reload} /> : null}
+        {error && !isUnreachable(error) ? <Problem error={error} retry={reload} /> : null}
         {props.children(data)}
       </>
     );

@@ -2,7 +2,7 @@ import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { zeroAddress } from "viem";
 import type { Address } from "viem";
 import { post } from "../api";
-import { useApp, useData, wordsOf } from "../app";
+import { forgetTyped, isUnreachable, useApp, useData, useReturn, useTyped, wordsOf } from "../app";
 import { calls } from "../contracts";
 import { amount, duration, ether, plain } from "../format";
 import { parseAmount } from "../numbers";
@@ -25,7 +25,7 @@ const LIFETIMES = [5, 60, 720];
 export function OrderPage(props: { model: string; robot: string; objective: string }) {
   const { model } = props;
   const described = useData<Model>(`models/${model}`);
-  const isMissing = described.error !== null && described.data === null;
+  const isMissing = described.error !== null && described.data === null && !isUnreachable(described.error);
   const known = useMemo(() => described.data ?? (isMissing ? withoutDescription(model) : null), [described.data, isMissing, model]);
   const description = known?.description;
   return (
@@ -50,15 +50,16 @@ type Choosing = Address | "" | null;
 
 function OrderForm({ model, robot, objective }: { model: Model; robot: string; objective: string }) {
   const { market, account } = useApp();
-  const [choice, setChoice] = useState(() => (objective ? { ...firstChoice(model), way: "cid" as const, cid: objective } : firstChoice(model)));
-  const [price, setPrice] = useState(typicalPrice(model.description?.price, market.token.symbol) || "1");
-  const [minutes, setMinutes] = useState<number | null>(null);
+  const [choice, setChoice] = useTyped(`choice ${model.described}`, () => (objective ? { ...firstChoice(model), way: "cid" as const, cid: objective } : firstChoice(model)));
+  const [price, setPrice] = useTyped("price", () => typicalPrice(model.description?.price, market.token.symbol) || "1");
+  const [minutes, setMinutes] = useTyped<number | null>("minutes", () => null);
   const [judge, setJudge] = useState<Judge | null>(NOBODY);
-  const [chosen, choose] = useState<Choosing>(null);
+  const [chosen, choose] = useTyped<Choosing>("chosen", () => null);
   const make = useObjective(model, choice);
   const { quotes, problem, ask } = useQuotes(model, make);
   const fitting = quotes?.filter((quote) => isUsable(quote, market.token.address)) ?? [];
-  const wanted = chosen ?? (fitting.find((quote) => quote.agent === robot) ?? fitting[0])?.agent ?? (quotes ? "" : null);
+  const isThere = chosen === "" || fitting.some((one) => one.agent === chosen);
+  const wanted = isThere ? chosen : (fitting.find((quote) => quote.agent === robot) ?? fitting[0])?.agent ?? (quotes ? "" : null);
   const quote = fitting.find((one) => one.agent === wanted);
   const offered = parseAmount(price, market.token.decimals);
   const cost = wanted ? (quote ? BigInt(quote.cost) : null) : offered;
@@ -123,7 +124,9 @@ function useQuotes(model: Model, make: Make | null): { quotes: Quote[] | null; p
     };
   }, [make, turn]);
   const known = found?.of === make ? found : null;
-  return { quotes: known?.quotes ?? null, problem: known?.problem, ask: () => setTurn((known) => known + 1) };
+  const ask = () => setTurn((known) => known + 1);
+  useReturn(known?.problem, ask);
+  return { quotes: known?.quotes ?? null, problem: known?.problem, ask };
 }
 
 /** Who could do it, side by side: price, start, duration, record; the cheapest first, refusals last. */
@@ -295,6 +298,7 @@ function Review(props: { of: Prepared; isWanted: () => boolean; close: () => voi
     setError("");
     const order = demand ? await signAndPost(demand, hash!, draft.robot, account, props.isWanted) : await orderLocally(draft, account.address, market);
     props.close();
+    forgetTyped();
     location.hash = `#/order/${order}`;
   };
   const failed = (problem: unknown) => {

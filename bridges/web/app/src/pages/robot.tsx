@@ -2,7 +2,7 @@ import { useState } from "preact/hooks";
 import { isAddress } from "viem";
 import type { Address } from "viem";
 import { ApiError, post } from "../api";
-import { useApp, useData, useEvery, useModel } from "../app";
+import { useApp, useData, useEvery, useModel, useTyped } from "../app";
 import { amount, clock, ether, plain, since } from "../format";
 import { Readings } from "../live";
 import { texts } from "../texts";
@@ -134,7 +134,7 @@ type Rules = Omit<OwnerRules, "notify" | "events">;
 function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
   const { robot, rules, changed } = props;
   const { notify, market } = useApp();
-  const [banned, setBanned] = useState("");
+  const [banned, setBanned] = useTyped(`refuse ${rules.refuse}`, () => "");
   const [stopping, setStopping] = useState(false);
   const path = `agents/${robot.address}`;
   const change = (fields: Partial<Rules>) => async () => {
@@ -177,7 +177,7 @@ function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
 /** A price that may be changed: people write `5` and mean the market's token. */
 function PriceSetting(props: { id: string; label: string; hint: string; now: string; save: (price: string) => Promise<void> }) {
   const { market } = useApp();
-  const [text, setText] = useState(props.now);
+  const [text, setText] = useTyped(`${props.id} ${props.now}`, () => props.now);
   const price = /^[\d.,]+$/.test(text.trim()) ? `${text.trim()} ${market.token.symbol}` : text.trim();
   return (
     <form class="row end" onSubmit={(event) => event.preventDefault()}>

@@ -13,7 +13,7 @@ export function robotsOf(agents: Agent[] | undefined): Agent[] {
 
 /** Home: who is here, what each does and for how much; and who is away. */
 export function RobotsPage() {
-  const { agents, away } = useApp();
+  const { agents, away, market } = useApp();
   const [search, setSearch] = useState("");
   const [model, setModel] = useState("");
   const robots = robotsOf(agents?.agents);
@@ -34,13 +34,13 @@ export function RobotsPage() {
       ) : null}
       {agents === null ? <p class="quiet" aria-busy="true">{texts.loading}</p> : null}
       <div class="robots">{shown.map((robot) => <RobotCard key={robot.address} robot={robot} />)}</div>
-      {agents !== null && !robots.length ? (
+      {agents !== null && !robots.length && market.connected.router ? (
         <div class="empty">
           <h2>{texts.noRobotsTitle}</h2>
           <p>{texts.noRobotsHint}</p>
           <pre>{texts.noRobotsCommand}</pre>
         </div>
-      ) : agents !== null && !shown.length && !gone.length ? <p class="empty">{texts.noneFound} <button type="button" class="button small quietly" onClick={() => { setSearch(""); setModel(""); }}>{texts.showAll}</button></p> : null}
+      ) : robots.length + away.length && !shown.length && !gone.length ? <p class="empty">{texts.noneFound} <button type="button" class="button small quietly" onClick={() => { setSearch(""); setModel(""); }}>{texts.showAll}</button></p> : null}
       {gone.length ? (
         <section>
           <h2>{texts.away}</h2>

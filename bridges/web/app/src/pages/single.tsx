@@ -1,6 +1,6 @@
-import { useMemo, useState } from "preact/hooks";
+import { useMemo } from "preact/hooks";
 import { zeroAddress } from "viem";
-import { useApp, useData } from "../app";
+import { useApp, useData, useTyped } from "../app";
 import { amount, plain } from "../format";
 import { parseAmount } from "../numbers";
 import type { Wish } from "../ordering";
@@ -31,7 +31,7 @@ export function SinglePage({ robot }: { robot: Robot }) {
 
 function RobotOrder({ robot, model }: { robot: Robot; model: Model }) {
   const { market, account } = useApp();
-  const [choice, setChoice] = useState(() => firstChoice(model));
+  const [choice, setChoice] = useTyped(`choice ${model.described}`, () => firstChoice(model));
   const chosen = useObjective(model, choice);
   const cost = robot.cost !== null ? BigInt(robot.cost) : parseAmount(typicalPrice(model.description?.price, market.token.symbol), market.token.decimals) ?? 0n;
   const wish = useMemo<Wish | null>(() => {
