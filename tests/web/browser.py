@@ -273,13 +273,17 @@ class Browser:
         }}"""
         self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
 
+    def label(self, words: str) -> WebElement:
+        """The label with these words, when it can be seen."""
+        path = f"//label[contains(normalize-space(.), {json.dumps(words)})]"
+        found: WebElement = self.until(
+            lambda: next(one for one in self.driver.find_elements(By.XPATH, path) if one.is_displayed()), words
+        )
+        return found
+
     def type(self, label: str, text: str) -> None:
         """Write a text into the field with this label."""
-        path = f"//label[contains(normalize-space(.), {json.dumps(label)})]"
-        found = self.until(
-            lambda: next(one for one in self.driver.find_elements(By.XPATH, path) if one.is_displayed()), label
-        )
-        field = self.driver.find_element(By.ID, found.get_attribute("for"))
+        field = self.driver.find_element(By.ID, self.label(label).get_attribute("for") or "")
         field.send_keys(Keys.CONTROL + "a")
         field.send_keys(text)
 

@@ -127,7 +127,7 @@ def test_a_page_outlives_its_server(site: Site) -> None:
             browser.connect()
             order_of_nobodys_model(browser, site)
             browser.sees("Your order is in the market")
-        browser.sees("Connecting again")
+        browser.sees("Connection lost")
         with site.page(port=port):
             browser.sees("Live")
             # The server knows the order again, because the page has posted it again.

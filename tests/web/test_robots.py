@@ -10,10 +10,12 @@ import threading
 import urllib.request
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 from urllib.error import HTTPError
 
 import pytest
+from eth_utils.crypto import keccak
+from selenium.webdriver.common.keys import Keys
 
 from tests.support.commands import Serving, aira
 from tests.web.browser import DESKTOP, PHONE, Browser
@@ -33,6 +35,10 @@ LOOKS = [
     for dark in (False, True)
 ]
 """Screens on which a page is looked at."""
+
+
+CLICKS: Final = "window.clicks = 0; addEventListener('click', (event) => { clicks += event.isTrusted; }, true)"
+TRANSFER: Final = "0x" + keccak(text="Transfer(address,address,uint256)").hex()
 
 
 @contextmanager
@@ -81,22 +87,30 @@ def test_a_newcomer_orders_from_the_cheaper_robot_watches_it_and_stops_it(
     site: Site, scout: str, pictures: Path
 ) -> None:
     with site.page(keyfile=True) as url, Browser(url) as browser:
+        browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": CLICKS})
         browser.go()
         browser.sees("Scout")
         check(browser, pictures / "robots-two.png")
         browser.press("Order")
-        browser.type("Duration", "60")
-        browser.until(lambda: len(browser.all(".quote")) > 1, "the quotes")
+        browser.click(f"#{browser.label('Duration').get_attribute('for')}")
+        for key in (Keys.HOME, Keys.DELETE, "6", "0"):
+            browser.keys(key)
+        browser.until(lambda: len(browser.all(".quote [value]")) > 1, "the quotes")
+        prices = [float(price.text.split()[0]) for price in browser.all(".quote .price-tag")]
+        assert min(prices) == 2.5 < max(prices)
         browser.click(f".quote [value='{scout}']")
-        browser.sees("2.5 XRT")
         check(browser, pictures / "quotes.png")
         browser.click("#order:not([disabled])")
         assert "Duration\n60 s" in browser.find("#in-words").text
+        assert "2.5 XRT" in browser.find("dialog[open]").text
         browser.sees("You get the price back.")
         browser.click("#sign")
         browser.until(lambda: "#/job/" in browser.driver.current_url, "the job")
+        assert browser.driver.execute_script("return clicks") == 5
         job = browser.driver.current_url
-        browser.until(lambda: browser.all(".topics canvas, .track canvas, canvas"), "the path")
+        browser.find(".track .path canvas")
+        shown = [browser.find(".path figcaption").text]
+        browser.until(lambda: browser.find(".path figcaption").text not in shown, "the next position")
         browser.driver.refresh()  # what came before is shown again
         browser.sees("/position")
         check(browser, pictures / "job-live.png")
@@ -109,6 +123,11 @@ def test_a_newcomer_orders_from_the_cheaper_robot_watches_it_and_stops_it(
         browser.until(lambda: facts(site, path)["liability"]["state"] == "failed", "the refund")
         contract = facts(site, path)
         assert contract["liability"]["promisor"] == scout
+        market, promisee = facts(site, "market"), contract["liability"]["promisee"]
+        people = [f"0x{int(one, 16):064x}" for one in (contract["liability"]["address"], promisee)]
+        moved = {"address": market["token"]["address"], "topics": [TRANSFER, *people], "fromBlock": "0x0"}
+        (refund,) = site.wallet().rpc("eth_getLogs", moved)
+        assert int(refund["data"], 16) == 2.5 * 10 ** market["token"]["decimals"]
         # For one robot alone: the other server knows the contract, and has never seen the order.
         with pytest.raises(HTTPError, match="404"):
             facts(site, f"orders/{contract['demandHash']}")
