@@ -10,6 +10,8 @@ import pytest
 
 from mesh.agent.ledger import Phase
 from mesh.dev.development import deploy_market
+from mesh.market.book import OrderStage
+from schemas import Demand, Offer
 from tests.mesh.agent.trades import job
 from tests.support.market import QUICK, Founded, Place, in_phase, offering
 from tests.support.nodes import Anvil
@@ -132,3 +134,19 @@ async def test_an_end_that_is_taken_back_before_it_counts_is_not_told(market: Se
             assert not outcome.done()
             await market.mine(1)
             assert (await outcome).success
+
+
+async def test_a_provider_is_done_with_orders_when_the_block_of_their_contract_counts(market: Settling) -> None:
+    place = market.place
+    async with place.provider(seconds=60) as provider, market.robot(), place.agent("person") as person:
+        contract = await person.demand(job(place), cost=7)
+
+        def stages() -> set[OrderStage]:
+            records = provider.orders._records.values()
+            return {one.state for one in records if isinstance(one.verified.message, Demand | Offer)}
+
+        created = (await market.dated(contract)).created.block_number
+        await market.mine_until_one_before(created)
+        assert OrderStage.CONFIRMED not in stages()
+        await market.mine(1)
+        await until(lambda: stages() == {OrderStage.CONFIRMED}, what="the provider is done with them")
