@@ -21,6 +21,7 @@ from mesh.agent._outbox import result_identity
 from mesh.agent._owner_rules import OwnerRules
 from mesh.agent._profile import OwnProfile
 from mesh.agent._quotes import Quoting
+from mesh.agent._refunds import DueRefunds
 from mesh.agent._services import offer_services
 from mesh.agent._status import AgentStatus
 from mesh.agent.contracts import ContractReports, Outcome
@@ -259,6 +260,7 @@ class AgentRuntime(Lifecycle):
         self.trader.full = self.rules.full
         self.notifier = Notifier(parts.settings, parts.signer.address)
         self.trader.on_offer = self._on_offer
+        self.refunds = DueRefunds(parts)
         self.token_events = TokenEvents(parts.channel.put, parts.signer.address)
         self.status = AgentStatus(parts, self.executor, model=model)
         self.profile = OwnProfile(parts, self.executor, self.rules, description, model=model)
@@ -304,6 +306,7 @@ class AgentRuntime(Lifecycle):
         yield "outbox", self.parts.outbox.run()
         yield "listener", self._follow_chain()
         yield "late results", LateResults(self.parts).run()
+        yield "refunds", self.refunds.run()
         yield "reports on earlier contracts", self._follow_earlier()
         if self._is_robot:
             yield "profile", self.profile.run()
@@ -422,6 +425,8 @@ class AgentRuntime(Lifecycle):
         if does_jobs and liability.promisor == self._account and not liability.is_finalized:
             self.executor.at_hand.add(liability.address)  # before the offer is none any more
         await self.trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
+        if liability.promisee == self._account and not liability.is_finalized:
+            self.refunds.created(liability.address)
         if liability.promisor != self._account:
             return
         if not does_jobs:
@@ -459,6 +464,7 @@ class AgentRuntime(Lifecycle):
                 await self.parts.ledger.set_aside(address)
                 await self.parts.outbox.settle(result_identity(address))
                 log.warning("the liability was reverted; its job waits", extra=log_event("job-set-aside"))
+        self.refunds.ended(address)
         await self.trader.liability_reverted(address)
 
     @with_liability_context
@@ -474,6 +480,7 @@ class AgentRuntime(Lifecycle):
             log.info("finalized, %s", "paid" if success else "refunded", extra=facts)
             paid = replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
             await self._on_phase(Phase.FINALIZED, paid)
+        self.refunds.ended(address)
         outcome = Outcome(success=success, result=result)
         self.trader.contracts.finalized(address, outcome, self.parts.chain_head.head if ended is None else ended)
         await self.trader.contracts.settle()
@@ -482,6 +489,7 @@ class AgentRuntime(Lifecycle):
     async def finalization_reverted(self, address: str) -> None:
         """A reorganisation reverted the end of a contract: the Result of its job, if it has one, is sent again."""
         self.trader.contracts.end_reverted(address)
+        self.refunds.end_reverted(address)
         async with self.executor.halted(address) as job:
             if job is not None and job.result is not None:
                 log.warning("the finalization was reverted", extra=log_event("finalization-reverted"))

@@ -1,0 +1,110 @@
+"""The cost of a job that nobody ends comes back by itself."""
+
+from __future__ import annotations
+
+import asyncio
+from itertools import count
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import DeploymentPlan, InsufficientFunds
+from mesh.chain.liabilities import Liabilities
+from mesh.dev import EmbeddedChain
+from mesh.dev.development import deploy_market
+from tests.mesh.agent.restarts import COST, half_way
+from tests.support.log_events import logged_facts
+from tests.support.market import Founded, Place
+from tests.support.rollups import ForeignBlocks, seen_in
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from mesh.agent.agent import Agent
+    from mesh.chain import Settled
+    from tests.support.routers import EmbeddedRouter
+
+REFUND_DELAY = 60
+
+
+@pytest.fixture(params=[EmbeddedChain, ForeignBlocks], ids=["own blocks", "blocks of another chain"])
+async def place(request: pytest.FixtureRequest, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
+    plan = DeploymentPlan(timeout_blocks=10, refund_delay=REFUND_DELAY)
+    async with request.param() as node:
+        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
+        async with Place(Founded(node, market), router.endpoint, tmp_path) as place:
+            yield place
+
+
+async def test_the_cost_of_a_job_that_is_never_finished_comes_back_within_two_blocks_of_its_time(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    before, chain = await place.balance("person"), place.chains["person"]
+    async with half_way(place) as (_robot, person, contract):
+        assert await place.balance("person") == before - COST
+        ended = asyncio.create_task(contract.outcome())
+        await _mined_until_due(place, person, contract.address)
+        async with asyncio.timeout(60):
+            while not ended.done():
+                await place.node.mine(1)
+                await until_found(lambda: _has_read(person, place), what="the block")
+                await asyncio.wait([ended], timeout=1.0)
+        outcome, due = await ended, await chain.liabilities.refundable_from(contract.address)
+        assert (outcome.success, outcome.code) == (False, "no-result")
+        (dated,) = [one for one in await chain.liabilities.history() if one.liability.address == contract.address]
+        assert dated.ended is not None
+        seen = seen_in if isinstance(place.node, ForeignBlocks) else int
+        first = next(block for block in count(dated.created.block_number) if seen(block) >= due)
+        assert first <= dated.ended.block_number <= first + 2
+    assert await place.balance("person") == before
+    assert len(logged_facts(caplog, "refund-taken")) == 1
+
+
+async def _mined_until_due(place: Place, person: Agent, liability: str) -> None:
+    """Mine until a transaction in the next block could refund it at last."""
+    liabilities, poll = place.chains["person"].liabilities, place.chains["person"].node.timing.poll_interval
+    refundable = await liabilities.refundable_from(liability)
+    while (await liabilities.refund_state(liability)).contract_block + 1 < refundable:
+        await place.node.mine(1)
+        await until_found(lambda: _has_read(person, place), what="the block")
+        await asyncio.sleep(poll)
+
+
+async def _has_read(agent: Agent, place: Place) -> bool:
+    return agent.parts.chain_head.head == await place.chains["person"].block_number()
+
+
+async def test_it_also_comes_back_when_the_persons_agent_was_away_at_that_time(place: Place) -> None:
+    before = await place.balance("person")
+    async with half_way(place):
+        assert await place.balance("person") == before - COST
+    await place.node.mine(10 * REFUND_DELAY)
+    async with place.agent("person"):
+
+        async def is_back() -> bool:
+            return await place.balance("person") == before
+
+        await until_found(is_back, what="the cost")
+
+
+async def test_a_refund_that_can_not_be_paid_for_is_tried_again(
+    place: Place, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    refund, attempts = Liabilities.refund, list[str]()
+
+    async def poor(liabilities: Liabilities, liability: str) -> Settled:
+        attempts.append(liability)
+        if len(attempts) == 1:
+            raise InsufficientFunds(place.address("person"), balance=0, needed=1)
+        return await refund(liabilities, liability)
+
+    monkeypatch.setattr(Liabilities, "refund", poor)
+    async with half_way(place) as (_robot, person, contract):
+        await _mined_until_due(place, person, contract.address)
+        await until(lambda: [one["code"] for one in logged_facts(caplog, "refund-waits")] == ["insufficient-funds"])
+        await place.node.mine(8 * REFUND_DELAY)
+        async with asyncio.timeout(60):
+            assert not (await contract.outcome()).success
+    assert attempts == [contract.address] * 2
