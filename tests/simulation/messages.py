@@ -98,9 +98,11 @@ class RingChannel(FifoChannel):
 
 
 class Callback:
-    """`zenoh.handlers.Callback`."""
+    """`zenoh.handlers.Callback`; here it is always called in the same thread, `indirect` or not."""
 
-    def __init__(self, callback: Callable[[Any], object], drop: Callable[[], object] | None = None) -> None:
+    def __init__(
+        self, callback: Callable[[Any], object], drop: Callable[[], object] | None = None, *, indirect: bool = True
+    ) -> None:
         self.callback = callback
         self.drop = drop
 
