@@ -31,7 +31,10 @@ An account that can't pay for it is rejected at the start."""
 command = LazyGroup(
     "chain",
     help="Run a development chain; deploy and inspect the network's contracts on any chain.",
-    lazy={"up": ("mesh.cli.up:chain_up", "serve a development chain with the contracts")},
+    lazy={
+        "cost": ("mesh.cli.chain_cost:cost", "show what a job costs, in the chain's coin and in money"),
+        "up": ("mesh.cli.up:chain_up", "serve a development chain with the contracts"),
+    },
 )
 
 

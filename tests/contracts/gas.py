@@ -12,7 +12,7 @@ from schemas import parse_cid
 from tests.contracts.chains import py_evm
 from tests.contracts.juries import Panel
 from tests.contracts.market import RESULT, Market
-from tests.contracts.suite import XRT, Suite
+from tests.contracts.suite import REFUND_DELAY, XRT, Suite
 
 Gas = dict[str, dict[str, int]]
 """Gas by row and generation (`generation_5`, `generation_3`)."""
@@ -46,6 +46,8 @@ ROWS: Final = {
     "finalize_owed": Row("  that refuses to pay", ("-", "-"), (125_000, 125_000)),
     "claim": Row("claim what is owed", ("-", "-"), (50_000, 50_000)),
     "deploy_jury": Row("deploy 2 of 3 jurors", ("-", "-"), (600_000, None)),
+    "approve": Row("approve the factory", ("-", "-"), (50_000, 50_000)),
+    "refund": Row("refund, cost > 0", ("-", "-"), (85_000, 85_000)),
     "withdraw_order": Row("withdraw an order", ("-", "-"), (35_000, 50_000)),
     "revert_mismatch": Row("reverted create (mismatch)", ("the limit", "~700,000"), (60_000, 60_000)),
 }
@@ -78,6 +80,12 @@ def _measure(market: Market) -> dict[str, int]:
     used["withdraw_order"] = suite.send(market.withdrawal(market.demand()), market.promisee)["gasUsed"]
     mismatch = market.creation(market.demand(cost=XRT), market.offer(cost=2 * XRT))
     used["revert_mismatch"] = suite.attempt(mismatch, market.provider)["gasUsed"]
+    used["approve"] = suite.send(suite.xrt.functions.approve(market.outsider.address, 2 * XRT), market.promisee)[
+        "gasUsed"
+    ]
+    liability = market.create(cost=XRT)
+    suite.chain.mine(REFUND_DELAY)
+    used["refund"] = suite.send(suite.factory.functions.refund(liability.address), market.promisee)["gasUsed"]
     return {key: used[key] for key in ROWS if key in used}
 
 
