@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 
-class Step(NamedTuple):
+class JobTransaction(NamedTuple):
     """A transaction of a job that pays in XRT.
 
     Its name among the measurements, who sends it and when; its gas in generations 3 and 5; the bytes of its data that
@@ -27,11 +27,11 @@ class Step(NamedTuple):
 
 
 STEPS: Final = (
-    Step("create_cost", "create the contract", "the provider", (206_700, 163_300), 450),
-    Step("finalize_cost", "finalize it", "the provider", (112_700, 111_600), 130),
-    Step("approve", "approve the factory", "the customer, once for many jobs", (45_900, 45_900), 45),
-    Step("refund", "refund it", "the customer, if nobody finalizes", (78_400, 78_900), 25),
-    Step("withdraw_order", "withdraw an order on the chain", "its maker, if asked for", (46_200, 28_300), 37),
+    JobTransaction("create_cost", "create the contract", "the provider", (206_700, 163_300), 450),
+    JobTransaction("finalize_cost", "finalize it", "the provider", (112_700, 111_600), 130),
+    JobTransaction("approve", "approve the factory", "the customer, once for many jobs", (45_900, 45_900), 45),
+    JobTransaction("refund", "refund it", "the customer, if nobody finalizes", (78_400, 78_900), 25),
+    JobTransaction("withdraw_order", "withdraw an order on the chain", "its maker, if asked for", (46_200, 28_300), 37),
 )
 """Each job has the first two."""
 

@@ -106,6 +106,9 @@ class Callback:
         self.callback = callback
         self.drop = drop
 
+    def __call__(self, received: Any) -> object:
+        return self.callback(received)
+
 
 class Mailbox:
     """A queue between the session and a thread of the process."""
