@@ -31,7 +31,7 @@ def screenshot(picture: str) -> str:
         return MOMENTS[picture]
     if (ROOT / "docs" / "tutorials" / picture).with_suffix(".md").exists():
         return f"{Path(picture).stem}.png"
-    found = re.fullmatch(r"page-([a-z]+)(?:-done)?(-phone)?(-dark)?\.webp", picture)
+    found = re.fullmatch(r"page-([a-z]+(?:-away)?)(?:-done)?(-phone)?(-dark)?\.webp", picture)
     if not found:
         raise ValueError(f"{picture}: no test makes a picture of this name")
     return f"{found[1]}-{'phone' if found[2] else 'desktop'}-{'dark' if found[3] else 'light'}.png"
