@@ -16,7 +16,7 @@ from tests.mesh.agent.restarts import COST, half_way
 from tests.support.log_events import logged_facts
 from tests.support.market import Founded, Place
 from tests.support.rollups import ForeignBlocks, seen_in
-from tests.support.waiting import until, until_found
+from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -103,7 +103,12 @@ async def test_a_refund_that_can_not_be_paid_for_is_tried_again(
     monkeypatch.setattr(Liabilities, "refund", poor)
     async with half_way(place) as (_robot, person, contract):
         await _mined_until_due(place, person, contract.address)
-        await until(lambda: [one["code"] for one in logged_facts(caplog, "refund-waits")] == ["insufficient-funds"])
+
+        async def is_told() -> bool:
+            await place.node.mine(1)  # what contracts count is looked at with each block
+            return [one["code"] for one in logged_facts(caplog, "refund-waits")] == ["insufficient-funds"]
+
+        await until_found(is_told, what="that the refund waits")
         await place.node.mine(8 * REFUND_DELAY)
         async with asyncio.timeout(60):
             assert not (await contract.outcome()).success
