@@ -163,7 +163,7 @@ def see_a_finished_job(browser: Browser, site: Site) -> None:
 
 
 def see_a_running_job(browser: Browser, site: Site) -> None:
-    order_locally(browser, site, seconds=120)
+    order_locally(browser, site, seconds=300)
     browser.sees("Playback began")
 
 

@@ -399,6 +399,7 @@ function useRecorded(cid: string, summary: Summary): { gathered: Gathered | null
 }
 
 async function addTopic(made: Gathered, cid: string, { topic, role, messages, shown: how }: TopicSummary, all: TopicSummary[], signal: AbortSignal): Promise<void> {
+  made.complete(topic, role, messages, [], []); // its place, whichever answer comes first
   const most = how === "image" ? MOST_PICTURES : MOST_MESSAGES;
   const found: Message[] = [];
   let next: number | null = messages > most && how === "values" ? null : -1;
