@@ -885,7 +885,8 @@ class Executor:
             if await self._chain.retrying(partial(self._chain.node.counts, block), outages=self._outages):
                 break
             if not is_told:
-                is_told, facts = True, log_event("job-waits", block=block)
+                is_told = True
+                facts = log_event("job-waits", block=block)
                 log.info("the job waits until its contract in block %d counts", block, extra=facts)
             await asyncio.sleep(self._chain.node.timing.poll_interval)
             job = await self._ledger.job(address)
