@@ -33,7 +33,8 @@ async def test_an_operator_controls_a_robot_of_the_servers_own_data_folder(place
         await log_in(browser)
         before = await browser.get(f"{page}/settings")
         assert before == {
-            "price": "", "paused": False, "refuse": [], "leastPrice": "", "held": False, "stopped": "", "here": True
+            "price": "", "paused": False, "refuse": [], "leastPrice": "", "held": False, "stopped": "", "here": True,
+            "events": [], "notify": []
         }  # fmt: skip
         wanted = {"price": "6 XRT", "paused": True, "refuse": [place.address("person")], "leastPrice": "1.5 XRT"}
         assert await browser.post(f"{page}/settings", wanted) == before | wanted
