@@ -198,12 +198,12 @@ export function useReturn(error: unknown, again: () => void): void {
 
 const typedHere = () => `aira-typed ${location.hash} `;
 
-/** The state of a form, which is still there when the page at this address is loaded again or returned to. */
-export function useTyped<T>(name: string, initial: () => T): [T, (value: T) => void] {
+/** The state of a form, which is still there when the page at this address is loaded again or returned to; and what forgets it. */
+export function useTyped<T>(name: string, initial: () => T): [T, (value: T) => void, () => void] {
   const key = useMemo(() => typedHere() + name, []);
   const [value, setValue] = useState<T>(() => JSON.parse(sessionStorage.getItem(key) ?? "null") ?? initial());
   useEffect(() => sessionStorage.setItem(key, JSON.stringify(value, (_, one) => (one instanceof File ? null : one))), [value]);
-  return [value, setValue];
+  return [value, setValue, () => sessionStorage.removeItem(key)];
 }
 
 /** Forgets what was typed at this address: it is ordered. */

@@ -134,11 +134,12 @@ type Rules = Omit<OwnerRules, "notify" | "events">;
 function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
   const { robot, rules, changed } = props;
   const { notify, market } = useApp();
-  const [banned, setBanned] = useTyped(`refuse ${rules.refuse}`, () => "");
+  const [banned, setBanned, forgetBanned] = useTyped(`refuse ${rules.refuse}`, () => "");
   const [stopping, setStopping] = useState(false);
   const path = `agents/${robot.address}`;
-  const change = (fields: Partial<Rules>) => async () => {
+  const change = (fields: Partial<Rules>, forget?: () => void) => async () => {
     await post(`${path}/settings`, fields);
+    forget?.();
     notify(texts.saved);
     changed();
   };
@@ -157,8 +158,8 @@ function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
       </div>
       <StopDialog title={texts.stopRobot} open={stopping} close={() => setStopping(false)} stop={stop} notNow={texts.notNow}><p>{texts.stopRobotHint}</p></StopDialog>
       <div class="fields owner-fields">
-        <PriceSetting id="set-price" label={texts.priceOfJob} hint={texts.priceOfJobHint(plain(market.token.symbol, 12))} now={rules.price} save={(price) => change({ price })()} />
-        <PriceSetting id="set-least" label={texts.leastPrice} hint={texts.leastPriceHint} now={rules.leastPrice} save={(leastPrice) => change({ leastPrice })()} />
+        <PriceSetting id="set-price" label={texts.priceOfJob} hint={texts.priceOfJobHint(plain(market.token.symbol, 12))} now={rules.price} save={(price, forget) => change({ price }, forget)()} />
+        <PriceSetting id="set-least" label={texts.leastPrice} hint={texts.leastPriceHint} now={rules.leastPrice} save={(leastPrice, forget) => change({ leastPrice }, forget)()} />
       </div>
       <h3>{texts.refused}</h3>
       <ul class="plain">
@@ -168,21 +169,21 @@ function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
       </ul>
       <form class="row end" onSubmit={(event) => event.preventDefault()}>
         <WordField label={texts.refuseCustomer} text={banned} change={setBanned} placeholder="0x…" error={banned && !isAddress(banned) ? texts.notAnAccount : ""} />
-        <Action class="button small quietly" disabled={!isAddress(banned)} run={change({ refuse: [...rules.refuse, banned as Address] })}>{texts.refuse}</Action>
+        <Action class="button small quietly" disabled={!isAddress(banned)} run={change({ refuse: [...rules.refuse, banned as Address] }, forgetBanned)}>{texts.refuse}</Action>
       </form>
     </>
   );
 }
 
 /** A price that may be changed: people write `5` and mean the market's token. */
-function PriceSetting(props: { id: string; label: string; hint: string; now: string; save: (price: string) => Promise<void> }) {
+function PriceSetting(props: { id: string; label: string; hint: string; now: string; save: (price: string, forget: () => void) => Promise<void> }) {
   const { market } = useApp();
-  const [text, setText] = useTyped(`${props.id} ${props.now}`, () => props.now);
+  const [text, setText, forget] = useTyped(`${props.id} ${props.now}`, () => props.now);
   const price = /^[\d.,]+$/.test(text.trim()) ? `${text.trim()} ${market.token.symbol}` : text.trim();
   return (
     <form class="row end" onSubmit={(event) => event.preventDefault()}>
       <NumberField label={props.label} text={text} change={setText} hint={props.hint} />
-      <Action id={props.id} class="button small" disabled={text === props.now} run={() => props.save(price)}>{texts.save}</Action>
+      <Action id={props.id} class="button small" disabled={text === props.now} run={() => props.save(price, forget)}>{texts.save}</Action>
     </form>
   );
 }
