@@ -6,6 +6,7 @@ import { useCallback, useContext, useEffect, useMemo, useRef, useState } from "p
 import { getAddress } from "viem";
 import type { Address, Hex } from "viem";
 import { ApiError, get } from "./api";
+import { forgetAll, keep, recall } from "./storage";
 import { stream } from "./stream";
 import { texts } from "./texts";
 import type { Agent, Agents, Market, Model, StreamEvent } from "./types";
@@ -69,22 +70,22 @@ export function AppProvider(props: { market: Market; reloadMarket: () => void; c
     if (!accounts.length) return;
     const chainId = Number(await ask(wallet.provider, "eth_chainId"));
     setAccount({ kind: "wallet", address: getAddress(accounts[0]), wallet, chainId });
-    localStorage.setItem(REMEMBERED, wallet.info.rdns);
+    keep("localStorage", REMEMBERED, wallet.info.rdns);
   }, []);
 
   const connect = useCallback((wallet: Announced) => adopt(wallet, "eth_requestAccounts"), [adopt]);
   const useLocal = useCallback(() => {
     if (market.account) setAccount({ kind: "local", address: market.account });
-    localStorage.setItem(REMEMBERED, "local");
+    keep("localStorage", REMEMBERED, "local");
   }, [market.account]);
   const disconnect = useCallback(() => {
     setAccount(null);
-    localStorage.setItem(REMEMBERED, "nobody");
+    keep("localStorage", REMEMBERED, "nobody");
   }, []);
 
   // The account of the last visit, if its wallet still gives it without asking.
   useEffect(() => {
-    const remembered = localStorage.getItem(REMEMBERED);
+    const remembered = recall("localStorage", REMEMBERED);
     if (market.account && (remembered === "local" || remembered === null)) setAccount({ kind: "local", address: market.account });
     const resume = () => {
       const wallet = announcedWallets().find((one) => one.info.rdns === remembered);
@@ -201,14 +202,14 @@ const typedHere = () => `aira-typed ${location.hash} `;
 /** The state of a form, which is still there when the page at this address is loaded again or returned to; and what forgets it. */
 export function useTyped<T>(name: string, initial: () => T): [T, (value: T) => void, () => void] {
   const key = useMemo(() => typedHere() + name, []);
-  const [value, setValue] = useState<T>(() => JSON.parse(sessionStorage.getItem(key) ?? "null") ?? initial());
-  useEffect(() => sessionStorage.setItem(key, JSON.stringify(value, (_, one) => (one instanceof File ? null : one))), [value]);
-  return [value, setValue, () => sessionStorage.removeItem(key)];
+  const [value, setValue] = useState<T>(() => JSON.parse(recall("sessionStorage", key) ?? "null") ?? initial());
+  useEffect(() => keep("sessionStorage", key, JSON.stringify(value, (_, one) => (one instanceof File ? null : one))), [value]);
+  return [value, setValue, () => keep("sessionStorage", key, null)];
 }
 
 /** Forgets what was typed at this address: it is ordered. */
 export function forgetTyped(): void {
-  for (const key of Object.keys(sessionStorage)) if (key.startsWith(typedHere())) sessionStorage.removeItem(key);
+  forgetAll("sessionStorage", typedHere());
 }
 
 const models = new Map<string, Promise<Model>>();

@@ -8,6 +8,7 @@ import { acceptsSigner, cidText, read } from "./contracts";
 import type { Reader } from "./contracts";
 import { announcementHash, orderHash, resultHash, signerOf } from "./messages";
 import type { Demand, Offer } from "./messages";
+import { keep, recall } from "./storage";
 import { texts } from "./texts";
 import type { Answer, Finding, Job, Market, Order, Validator } from "./types";
 import { ask } from "./wallet";
@@ -67,13 +68,13 @@ export interface OwnOrder {
 /** Keeps an order that this browser made, or what changed about it. */
 export function rememberOrder(order: OwnOrder): void {
   const known = ownOrders().filter((one) => one.hash !== order.hash);
-  localStorage.setItem(REMEMBERED, JSON.stringify([order, ...known].slice(0, MOST_REMEMBERED)));
+  keep("localStorage", REMEMBERED, JSON.stringify([order, ...known].slice(0, MOST_REMEMBERED)));
 }
 
 /** The orders that this browser made, newest first. */
 export function ownOrders(): OwnOrder[] {
   try {
-    const known = JSON.parse(localStorage.getItem(REMEMBERED) ?? "[]");
+    const known = JSON.parse(recall("localStorage", REMEMBERED) ?? "[]");
     return Array.isArray(known) ? known.filter((one) => typeof one?.hash === "string") : [];
   } catch {
     return [];
@@ -84,12 +85,12 @@ const contractKey = (market: Market) => `aira-contract-${market.chainId}-${marke
 
 /** The market's contract that this browser allowed to take tokens before, on this chain; null if it allowed none. */
 export function allowedContract(market: Market): Address | null {
-  return localStorage.getItem(contractKey(market)) as Address | null;
+  return recall("localStorage", contractKey(market)) as Address | null;
 }
 
 /** Remembers the market's contract as the one that may take tokens. */
 export function rememberContract(market: Market): void {
-  localStorage.setItem(contractKey(market), market.factory);
+  keep("localStorage", contractKey(market), market.factory);
 }
 
 /** Reads contracts through the wallet's node if it is on the same chain: the server can't change those answers. */
