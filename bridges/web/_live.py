@@ -29,7 +29,7 @@ from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, ReadingKey, job_s
 from schemas.payloads import payload_type
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
     from contextlib import AsyncExitStack
 
     import zenoh
@@ -62,7 +62,9 @@ ALL_READING_BYTES: Final = 48 << 20
 OVERHEAD: Final = 256
 """Bytes that a reading takes in memory beside its payload."""
 MESSAGES: Final = Rate(per_second=400.0, burst=400)
-"""Messages of one job, or of one robot's readings, that are shown."""
+"""Messages of one job, or of one robot's readings, that are shown; …"""
+COUNTED_BYTES: Final = 4096
+"""… one counts once more for each of so many bytes, since they are decoded, unless it is a picture."""
 PICTURES: Final = Rate(per_second=4.0, burst=4)
 """Pictures among them."""
 LARGEST: Final = 512 << 10
@@ -169,7 +171,7 @@ class Followed:
         selector: str,
         *,
         is_own: bool = False,
-        keep: Callable[[str, Played], object],
+        keep: Callable[[str, Played], Awaitable[None]],
     ) -> None:
         self._parts = components
         self._selector = selector
@@ -202,7 +204,7 @@ class Followed:
             async with pump:
                 self.is_open.set()
                 async for agent, message in pump:
-                    self._keep(agent, message)
+                    await self._keep(agent, message)
         finally:
             self.is_open.set()
 
@@ -215,19 +217,20 @@ class Followed:
             agent = parse_address(key.agent)
         except AiraError:
             return None
-        if not self._messages.allow(agent):
-            self._parts.drops.count("live-overflow", agent)
-            return None
         now, kind = time.time_ns(), payload_type(str(sample.encoding))
         role = "objective" if isinstance(key, ObjectiveTopicKey) else "device"
         message = Played(key.topic, sample.payload.to_bytes(), now, now, 0, kind, role)
-        if picture_in(message) is not None and not self._pictures.allow(agent):
+        is_picture = picture_in(message) is not None
+        if not self._messages.allow(agent, 1.0 if is_picture else 1.0 + len(message.payload) / COUNTED_BYTES):
+            self._parts.drops.count("live-overflow", agent)
+            return None
+        if is_picture and not self._pictures.allow(agent):
             return None
         return agent, message
 
 
 def sample_json(message: Played) -> dict[str, Any]:
-    """A message as a sample."""
+    """A message as a sample. A large one takes a tenth of a second: call it in a thread."""
     picture, image, is_cut, value = picture_in(message), None, False, None
     if picture is None:
         value, is_cut = shown_value(message)
@@ -246,6 +249,10 @@ def sample_json(message: Played) -> dict[str, Any]:
         "size": len(message.payload),
         "cut": is_cut,
     }
+
+
+def _encoded(message: Played) -> msgspec.Raw:
+    return msgspec.Raw(msgspec.json.encode(sample_json(message)))
 
 
 class Live(Lifecycle):
@@ -287,10 +294,12 @@ class Live(Lifecycle):
         topics = self._readings.of(robot)
         return await asyncio.to_thread(lambda: {topic: [*map(sample_json, kept)] for topic, kept in topics.items()})
 
-    def _take_reading(self, robot: str, reading: Played) -> None:
+    async def _take_reading(self, robot: str, reading: Played) -> None:
+        topic = f"readings/{robot}"
+        sample = await asyncio.to_thread(sample_json, reading) if self._stream.has_subscribers(topic) else None
         self._readings.add(robot, reading)
-        if self._stream.has_subscribers(topic := f"readings/{robot}"):
-            self._stream.publish(topic, "message", sample_json(reading))
+        if sample is not None:
+            self._stream.publish(topic, "message", sample)
 
     def _take_contract(self, job: SeenJob) -> None:
         agent = self._parts.agent
@@ -311,8 +320,8 @@ class Live(Lifecycle):
         elif not liability.is_finalized:
             samples = Samples(SAMPLES, BYTES)
 
-            def keep(_agent: str, message: Played) -> None:
-                sample = msgspec.Raw(msgspec.json.encode(sample_json(message)))
+            async def keep(_agent: str, message: Played) -> None:
+                sample = await asyncio.to_thread(_encoded, message)
                 samples.add(sample)
                 if self._stream.has_subscribers(topic := f"live/{address}"):
                     self._stream.publish(topic, "message", sample)
