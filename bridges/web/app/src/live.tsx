@@ -53,7 +53,7 @@ function Following<T>(props: { path: string; topic: string; model: Description |
   useTopic(topic, (event) => {
     if (event.kind === "gap") setTurn((known) => known + 1);
     else if (event.kind !== "message") return;
-    else if (!waiting.current) gathered?.add(event.data);
+    else if (!waiting.current) gathered?.addNew(event.data);
     else if (waiting.current.push(event.data) > 2 * MOST_MESSAGES) waiting.current.shift();
   });
   useEffect(() => {
