@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from bridges.web._api import OPENAPI
+from documentation.staging import ROOT
 from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ Errors have a fitting status and this body, with a code of [codes.md](codes.md):
 
 def http_api() -> str:
     """The page's text."""
-    document = decode_json(OPENAPI.read_text(encoding="utf-8"))
+    document = decode_json((ROOT / "bridges" / "web" / "openapi.json").read_bytes())
     return "\n".join((HEAD.format(description=document["info"]["description"]), *_paths(document), *_schemas(document)))
 
 
@@ -31,11 +31,7 @@ def _paths(document: dict[str, Any]) -> Iterator[str]:
     for path, methods in document["paths"].items():
         for method, operation in methods.items():
             yield f"### {method.upper()} {path}\n"
-            yield (
-                f"{operation['summary']}."
-                + (f" {operation['description']}" if "description" in operation else "")
-                + "\n"
-            )
+            yield " ".join(filter(None, (f"{operation['summary']}.", operation.get("description")))) + "\n"
             queries = [given for given in operation.get("parameters", ()) if given.get("in") == "query"]
             for given in queries:
                 about = given.get("description") or _type(given["schema"])
