@@ -22,11 +22,11 @@ from unittest.mock import AsyncMock, MagicMock
 import pytest
 
 import mesh
-from documentation.blocks import Block, blocks
 from mesh import Agent, Job, cid_of_file
 from mesh.settings import OPTIONS, load
 from mesh.testing import FakeJob, Market, assert_paid, run
 from tests.documentation.commands import commands, scripts, wrong_words
+from tests.support.blocks import Block, blocks
 
 ROOT: Final = Path(__file__).parents[2]
 PAGES: Final = {

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from documentation.blocks import blocks as blocks_of
+from tests.support.blocks import blocks as blocks_of
 from tests.support.commands import Serving, run
 from tests.support.ports import free_port
 
