@@ -16,6 +16,11 @@ PAGES = (*TOP, *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "examples
 SOURCE = re.compile(r"`((?:schemas|mesh|bridges|tests|bench|contracts|deploy|peers|examples)/[\w./-]*)`")
 LINK = re.compile(r"\]\((?!https?:|#)([^)#]+)")
 ANCHOR = re.compile(r"\]\((?!https?:)([^)#]*)#([^)]+)\)")
+BUTTON = re.compile(r"(?<!under )(?<!\*)\*([A-Z][^*]+?)(?: \d+ XRT)?\*(?!\*)")
+ABOUT_THE_PAGE = (
+    *sorted((ROOT / "docs/tutorials").glob("*.md")),
+    *(ROOT / f"docs/guides/{name}.md" for name in ("lessons", "page")),
+)
 PARTS = re.compile(r"`((?:schemas|mesh|bridges)/[\w/]+\.py)`: (`[\w.]+`(?:,\s`[\w.]+`)*)")
 
 
@@ -44,6 +49,13 @@ def test_every_part_that_a_page_names_is_in_its_file(page: Path) -> None:
     ]
 
     assert missing == []
+
+
+@pytest.mark.parametrize("page", ABOUT_THE_PAGE, ids=[page.stem for page in ABOUT_THE_PAGE])
+def test_what_is_to_be_pressed_is_called_so_on_the_page(page: Path) -> None:
+    texts = (ROOT / "bridges/web/app/src/texts.ts").read_text()
+
+    assert [button for button in BUTTON.findall(page.read_text()) if button not in texts] == []
 
 
 @cache
