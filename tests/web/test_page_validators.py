@@ -88,6 +88,6 @@ def test_a_jury_is_named_once_enough_jurors_answer(site: Site) -> None:
         fill_in(browser, site)
         browser.press("With a validator")
         browser.type("Validator", jury)
-        browser.sees("2 of its 2 jurors are here, 2 must judge alike")
+        browser.sees("2 of its 2 jurors are here, 2 must agree")
         browser.sees("This browser checked it, through your wallet's node")
         browser.until(lambda: browser.all("#allow") or browser.all("#order:not([disabled])"), "a way to go on")
