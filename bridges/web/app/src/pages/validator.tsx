@@ -4,7 +4,7 @@ import { useEffect, useLayoutEffect, useMemo, useState } from "preact/hooks";
 import { isAddress, zeroAddress } from "viem";
 import type { Address } from "viem";
 import { get, query } from "../api";
-import { useApp, useData } from "../app";
+import { useApp, useData, useTyped } from "../app";
 import { amount, short } from "../format";
 import { parseAmount } from "../numbers";
 import { texts } from "../texts";
@@ -29,8 +29,9 @@ const SETTLED = 400;
 export function ValidatorChoice(props: { choose: (judge: Judge | null) => void }) {
   const { market, account } = useApp();
   const { choose } = props;
-  const [named, setNamed] = useState("");
-  const [fee, setFee] = useState("");
+  const [named, setNamed] = useTyped("validator", () => "");
+  const [fee, setFee] = useTyped("validator-fee", () => "");
+  const [wasNamed] = useState(Boolean(named || fee));
   const [asked, setAsked] = useState<string | null>(null);
   const [problem, setProblem] = useState<unknown>(null);
   const [independent, setIndependent] = useState<boolean | null>(null);
@@ -73,7 +74,7 @@ export function ValidatorChoice(props: { choose: (judge: Judge | null) => void }
   };
 
   return (
-    <details class="more" id="with-validator">
+    <details class="more" id="with-validator" open={wasNamed}>
       <summary>{texts.withValidator}</summary>
       <PresentValidators choose={setNamed} />
       <div class="fields">
