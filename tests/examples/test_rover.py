@@ -42,7 +42,7 @@ def test_the_description_is_that_of_the_program(tmp_path: Path) -> None:
 
 def test_the_docs_show_the_program() -> None:
     (shown,) = re.findall(
-        r"```python\n(.*?)```", (EXAMPLES.parent / "docs" / "reference" / "models.md").read_text(), re.DOTALL
+        r"```python\n(.*?)```", (EXAMPLES.parent / "docs" / "guides" / "describe-a-robot.md").read_text(), re.DOTALL
     )
     assert shown == (EXAMPLE / "robot.py").read_text()
 

@@ -209,7 +209,9 @@ def test_new_describes_an_agent_whose_model_is_the_file_to_write(tmp_path: Path)
 
 
 def test_new_describes_the_robot_of_the_docs(tmp_path: Path) -> None:
-    (text,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "reference" / "models.md").read_text(), re.DOTALL)
+    (text,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "guides" / "describe-a-robot.md").read_text(), re.DOTALL
+    )
     description = new_model(program(tmp_path, text))
     assert (description.title, description.price, description.seconds) == ("Rover", "5 XRT", 10)
     (topic,) = description.objective
