@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from mesh.base.flood import BoundedDict
 from mesh.base.log_context import liability_context, log_event
 from mesh.chain import NodeUnreachable, NotALiability, NotOffered, RequestRefused, Reverted
+from mesh.chain.following import READ_ERRORS
 from mesh.errors import ChainError
+from schemas import ZERO_ADDRESS
 
 if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
+    from schemas import Liability
 
 log = logging.getLogger(__name__)
 
-FIRST_LOOK: Final = 30
-"""Blocks after which the chain is asked from when on a contract that is still open can be refunded."""
-AGAIN: Final = 20
-"""Blocks between two attempts while the account lacks ETH, or gas is too expensive."""
+FIRST_LOOK: Final = 360.0
+"""Seconds after which the chain is asked from when on a contract that is still open can be refunded."""
+AGAIN: Final = 240.0
+"""Seconds between two attempts while the account lacks ETH, gas is too expensive, or the contract refuses."""
+TOO_EARLY: Final = "RefundTooEarly"
+"""The contract's error before the block from which on it can be refunded."""
 
 
 class DueRefunds:
     """Refunds the contracts of which the account is the promisee, as soon as that is possible.
 
-    The original contracts offer no refund; there it does nothing. Blocks are as contracts count them.
+    Not those that have cost it nothing. The original contracts offer no refund; there it does nothing. Blocks are as
+    contracts count them.
     """
 
     def __init__(self, parts: AgentComponents) -> None:
@@ -35,29 +42,46 @@ class DueRefunds:
         self._ended: BoundedDict[str, None] = BoundedDict(256)
         """The latest that have ended, which a reorganisation may revert."""
 
-    def created(self, liability: str, *, earlier: bool = False) -> None:
-        """A contract of the account exists, perhaps again; it may be one of an `earlier` run."""
-        self._look_at[liability] = 0 if earlier else self._parts.chain_head.contract_block + FIRST_LOOK
+    def created(self, liability: Liability) -> None:
+        """A contract of the account exists, perhaps again."""
+        if _has_cost(liability):
+            self._wait(liability.address)
 
-    def ended(self, liability: str) -> None:
+    def ended(self, address: str) -> None:
         """A contract has ended, or was reverted."""
-        if self._look_at.pop(liability, None) is not None:
-            self._ended[liability] = None
+        if self._look_at.pop(address, None) is not None:
+            self._ended[address] = None
 
-    def end_reverted(self, liability: str) -> None:
+    def end_reverted(self, address: str) -> None:
         """A reorganisation reverted the end of a contract."""
-        if liability in self._ended:
-            self.created(liability)
+        if address in self._ended:
+            self._wait(address)
 
     async def run(self) -> None:
         """Look after each block, until cancelled."""
         head = self._parts.chain_head
-        for _, address in await self._parts.ledger.contracts("demand"):
-            self.created(address, earlier=True)
+        await self._take_up_earlier()
         while True:
             due = [address for address, block in self._look_at.items() if head.contract_block + 1 >= block]
             await asyncio.gather(*map(self._look, due))
             await head.reached(head.head + 1)
+
+    def _wait(self, address: str) -> None:
+        self._look_at[address] = self._parts.chain_head.contract_block + self._blocks_in(FIRST_LOOK)
+
+    def _blocks_in(self, seconds: float) -> int:
+        return self._parts.chain.node.profile.blocks_in(seconds)
+
+    async def _take_up_earlier(self) -> None:
+        """Look at the contracts of earlier runs that are still open."""
+        addresses = [address for _, address in await self._parts.ledger.contracts("demand")]
+        read = partial(self._parts.chain.liabilities.find_open, addresses)
+        found = await self._parts.chain.retrying(read, outages=self._parts.outages, errors=READ_ERRORS)
+        for address in addresses:
+            if address not in found:
+                self._ended[address] = None
+            elif _has_cost(found[address]):
+                self._look_at.setdefault(address, 0)
 
     async def _look(self, address: str) -> None:
         with liability_context(address):
@@ -79,16 +103,23 @@ class DueRefunds:
             if not state.is_refundable:
                 return state.refundable_from
             settled = await liabilities.refund(address)
-        except (NodeUnreachable, RequestRefused, Reverted) as error:
-            # Perhaps its end is in a block that was not read yet, or the next block is the first that allows it.
+        except (NodeUnreachable, RequestRefused) as error:
             log.debug("looking at the refund again after the next block: %s", error)
             return following
+        except Reverted as error:  # perhaps its end is in a block that was not read yet
+            log.debug("the contract refuses the refund: %s", error)
+            return following if error.reason == TOO_EARLY else following + self._blocks_in(AGAIN)
         except (NotOffered, NotALiability):  # or a reorganisation has reverted it
             return None
         except ChainError as error:
             facts = log_event("refund-waits", code=error.code)
             log.warning("nobody ended the contract in time, and taking its cost back failed: %s", error, extra=facts)
-            return following + AGAIN
+            return following + self._blocks_in(AGAIN)
         facts = log_event("refund-taken", gas=settled.gas_used)
         log.warning("nobody ended the contract in time, so its cost was taken back", extra=facts)
         return None
+
+
+def _has_cost(liability: Liability) -> bool:
+    """Whether its promisee gets anything back."""
+    return liability.cost > 0 or (liability.validator != ZERO_ADDRESS and liability.validator_fee > 0)

@@ -426,7 +426,7 @@ class AgentRuntime(Lifecycle):
             self.executor.at_hand.add(liability.address)  # before the offer is none any more
         await self.trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
         if liability.promisee == self._account and not liability.is_finalized:
-            self.refunds.created(liability.address)
+            self.refunds.created(liability)
         if liability.promisor != self._account:
             return
         if not does_jobs:

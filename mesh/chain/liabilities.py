@@ -155,6 +155,14 @@ class Liabilities:
         found = list(compress(addresses, await self._version.are_liabilities(addresses)))
         return {record.address: record for record, _ in await _read_all(self._node, found)}
 
+    async def find_open(self, addresses: Sequence[str]) -> dict[str, Liability]:
+        """The records of those among these addresses that are liabilities and have not ended, in few calls."""
+        found = list(compress(addresses, await self._version.are_liabilities(addresses)))
+        calls = [call for address in found for call in getters("Liability", address, ("isFinalized",))]
+        ended = await self._node.read_all(calls, block="latest")
+        still_open = [address for address, has_ended in zip(found, ended, strict=True) if not has_ended]
+        return {record.address: record for record, _ in await _read_all(self._node, still_open)}
+
     async def parties(self, addresses: Sequence[str]) -> list[tuple[str, str]]:
         """Promisee and promisor of each of these, which are known to be liabilities, in one call for fifty."""
         calls = [call for address in addresses for call in getters("Liability", address, ("promisee", "promisor"))]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import DeploymentPlan, InsufficientFunds
+from mesh.chain import DeploymentPlan, InsufficientFunds, Reverted
 from mesh.chain.liabilities import Liabilities
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import deploy_market
-from tests.mesh.agent.restarts import COST, half_way
+from tests.mesh.agent.restarts import COST, half_way, words
 from tests.support.log_events import logged_facts
 from tests.support.market import Founded, Place
 from tests.support.rollups import ForeignBlocks, seen_in
@@ -72,6 +72,13 @@ async def _mined_until_due(place: Place, person: Agent, liability: str) -> None:
         await asyncio.sleep(poll)
 
 
+async def _mined_on(place: Place, person: Agent, *, blocks: int) -> None:
+    for _ in range(blocks):
+        await place.node.mine(1)
+        await until_found(lambda: _has_read(person, place), what="the block")
+        await asyncio.sleep(place.chains["person"].node.timing.poll_interval)
+
+
 async def _has_read(agent: Agent, place: Place) -> bool:
     return agent.parts.chain_head.head == await place.chains["person"].block_number()
 
@@ -113,3 +120,44 @@ async def test_a_refund_that_can_not_be_paid_for_is_tried_again(
         async with asyncio.timeout(60):
             assert not (await contract.outcome()).success
     assert attempts == [contract.address] * 2
+
+
+async def test_a_contract_that_cost_nothing_is_left_alone(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    refund, refunded = Liabilities.refund, list[str]()
+
+    async def noted(liabilities: Liabilities, liability: str) -> Settled:
+        refunded.append(liability)
+        return await refund(liabilities, liability)
+
+    monkeypatch.setattr(Liabilities, "refund", noted)
+    async with half_way(place) as (_robot, person, contract):
+        free = await person.demand(words(place), cost=0)
+        await _mined_until_due(place, person, free.address)
+        await _mined_on(place, person, blocks=8)
+        async with asyncio.timeout(60):
+            assert not (await contract.outcome()).success
+    async with place.agent("person") as person:
+        await _mined_on(place, person, blocks=8)
+    assert refunded == [contract.address]
+
+
+async def test_a_contract_that_refuses_the_refund_is_asked_again_after_minutes(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts = list[str]()
+
+    async def refused(liabilities: Liabilities, liability: str) -> Settled:
+        attempts.append(liability)
+        raise Reverted("Blocked")
+
+    monkeypatch.setattr(Liabilities, "refund", refused)
+    async with half_way(place) as (_robot, person, contract):
+        await _mined_until_due(place, person, contract.address)
+
+        async def is_asked() -> bool:
+            await place.node.mine(1)
+            return bool(attempts)
+
+        await until_found(is_asked, what="the attempt")
+        await _mined_on(place, person, blocks=8)
+    assert attempts == [contract.address]

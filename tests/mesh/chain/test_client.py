@@ -153,6 +153,7 @@ async def test_a_job_goes_from_orders_to_payment(market: DeployedMarket, generat
         made = await chain.liabilities.get(created.liability)
         strange = [market.promisee.address, market.stranger.address]
         assert await chain.liabilities.find_all([*strange, created.liability]) == {created.liability: made}
+        assert await chain.liabilities.find_open([*strange, created.liability]) == {created.liability: made}
         assert (made.model, made.objective, made.result) == (demand.model, demand.objective, "")
         assert (made.promisee, made.promisor, made.lighthouse) == (*people, market.deployment.lighthouse)
         assert (made.token, made.cost, made.lighthouse_fee) == (market.deployment.xrt, cost, fee)
@@ -164,6 +165,8 @@ async def test_a_job_goes_from_orders_to_payment(market: DeployedMarket, generat
         assert settled.gas_used < 150_000
         done = await chain.liabilities.get(created.liability)
         assert (done.result, done.is_success, done.is_finalized) == (result.result, True, True)
+        assert await chain.liabilities.find_open([*strange, created.liability]) == {}
+        assert await chain.liabilities.find_open([]) == {}
         after = [await chain.tokens.balance(address) for address in people]
         assert [now - then for now, then in zip(after, before, strict=True)] == [-cost, cost - fee]
 
