@@ -917,23 +917,18 @@ class WatchedContracts:
             self._watched[address].outcome = None
 
     async def settle(self) -> None:
-        """Tell those who wait of the ends that count by now. Raises `NodeUnreachable`."""
+        """Tell those who wait of the ends that count, as far as the chain was read. Raises `NodeUnreachable`."""
+        if all(watched.outcome is None for watched in self._watched.values()):
+            return
+        counted = await self._parts.chain.node.counted(self._parts.chain_head.head)
         for address, watched in list(self._watched.items()):
-            if watched.outcome is None or not await self._parts.chain.node.counts(watched.ended_in):
+            if watched.outcome is None or watched.ended_in > counted:
                 continue
-            outcome = self._taken_end(address)  # it may have been taken back meanwhile
-            if outcome is not None and not watched.ended.done():
-                facts = log_event("contract-ended", success=outcome.success, result=outcome.result)
-                log.info("the contract has ended, %s", "paid" if outcome.success else "refunded", extra=facts)
-                watched.ended.set_result(outcome)
-
-    def _taken_end(self, address: str) -> Outcome | None:
-        """How a contract has ended, which is not watched any more then."""
-        watched = self._watched.get(address)
-        if watched is None or watched.outcome is None:
-            return None
-        del self._watched[address]
-        return watched.outcome
+            del self._watched[address]
+            if not watched.ended.done():
+                facts = log_event("contract-ended", success=watched.outcome.success, result=watched.outcome.result)
+                log.info("the contract has ended, %s", "paid" if watched.outcome.success else "refunded", extra=facts)
+                watched.ended.set_result(watched.outcome)
 
     def expire(self, block: int) -> None:
         """The chain has `block`: reverted contracts whose orders' deadline has passed are given up."""

@@ -882,7 +882,10 @@ class Executor:
         job, is_told = await self._ledger.job(address), False
         while job is not None and job.phase is Phase.INCOMING:
             block = self.created_in[address]
-            if await self._chain.retrying(partial(self._chain.node.counts, block), outages=self._outages):
+            if self._head.head < block:  # its events are handled at this moment
+                await self._head.reached(block)
+            counted = partial(self._chain.node.counted, self._head.head)
+            if await self._chain.retrying(counted, outages=self._outages) >= block:
                 break
             if not is_told:
                 is_told = True

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from mesh.agent.contracts import Outcome, WatchedContracts
 from mesh.agent.ledger import Phase
+from mesh.chain import Node
+from mesh.dev import EmbeddedChain
 from mesh.dev.development import deploy_market
 from mesh.market.book import OrderStage
-from schemas import Demand, Offer
+from mesh.role.following import ChainHead
+from schemas import ZERO_ADDRESS, Demand, Offer
 from tests.mesh.agent.trades import job
 from tests.support.market import QUICK, Founded, Place, in_phase, offering
 from tests.support.nodes import Anvil
@@ -150,3 +155,21 @@ async def test_a_provider_is_done_with_orders_when_the_block_of_their_contract_c
         assert OrderStage.CONFIRMED not in stages()
         await market.mine(1)
         await until(lambda: stages() == {OrderStage.CONFIRMED}, what="the provider is done with them")
+
+
+async def test_an_end_counts_only_as_far_as_the_agent_has_read_the_chain() -> None:
+    """The node's latest blocks may be of a chain that the agent has not seen yet, on which the contract is open."""
+    async with EmbeddedChain() as chain, Node(chain.provider, timing=replace(QUICK, confirmations=3)) as node:
+        await chain.mine(20)
+        head = ChainHead(5)
+        parts: Any = SimpleNamespace(chain=SimpleNamespace(node=node), chain_head=head)
+        contracts = WatchedContracts(parts, cast("Any", None))
+        ended = contracts._watch(ZERO_ADDRESS).ended
+        contracts.finalized(ZERO_ADDRESS, Outcome(success=True, result=""), 5)
+        for read in (5, 6):
+            head.advance_to(read)
+            await contracts.settle()
+            assert not ended.done()
+        head.advance_to(7)
+        await contracts.settle()
+        assert ended.result().success
