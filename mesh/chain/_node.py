@@ -568,10 +568,11 @@ class Node:
     async def _run_number(self, block: int | str) -> int | None:
         """The number that a contract sees in the state after a block; None if the node does not run such code."""
         try:
-            return int.from_bytes(await self.call({"data": "0x" + RUN_NUMBER.hex()}, block=block))
+            returned = await self.call({"data": "0x" + RUN_NUMBER.hex()}, block=block)
         except (RequestRefused, Reverted) as error:
             log.debug("the number of blocks that contracts see can't be asked: %s", error)
             return None
+        return int.from_bytes(returned) if len(returned) == 32 else None  # some ignore code without an address
 
     async def header(self, block: int | str) -> BlockHeader | None:
         """A block, by its number or `latest`; None if the chain does not have it."""
