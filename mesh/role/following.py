@@ -169,8 +169,8 @@ async def follow_chain(
             )
             async with aclosing(blocks):
                 async for block in blocks:
+                    contract_block = await chain.node.contract_blocks.last(block.block_number)  # first: it may fail
                     await _take_block(role, read, block, history, store)
-                    contract_block = await chain.node.contract_blocks.last(block.block_number)
                     head.advance_to(block.block_number, contract_block)
                     await role.on_head(block.block_number)
                     backoff.reset()
