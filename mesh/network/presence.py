@@ -33,6 +33,8 @@ class _Tokens:
         self.session = session
         self.selector: Final = zenoh.KeyExpr(selector)
         self.keys = set[str]()
+        self._has_overflowed = False
+        """Whether there were tokens that are not remembered."""
         self.listeners: list[Changed] = []
         self.lock: Final = threading.RLock()
         # Directly, so that what the router says is known here before what it says next.
@@ -42,12 +44,15 @@ class _Tokens:
     def _receive(self, sample: zenoh.Sample) -> None:
         key, is_present = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
         with self.lock:
-            if is_present == (key in self.keys):
+            is_known = key in self.keys
+            if is_known if is_present else not (is_known or self._has_overflowed):
                 return
             if not is_present:
-                self.keys.remove(key)
+                self.keys.discard(key)
             elif len(self.keys) < KEPT:
                 self.keys.add(key)
+            else:
+                self._has_overflowed = True
             for changed in tuple(self.listeners):
                 changed(key, is_present)
 

@@ -11,9 +11,10 @@ from mesh.network.presence import PRESENT_LIMIT
 from mesh.watching import PresentPeer, present
 from schemas import PresenceKey
 from tests.support.orders import MARKET, ROBOT
-from tests.support.waiting import until_found
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    import pytest
     import zenoh
 
 FLOOD = PRESENT_LIMIT + 200
@@ -38,3 +39,19 @@ async def test_agents_are_counted_beyond_a_limit_and_providers_found(here: zenoh
         assert await watching.present(agent=ROBOT.address) == [
             PresenceKey(MARKET, role, ROBOT.address) for role in ("provider", "zebra")
         ]
+
+
+async def test_who_came_when_no_more_are_remembered_is_reported_gone(
+    here: zenoh.Session, there: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mesh.network.presence.KEPT", 3)
+    appeared, gone = set[str](), list[str]()
+    async with Channel(here, MARKET) as watching, Channel(there, MARKET) as strangers:
+        for number in range(5):
+            strangers.announce("agent", f"0x{number:040x}")
+        watching.watch_presence(lambda key: appeared.add(key.agent), gone=lambda key: gone.append(key.agent))
+        await until(lambda: len(appeared) == 5)
+        async with Channel(there, MARKET) as theirs:
+            theirs.announce("provider", ROBOT.address)
+            await until(lambda: ROBOT.address.lower() in appeared)
+        await until(lambda: gone == [ROBOT.address.lower()])
