@@ -70,7 +70,9 @@ STOP_SECONDS: Final = 3.0
 GRACE: Final = 10.0
 """Seconds without a device, or a router, after which the robot is unreachable: both may be started again."""
 GAS_INTERVAL: Final = 60.0
-"""Seconds between two looks at the account's balance."""
+"""Seconds between two looks at the account's balance, if somebody is told."""
+RARELY: Final = 10
+"""So many times that, if nobody is: each look asks the node several questions."""
 ENOUGH: Final = 20
 """Transactions for which the account should have gas."""
 ROUTER: Final = "router"
@@ -280,7 +282,7 @@ class OwnerWatch:
         self._parts = parts
         self._notifier = notifier
         self._grace = grace
-        self._gas_interval = gas_interval
+        self._gas_interval = gas_interval if notifier.targets() else RARELY * gas_interval
         self._timers: dict[str, asyncio.TimerHandle] = {}
         """Of the parts that can't be reached."""
 

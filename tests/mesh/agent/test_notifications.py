@@ -8,7 +8,9 @@ import hashlib
 import hmac
 import json
 import secrets
+from collections import Counter
 from contextlib import asynccontextmanager
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -344,6 +346,31 @@ async def test_a_lost_router_is_reported_and_not_its_devices(
         router.start()
         await until(lambda: robot.network.connected)
     assert [event["data"]["part"] for event in receiver.taken] == ["router"], token
+
+
+async def test_the_balance_is_looked_at_rarely_if_nobody_is_told(tmp_path: Path, receiver: Receiver) -> None:
+    looks = Counter[str]()
+
+    def counting(who: str) -> Any:
+        async def retrying(_question: object, **_: object) -> tuple[int, int]:
+            looks[who] += 1
+            return 1, 0
+
+        return SimpleNamespace(chain=SimpleNamespace(retrying=retrying), outages=None)
+
+    gas: Any = {"notify_events": ("low-on-gas",)}
+    async with (
+        notifying(tmp_path, receiver.url, **gas) as told,
+        notifying(tmp_path, **gas) as untold,
+        asyncio.TaskGroup() as tasks,
+    ):
+        watches = [OwnerWatch(counting("told"), told, gas_interval=0.02)]
+        watches.append(OwnerWatch(counting("untold"), untold, gas_interval=0.02))
+        running = [tasks.create_task(work) for watch in watches for _, work in watch.tasks()]
+        await until(lambda: looks["told"] >= 30)
+        for task in running:
+            task.cancel()
+    assert 1 <= looks["untold"] <= 10, looks
 
 
 async def test_an_account_with_little_gas_is_reported_once(place: Place, receiver: Receiver) -> None:
