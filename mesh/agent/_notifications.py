@@ -170,7 +170,7 @@ class Notifier(Lifecycle):
         secret = _secret(settings.notify_secret_file) if settings.notify_secret_file else b""
         self.wanted: Final = frozenset(settings.notify_events)
         """The events that are remembered, and delivered."""
-        self.recent: Final = deque[RobotEvent](maxlen=RECENT)
+        self.recent: Final = deque[RobotEvent]()
         """The latest events, oldest first, also if there are no targets."""
         self._source = f"/aira/agent/{address}"
         self._retry = retry
@@ -195,7 +195,7 @@ class Notifier(Lifecycle):
             return
         at = datetime.now(UTC)
         detail = next((data[name] for name in ("reason", "part", "balance") if data.get(name)), "")
-        self.recent.append(RobotEvent(event=event, time=at.timestamp(), about=about, detail=detail[:LONGEST_DETAIL]))
+        self._remember(RobotEvent(event=event, time=at.timestamp(), about=about, detail=detail[:LONGEST_DETAIL]))
         now = at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         identity = f"{event}-{about or secrets.token_hex(8)}"
         envelope = {"specversion": "1.0", "id": identity, "source": self._source, "type": f"aira.{event}", "time": now}
@@ -203,6 +203,12 @@ class Notifier(Lifecycle):
         body = msgspec.json.encode(envelope | {"datacontenttype": "application/json", "data": data})
         for outbox in self._outboxes:
             outbox.put(Notification(identity, body))
+
+    def _remember(self, event: RobotEvent) -> None:
+        """Offers make room first: strangers cause any number of them."""
+        self.recent.append(event)
+        if len(self.recent) > RECENT:
+            self.recent.remove(next((one for one in self.recent if one.event == "job-offered"), self.recent[0]))
 
     async def _drain(self) -> None:
         with suppress(TimeoutError):

@@ -152,6 +152,21 @@ async def test_the_latest_events_are_remembered_also_if_nobody_is_told(tmp_path:
         assert (notifier.recent[-1].event, len(notifier.recent[-1].detail)) == ("robot-unreachable", 200)
 
 
+async def test_offers_that_strangers_cause_push_out_no_other_event(tmp_path: Path) -> None:
+    async with notifying(tmp_path) as notifier:
+        notifier.notify("job-offered", {}, about="first")
+        notifier.notify("low-on-gas", {"balance": "7"})
+        for number in range(3 * RECENT):
+            notifier.notify("job-offered", {}, about=f"{number}")
+        events = [(one.event, one.about) for one in notifier.recent]
+        assert events[0] == ("low-on-gas", "")
+        assert events[-1] == ("job-offered", f"{3 * RECENT - 1}")
+        for number in range(RECENT):
+            notifier.notify("job-paid", {}, about=f"{number}")
+        assert [one.event for one in notifier.recent] == ["job-paid"] * RECENT
+        assert notifier.recent[-1].about == f"{RECENT - 1}"
+
+
 async def test_the_owner_sees_what_a_target_has_not_got(tmp_path: Path, receiver: Receiver) -> None:
     receiver.broken = 503
     async with notifying(tmp_path, receiver.url) as notifier:
