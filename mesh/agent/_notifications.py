@@ -75,6 +75,8 @@ RARELY: Final = 10
 """So many times that, if nobody is: each look asks the node several questions."""
 ENOUGH: Final = 20
 """Transactions for which the account should have gas."""
+PARTS: Final = 64
+"""Parts that may be unreachable at the same time: without a roster at the router, strangers may announce devices."""
 ROUTER: Final = "router"
 SECRET_PREFIX: Final = b"whsec_"
 """How the secrets of Standard Webhooks begin: base64 follows."""
@@ -326,7 +328,7 @@ class OwnerWatch:
         """Notify of a part that is not back within the grace."""
         if (timer := self._timers.pop(part, None)) is not None:
             timer.cancel()
-        if not is_reachable:
+        if not is_reachable and (part == ROUTER or len(self._timers) < PARTS):
             self._timers[part] = asyncio.get_running_loop().call_later(self._grace, self._tell, part)
 
     def _tell(self, part: str) -> None:

@@ -17,7 +17,7 @@ import pytest
 from aiohttp import web
 
 from mesh import Agent, ConfigurationError, Empty, JobFailed, Settings
-from mesh.agent._notifications import QUEUED, RECENT, Notifier, OwnerWatch
+from mesh.agent._notifications import PARTS, QUEUED, RECENT, Notifier, OwnerWatch
 from mesh.base.retry import RetryPolicy
 from mesh.chain import Account
 from mesh.network import Endpoints, Network
@@ -332,6 +332,19 @@ async def watched(place: Place, receiver: Receiver, *, grace: float) -> AsyncIte
             yield robot
             for task in running:
                 task.cancel()
+
+
+async def test_devices_of_strangers_that_are_gone_are_reported_up_to_a_limit(place: Place, receiver: Receiver) -> None:
+    async with watched(place, receiver, grace=0.3) as robot, Network(Endpoints(connect=(place.endpoint,))) as board:
+        sees, declare = robot.network.session.liveliness(), board.session.liveliness().declare_token
+        keys = [str(DeviceTopicKey(robot.address, f"arm{number}", PRESENT)) for number in range(PARTS + 20)]
+        tokens = [declare(key) for key in keys]
+        await until(lambda: all(any(reply.ok for reply in sees.get(key)) for key in keys[-1:]))
+        for token in tokens:
+            token.undeclare()  # type: ignore[no-untyped-call]
+        await until(lambda: len(receiver.taken) == PARTS)
+        await asyncio.sleep(0.5)
+    assert len(receiver.taken) == PARTS
 
 
 async def test_a_device_that_is_gone_for_longer_than_the_grace_is_reported_once(
