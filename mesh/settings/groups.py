@@ -103,8 +103,8 @@ class ChainSettings(StorageSettings):
 
     chain: Literal["", "base", "optimism", "arbitrum", "gnosis", "polygon", "ethereum", "sepolia", "local"] = option(
         "",
-        "the chain by name: base, optimism, arbitrum, gnosis, polygon, ethereum, sepolia or local; it sets what is not"
-        " given of the next five, and other chains are refused (empty: any chain)",
+        "the chain by name: base, optimism, arbitrum, gnosis, polygon, ethereum, sepolia or local; options that are not"
+        " given and say [the chain's …] are its own, and other chains are refused (empty: any chain)",
     )
     web3_http_provider: str = option(
         "http://127.0.0.1:8545", "JSON-RPC of the EVM node; separate several nodes of one chain (http or ws) by commas"

@@ -177,13 +177,8 @@ def ask(anvil: Anvil, method: str, *parameters: object) -> None:
 async def gnosis() -> AsyncIterator[Anvil]:
     """A node of a chain with the number and the pace of Gnosis Chain."""
     async with Anvil(arguments=("--chain-id", "100")) as node:
-        _ask(node, "anvil_mine", "0x32", "0x5")
+        ask(node, "anvil_mine", "0x32", "0x5")
         yield node
-
-
-def _ask(node: Anvil, method: str, *params: str) -> None:
-    body = json.dumps({"jsonrpc": "2.0", "id": 1, "method": method, "params": params}).encode()
-    urllib.request.urlopen(urllib.request.Request(node.url, body, {"Content-Type": "application/json"})).read()
 
 
 async def test_a_known_chain_should_be_named(machine: Machine, gnosis: Anvil) -> None:
@@ -207,7 +202,7 @@ async def test_a_node_of_another_chain_than_the_named_one_fails(machine: Machine
 
 async def test_another_pace_than_the_chains_is_a_warning(machine: Machine) -> None:
     async with Anvil(arguments=("--chain-id", "100")) as node:
-        _ask(node, "anvil_mine", "0x32", "0x3c")
+        ask(node, "anvil_mine", "0x32", "0x3c")
         found = await machine.examined("bridge", web3_http_provider=node.url, chain="gnosis")
     assert (found.one("chain profile").status, found.one("chain profile").code) == (CheckStatus.WARN, "unlike-chain")
     assert "a block comes every 60 s, not every 5 s" in found.one("chain profile").message
