@@ -7,6 +7,7 @@ import msgspec
 
 from mesh.cli.options import with_settings
 from mesh.settings import MEANING, OPTIONS, Settings
+from mesh.settings.chains import FILLED
 
 
 @click.command("settings")
@@ -19,4 +20,6 @@ def command(settings: Settings, as_json: bool) -> None:
         click.echo(msgspec.json.encode(values))
         return
     for name, value in values.items():
-        click.echo(f"# {MEANING[name]}\n{name} = {msgspec.json.encode(value).decode()}\n")
+        # What is the chain's is not given, so that it is the other's when another chain is named in the file.
+        given = "" if name not in FILLED or value != getattr(settings.profile, name) else "# "
+        click.echo(f"# {MEANING[name]}\n{given}{name} = {msgspec.json.encode(value).decode()}\n")

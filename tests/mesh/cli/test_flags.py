@@ -12,10 +12,12 @@ from click.testing import CliRunner
 from mesh.cli import main
 from mesh.cli.options import PORT
 from mesh.settings import DEFAULTS, OPTIONS
+from mesh.settings.chains import CHAINS
 from tests.support.commands import refused
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from click.testing import Result
 
@@ -29,6 +31,16 @@ def aira(*arguments: str, **variables: str) -> Result:
 def test_an_empty_flag_wins_over_a_variable() -> None:
     done = aira("settings", "--json", "--recording-topics", "", AIRA_RECORDING_TOPICS="/led")
     assert json.loads(done.stdout)["recording_topics"] == ""
+
+
+def test_another_chain_can_be_named_in_a_file_of_settings_that_were_printed(tmp_path: Path) -> None:
+    file = tmp_path / "aira.toml"
+    file.write_text(aira("settings", "--reorg-depth", "77").stdout)
+    assert json.loads(aira("settings", "--json", "--config", str(file)).stdout)["confirmations"] == 1
+    found = json.loads(aira("settings", "--json", "--config", str(file), "--chain", "base").stdout)
+    base = CHAINS["base"]
+    assert found["reorg_depth"] == 77, "what was given is kept"
+    assert (found["confirmations"], found["deadline_limit"]) == (base.confirmations, base.deadline_limit)
 
 
 @pytest.mark.parametrize(
