@@ -61,11 +61,13 @@ class Cable(Lifecycle):
     async def _connect(self, end: _End) -> None:
         loop = asyncio.get_running_loop()
         try:
-            await loop.create_connection(lambda: _End(self, end), self._host, self._port)
+            to_router, _ = await loop.create_connection(lambda: _End(self, end), self._host, self._port)
         except OSError:
             end.transport.abort()
         else:
-            if not end.transport.is_closing():
+            if end.transport.is_closing():  # meanwhile
+                to_router.abort()
+            else:
                 end.transport.resume_reading()
 
 

@@ -80,8 +80,12 @@ class MarketClock:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Meanwhile it knows the timers that handlers set in this event loop."""
+        """Meanwhile it knows the timers that handlers set in this event loop.
+
+        Of several markets in it, the one that was opened last has the timers.
+        """
         loop: Any = asyncio.get_running_loop()
+        before = loop.call_at
 
         def call_at(when: float, callback: Any, *arguments: Any, context: Any = None) -> Any:
             if not (job := job_of_handler()):
@@ -96,7 +100,7 @@ class MarketClock:
         try:
             yield
         finally:
-            del loop.call_at
+            loop.call_at = before
 
     async def advance(self, seconds: float) -> None:
         """Let that many seconds pass at once, for the handlers of jobs that run here, and for the chain.
@@ -115,9 +119,7 @@ class MarketClock:
             for timer in timers:
                 timer.bring_forward(step)
             left -= step
-            if left <= 0:
-                break
-            if first is None:
+            if left <= 0 or first is None:
                 break
             await asyncio.sleep(0)
         await self._until_asleep()

@@ -308,3 +308,13 @@ async def test_orders_expire_when_the_clock_is_brought_forward(market: Market) -
     with pytest.raises(AiraError) as caught:
         await order.contract(wait=True)
     assert caught.value.code == "order-expired"
+
+
+async def test_the_event_loop_has_its_own_clock_again_after_each_market() -> None:
+    loop = asyncio.get_running_loop()
+    before = loop.call_at
+    async with Market():
+        async with Market():
+            pass
+        await asyncio.sleep(0.001)
+    assert loop.call_at == before
