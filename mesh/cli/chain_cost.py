@@ -9,13 +9,12 @@ import click
 
 from mesh.amounts import Unit
 from mesh.chain.costs import EACH_JOB, STEPS
+from mesh.cli.chain import GWEI
 from mesh.cli.options import with_chain_settings, with_json
 from mesh.cli.output import print_json, print_line, print_table
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
-
-GWEI = Unit("gwei", 9, "wei")
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,8 +43,6 @@ class ChainProfile:
     """What gas is paid in."""
     tokens: Mapping[str, str] = field(default_factory=dict)
     """Well-known tokens: addresses (EIP-55) by symbol."""
-    has_blooms: bool = True
-    """Whether the headers of blocks have Bloom filters, which save requests for logs."""
     has_priority_fee: bool = True
     """Whether a priority fee is paid beside the base fee."""
     l1: Literal["", "op", "arbitrum"] = ""

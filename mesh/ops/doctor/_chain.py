@@ -133,12 +133,12 @@ class ChainChecks:
         seconds = await node.heads.block_time(MEASURED)
         if seconds is not None and not profile.block_seconds / 2 <= seconds <= 2 * profile.block_seconds:
             yield f"a block comes every {seconds:.2g} s, not every {profile.block_seconds:g} s"
-        if profile.has_blooms and head.logs_bloom is None:
+        if head.logs_bloom is None:  # they save requests for logs
             yield "its blocks have no Bloom filters"
         if profile.has_priority_fee and head.base_fee is None:
             yield "its blocks have no base fee"
-        if lacking := [tag for tag in ("safe", "finalized") if tag not in await self._tags()]:
-            yield f"it does not say which block is {' or '.join(lacking)}"
+        if lacking := {"safe", "finalized"} - await self._tags():
+            yield f"it does not say which block is {' or '.join(sorted(lacking, reverse=True))}"
         try:
             first = max(0, head.number - profile.log_range + 1)
             await node.logs(first, head.number, addresses=[ZERO_ADDRESS], topics=["0x" + "00" * 32])
