@@ -10,7 +10,7 @@ import click
 from mesh.amounts import Unit
 from mesh.chain.costs import EACH_JOB, STEPS
 from mesh.cli.chain import GWEI
-from mesh.cli.options import with_chain_settings, with_json
+from mesh.cli.options import FiniteRange, with_chain_settings, with_json
 from mesh.cli.output import print_json, print_line, print_table
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class Priced:
 
 @click.command("cost", short_help="show what a job costs, in the chain's coin and in money")
 @click.option("--gas-price", help="gwei for a unit of gas, instead of asking the node; data is not counted then")
-@click.option("--coin-price", type=click.FloatRange(min=0, min_open=True), help="USD for one of the chain's coin")
+@click.option("--coin-price", type=FiniteRange(0, 1e12, min_open=True), help="USD for one of the chain's coin")
 @with_json
 @with_chain_settings("generation")
 async def cost(settings: Settings, *, gas_price: str | None, coin_price: float | None, as_json: bool) -> None:

@@ -137,7 +137,8 @@ def test_the_price_of_a_job_that_nobody_finishes_is_taken_back(fragile: Fragile,
         browser.sees("If nothing comes, you can take 5 XRT back in about")
         assert not browser.all("#refund")
         site.wallet().rpc("anvil_mine", hex(REFUND_DELAY + 1))
-        browser.click("#refund")
+        if account == "wallet":  # the server takes its account's money back by itself
+            browser.click("#refund")
         browser.sees("The contract was called off. The price went back.")
 
 
@@ -153,7 +154,7 @@ class State(NamedTuple):
 
 def see_robots(browser: Browser, _site: Site) -> None:
     browser.go()
-    browser.sees("no jobs yet")
+    browser.sees("available")
 
 
 def see_a_finished_job(browser: Browser, site: Site) -> None:

@@ -131,8 +131,7 @@ async def test_the_cost_is_refunded_if_the_validator_is_killed_before_it_judges(
         refused(await judged.aira(*refund, by="rival"), "not-refundable", f"{block:,}")
         async with judged.site.chain("rival") as chain:
             await chain.node.request("anvil_mine", hex(block - await chain.block_number()))
-        assert (await judged.aira(*refund, by="rival")).returncode == 0
-        assert await asyncio.to_thread(demand.wait) == 1
+        assert await asyncio.to_thread(demand.wait) == 1  # the person's own agent has taken the refund
         assert "no verdict of the validator" in demand.log()
     assert await judged.balances() == before
 

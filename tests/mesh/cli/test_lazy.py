@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 GROUPS = {
     "account": ("new", "import", "show"),
-    "chain": ("up", "deploy", "status"),
+    "chain": ("up", "deploy", "status", "cost"),
     "liability": ("show", "list", "watch", "cancel", "claim", "stop", "hand-back"),
     "lighthouse": ("create", "list", "info", "join", "leave"),
     "xrt": ("balance", "allowance", "approve", "transfer"),

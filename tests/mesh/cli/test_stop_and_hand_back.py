@@ -107,7 +107,9 @@ def test_an_owner_changes_the_price_pauses_stops_and_releases_a_robot_that_runs(
             return dict(json.loads(done.stdout))
 
         changed = control("set", "--price", "6", "--paused", "true", "--least-price", "5.5", "--refuse", CUSTOMER)
-        assert changed | {"robot": ""} == {
+        events = [event["event"] for event in changed["events"]]
+        assert events == ["job-offered", "job-begun"]
+        assert changed | {"robot": "", "events": []} == {
             "robot": "",
             "price": "6 XRT",
             "paused": True,
@@ -115,6 +117,8 @@ def test_an_owner_changes_the_price_pauses_stops_and_releases_a_robot_that_runs(
             "leastPrice": "5.5 XRT",
             "held": False,
             "stopped": "",
+            "events": [],
+            "notify": [],
         }
         listed = invoke("robots", **own).stdout
         assert ("closed" in listed, "6 XRT" in listed) == (True, True), listed
@@ -130,7 +134,7 @@ def test_an_owner_changes_the_price_pauses_stops_and_releases_a_robot_that_runs(
         nobody = invoke("robot", "show", **(own | {"AIRA_KEYFILE": ""}))
         assert (nobody.returncode, "[robot-unknown]" in nobody.stderr) == (2, True), nobody.stderr
         with Serving(sys.executable, tmp_path / "robot.py", "0", says="account 0x", variables=own):
-            assert control("show") == stopped | {"stopped": ""}
+            assert control("show") | {"events": []} == stopped | {"stopped": "", "events": []}
             released = control("release")
             assert (released["held"], released["paused"]) == (False, True)
             assert "takes        no jobs: it is paused\n" in invoke("robot", "show", **own).stdout

@@ -48,10 +48,10 @@ def test_a_sound_machine_has_a_line_for_each_check_and_ends_with_0(town: ServedC
     assert all(parts), done.stdout
     assert [part["name"] for part in parts if part] == [
         *("router", "session", "own write", "denied write", "router clock"),
-        *("node", "chain", "node clock", "chain clock", "contracts", "lighthouse", "token"),
+        *("node", "chain", "chain profile", "node clock", "chain clock", "contracts", "lighthouse", "token"),
         *("keyfile", "ether", "tokens", "other allowances", "stake", "turn", "data folder", "disk space"),
     ]
-    assert last.removesuffix(BUSY_DISK) == "all 20 checks passed for the role provider"
+    assert last.removesuffix(BUSY_DISK) == "all 21 checks passed for the role provider"
     assert "\x1b" not in done.stdout
     assert PASSWORD not in done.stdout
 
