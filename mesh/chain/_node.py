@@ -46,7 +46,7 @@ from mesh.chain.errors import (
 from mesh.chain.metrics import NodeMetrics
 from mesh.chain.rpc import RpcClient, is_answered
 from mesh.errors import ClosedError, ConfigurationError
-from mesh.settings.chains import ANY
+from mesh.settings.chains import ANY, ETHEREUM_SECONDS
 from schemas import keccak256
 from schemas.address import address_bytes
 
@@ -287,8 +287,6 @@ CHECK_AGAIN: Final = 3600.0
 """Seconds after which it is checked again whose blocks contracts count."""
 CHECK_REFUSED: Final = 60.0
 """The same if the node did not say."""
-ETHEREUM_SLOT: Final = 12.0
-"""Seconds between two blocks of Ethereum, which the contracts of some other chains count."""
 
 
 class ContractBlocks:
@@ -320,7 +318,7 @@ class ContractBlocks:
 
     async def seconds(self, blocks: int) -> float | None:
         """Seconds between two of the blocks that contracts count, by the last `blocks`; None if it is not known."""
-        return await self._heads.block_time(blocks) if await self.are_own() else ETHEREUM_SLOT
+        return await self._heads.block_time(blocks) if await self.are_own() else ETHEREUM_SECONDS
 
     async def are_own(self) -> bool:
         """Whether contracts count the chain's own blocks."""

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 DAY: Final = 86_400
 """Seconds."""
+ETHEREUM_SECONDS: Final = 12.0
+"""Between two blocks of Ethereum, which the contracts of some other chains count."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,8 +32,6 @@ class ChainProfile:
     """EIP-155; 0 for any."""
     block_seconds: float
     """Between two blocks."""
-    l1_seconds: float = 0.0
-    """Between two of the blocks that contracts see, if these are another chain's (0: they see this chain's)."""
     confirmations: int
     reorg_depth: int
     poll_interval: float
@@ -58,7 +58,7 @@ class ChainProfile:
 
     def blocks_in(self, seconds: float) -> int:
         """How many blocks, as contracts count them, take so long."""
-        return max(1, round(seconds / (self.l1_seconds or self.block_seconds)))
+        return max(1, round(seconds / (ETHEREUM_SECONDS if self.l1 == "arbitrum" else self.block_seconds)))
 
 
 FILLED: Final = ("confirmations", "reorg_depth", "poll_interval", "deadline_limit")
@@ -107,7 +107,6 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 title="Arbitrum One",
                 chain_id=42_161,
                 block_seconds=0.25,
-                l1_seconds=12.0,
                 confirmations=4,
                 reorg_depth=240,
                 poll_interval=1.0,
@@ -149,7 +148,7 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 name="ethereum",
                 title="Ethereum",
                 chain_id=1,
-                block_seconds=12.0,
+                block_seconds=ETHEREUM_SECONDS,
                 confirmations=3,
                 reorg_depth=64,
                 poll_interval=1.0,
@@ -162,7 +161,7 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 name="sepolia",
                 title="Sepolia, a test network",
                 chain_id=11_155_111,
-                block_seconds=12.0,
+                block_seconds=ETHEREUM_SECONDS,
                 confirmations=2,
                 reorg_depth=64,
                 poll_interval=1.0,
@@ -193,7 +192,7 @@ ANY: Final = ChainProfile(
     name="",
     title="any chain",
     chain_id=0,
-    block_seconds=12.0,
+    block_seconds=ETHEREUM_SECONDS,
     confirmations=1,
     reorg_depth=12,
     poll_interval=1.0,

@@ -168,11 +168,16 @@ def see_a_running_job(browser: Browser, site: Site) -> None:
     browser.sees("Playback began")
 
 
+def retype(browser: Browser, label: str, text: str) -> None:
+    """Empty a field, and type into it key by key."""
+    browser.type(label, Keys.BACKSPACE)
+    for key in text:
+        browser.keys(key)
+
+
 def see_quotes(browser: Browser, site: Site) -> None:
     browser.go(f"order/model/{site.model}")
-    browser.type("Duration", Keys.BACKSPACE)
-    for key in "12.5":
-        browser.keys(key)
+    retype(browser, "Duration", "12.5")
     browser.find(".quote [value]:checked")
     browser.find("#order:not([disabled])")
 
@@ -188,9 +193,7 @@ def see_a_waiting_order(browser: Browser, site: Site) -> None:
 
 def see_ones_own_robot(browser: Browser, site: Site) -> None:
     browser.go(f"robot/{facts(site, 'liabilities')['liabilities'][0]['promisor']}")
-    browser.type("Price of a job", Keys.BACKSPACE)
-    for key in "3.25":
-        browser.keys(key)
+    retype(browser, "Price of a job", "3.25")
     browser.find("#set-price:not([disabled])")
 
 

@@ -37,7 +37,6 @@ def test_each_profile_fits_itself(profile: ChainProfile) -> None:
     assert profile.confirmations <= profile.reorg_depth
     assert profile.explorer.startswith("https://") is (profile.name != "local")
     assert not profile.explorer.endswith("/")
-    assert bool(profile.l1_seconds) is (profile.l1 == "arbitrum")
     assert len(profile.finalized.split(". ")) == 1, "one sentence"
 
 
