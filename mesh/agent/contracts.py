@@ -927,7 +927,10 @@ class WatchedContracts:
             del self._watched[address]
             if not watched.ended.done():
                 facts = log_event("contract-ended", success=watched.outcome.success, result=watched.outcome.result)
-                log.info("the contract has ended, %s", "paid" if watched.outcome.success else "refunded", extra=facts)
+                with liability_context(address):
+                    log.info(
+                        "the contract has ended, %s", "paid" if watched.outcome.success else "refunded", extra=facts
+                    )
                 watched.ended.set_result(watched.outcome)
 
     def expire(self, block: int) -> None:

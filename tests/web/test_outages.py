@@ -6,6 +6,7 @@ import asyncio
 import json
 import re
 import sys
+import time
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -239,6 +240,20 @@ class Tabs:
         holds, log = (self.browser.driver.execute_script(SEEN, css) for css in STATES[name][1:])
         return holds, [int(re.sub(r"\D", "", text)) for text in log]
 
+    def settled(self, name: str) -> tuple[list[str], list[int]]:
+        """What is seen of the state once it has stayed the same for a second: some of it comes later."""
+        since, seen = time.monotonic(), self.seen(name)[0]
+
+        def has_stayed() -> bool:
+            nonlocal since, seen
+            now = self.seen(name)[0]
+            if now != seen:
+                since, seen = time.monotonic(), now
+            return time.monotonic() - since > 1
+
+        self.browser.until(has_stayed, f"{name} to stay as it is")
+        return self.seen(name)
+
     def contracts(self) -> int:
         """How many there are on the chain."""
         of_factory = {"address": facts(self.site, "market")["factory"], "fromBlock": "0x0"}
@@ -277,7 +292,7 @@ OUTAGES: Final = {"none": "Live", "router": "The server has lost the router", "s
 @pytest.mark.parametrize("outage", OUTAGES)
 def test_what_is_seen_outlives_a_reload_and(fragile: Fragile, tabs: Tabs, pictures: Path, outage: str) -> None:
     browser, contracts = tabs.browser, tabs.contracts()
-    before = {name: tabs.seen(name) for name in tabs.each()}
+    before = {name: tabs.settled(name) for name in tabs.each()}
     lost = {"router": fragile.router, "server": tabs.server}.get(outage)
     if lost is not None:
         lost.kill()
