@@ -1,0 +1,198 @@
+"""The client of a signer: what doors, pages and commands use. It has no key, no chain and no Zenoh.
+
+async with SignerClient(folder / "door.sock") as signer:
+    job = await signer.order(model="Qm…", messages=[("/blink", "red")], cost="1 XRT", idempotency_key="…")
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+
+import aiohttp
+import msgspec
+
+from mesh.errors import AiraError, InputError
+from mesh.signer import protocol
+from mesh.signer.protocol import (
+    DOOR,
+    LARGEST_ANSWER,
+    OWNER,
+    Message,
+    SignerError,
+    SignerUnavailable,
+)
+from schemas.decoding import InvalidData, decode_json
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+    from types import TracebackType
+
+A = TypeVar("A", bound=protocol.Answer)
+
+CONNECT_SECONDS: Final = 5.0
+ANSWER_SECONDS: Final = 180.0
+"""An order asks robots, and perhaps fetches an objective, before it is answered."""
+
+
+class SignerClient:
+    """Talks to the signer on a socket: `async with SignerClient(path) as signer`. Usable by many tasks at once.
+
+    Each method raises a `SignerError` with the code and the hint of the signer's refusal, `SignerUnavailable` if it
+    does not answer, and `InputError` for a request that can't be one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._session: aiohttp.ClientSession | None = None
+
+    async def __aenter__(self) -> Self:
+        timeout = aiohttp.ClientTimeout(total=ANSWER_SECONDS, sock_connect=CONNECT_SECONDS)
+        connector = aiohttp.UnixConnector(path=str(self._path), limit=64)
+        self._session = aiohttp.ClientSession(connector=connector, timeout=timeout)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._session is not None:
+            await self._session.close()
+            self._session = None
+
+    async def find_robots(self, *, model: str = "", text: str = "", limit: int = 20) -> protocol.FoundRobots:
+        """See `FindRobots`."""
+        return await self._call(protocol.FoundRobots, "find_robots", model=model, text=text, limit=limit)
+
+    async def describe_model(self, model: str) -> protocol.DescribedModel:
+        """What orders of a model (CID or name) must say, and what the policy allows of it."""
+        return await self._call(protocol.DescribedModel, "describe_model", model=model)
+
+    async def quote(
+        self, *, model: str, messages: Iterable[tuple[str, Any]] = (), objective: str = ""
+    ) -> protocol.FoundQuotes:
+        """See `AskQuotes`; `messages` are topics with values."""
+        listed = _messages(messages)
+        return await self._call(protocol.FoundQuotes, "quote", model=model, messages=listed, objective=objective)
+
+    async def order(
+        self,
+        *,
+        model: str,
+        cost: str,
+        idempotency_key: str,
+        messages: Iterable[tuple[str, Any]] = (),
+        objective: str = "",
+        robot: str = "cheapest",
+        deadline_seconds: int = 600,
+        note: str = "",
+    ) -> protocol.Job:
+        """See `OrderJob`; `messages` are topics with values."""
+        return await self._call(
+            protocol.Job,
+            "order",
+            model=model,
+            messages=_messages(messages),
+            objective=objective,
+            robot=robot,
+            cost=cost,
+            deadline_seconds=deadline_seconds,
+            idempotency_key=idempotency_key,
+            note=note,
+        )
+
+    async def job(self, job_id: str, *, revision: int = -1, wait_seconds: float = 0.0) -> protocol.Job:
+        """See `ReadJob`."""
+        return await self._call(protocol.Job, "job", job_id=job_id, revision=revision, wait_seconds=wait_seconds)
+
+    async def jobs(self, *, limit: int = 20) -> tuple[protocol.Job, ...]:
+        """The latest jobs, the newest first."""
+        return (await self._call(protocol.Jobs, "jobs", limit=limit)).jobs
+
+    async def stop_job(self, job_id: str, *, why: str = "") -> protocol.Job:
+        """See `StopJob`."""
+        return await self._call(protocol.Job, "stop_job", job_id=job_id, why=why)
+
+    async def withdraw(self, job_id: str) -> protocol.Job:
+        """See `WithdrawJob`."""
+        return await self._call(protocol.Job, "withdraw", job_id=job_id)
+
+    async def recording(self, job_id: str, *, topic: str = "", first: int = 0, limit: int = 50) -> protocol.Recording:
+        """See `ReadRecording`."""
+        return await self._call(protocol.Recording, "recording", job_id=job_id, topic=topic, first=first, limit=limit)
+
+    async def verify(self, job_id: str) -> protocol.Verification:
+        """See `VerifyJob`."""
+        return await self._call(protocol.Verification, "verify", job_id=job_id)
+
+    async def balance(self) -> protocol.Balance:
+        """See `Balance`."""
+        return await self._call(protocol.Balance, "balance")
+
+    async def statement(self, *, first: str = "", last: str = "", limit: int = 100) -> protocol.AccountStatement:
+        """See `ReadStatement`."""
+        return await self._call(protocol.AccountStatement, "statement", first=first, last=last, limit=limit)
+
+    async def consents(self) -> tuple[protocol.Consent, ...]:
+        """The orders that wait for a person's yes. This and what follows is on the owner's socket only."""
+        return (await self._call(protocol.Consents, "consents")).consents
+
+    async def approve(self, consent: str) -> protocol.Job:
+        """Allow the order of a consent (its id), once."""
+        return await self._call(protocol.Job, "approve", id=consent)
+
+    async def deny(self, consent: str) -> protocol.Job:
+        """Don't allow it."""
+        return await self._call(protocol.Job, "deny", id=consent)
+
+    async def log(self, *, first: int | None = None, limit: int = 100) -> protocol.LogEntries:
+        """See `ReadLog`."""
+        return await self._call(protocol.LogEntries, "log", first=first, limit=limit)
+
+    async def verify_log(self) -> protocol.LogVerified:
+        """See `LogVerified`."""
+        return await self._call(protocol.LogVerified, "verify_log")
+
+    async def policy(self) -> protocol.PolicyInUse:
+        """See `PolicyInUse`."""
+        return await self._call(protocol.PolicyInUse, "policy")
+
+    async def use_policy(self) -> protocol.PolicyInUse:
+        """See `UsePolicy`."""
+        return await self._call(protocol.PolicyInUse, "use_policy")
+
+    async def _call(self, kind: type[A], operation: str, **fields: Any) -> A:
+        known = DOOR.get(operation) or OWNER[operation]
+        try:
+            body = msgspec.json.encode(msgspec.convert(fields, known.request))
+        except (msgspec.ValidationError, TypeError, OverflowError, RecursionError) as error:
+            raise InputError(f"not a request for {operation}: {error}"[:300], code="invalid-request") from None
+        status, data = await self._post(operation, body)
+        try:
+            if status == 200:
+                return decode_json(data, kind)
+            failure = decode_json(data, protocol.ErrorAnswer).error
+        except InvalidData:
+            raise SignerUnavailable("what answers on the socket is no signer of this version") from None
+        raise SignerError(failure.message, hint=failure.next, code=failure.code, from_strangers=failure.from_strangers)
+
+    async def _post(self, operation: str, body: bytes) -> tuple[int, bytes]:
+        if self._session is None:
+            raise AiraError("the client is not open", hint="use it inside `async with`", code="closed-error")
+        headers = {"Content-Type": "application/json"}
+        try:
+            async with self._session.post(f"http://signer/v1/{operation}", data=body, headers=headers) as response:
+                data = await response.content.read(LARGEST_ANSWER + 1)
+                while len(data) <= LARGEST_ANSWER and (more := await response.content.read(LARGEST_ANSWER)):
+                    data += more
+                if len(data) > LARGEST_ANSWER:
+                    raise SignerUnavailable("what answers on the socket is no signer: its answer is too long")
+                return response.status, data
+        except (TimeoutError, aiohttp.ClientError, OSError) as error:
+            raise SignerUnavailable(
+                f"the signer does not answer: {type(error).__name__}",
+                hint="start it with `aira signer`; ask again for an order with the same key",
+            ) from None
+
+
+def _messages(messages: Iterable[tuple[str, Any]]) -> tuple[Message, ...]:
+    return tuple(Message(topic=topic, value=value) for topic, value in messages)
