@@ -8,7 +8,7 @@ LIFTS = [("/lift", 1.5), ("/lift", 0.5), ("/lift", 2.0)]
 
 
 async def order() -> None:
-    async with Agent(cid_of_file(Path(__file__).with_name("robot.py"))) as client:
+    async with Agent(cid_of_file(Path(__file__).with_name("forklift.py"))) as client:
         names = {robot.address: str(robot) for robot in await client.robots(client.model)}
         for quote in await client.quotes(client.model, LIFTS):
             print(f"{names[quote.agent]} wants {XRT.show(quote.cost)}", flush=True)

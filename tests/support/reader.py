@@ -31,6 +31,7 @@ SERVES: Final = {
     "aira board run": "connect it with",
     "aira edge": "edge of 0x",
     "hello_mesh/agent.py": "watching on",
+    "/forklift.py": "account 0x",
     "/robot.py": "account 0x",
     "/lamp.py": ROBOT,
     "/rover.py": "the rover drives",
