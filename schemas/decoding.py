@@ -63,6 +63,31 @@ def decode_json(data: bytes | str, kind: Any = None, hook: Callable[[type[Any], 
         raise _refusal(error) from None
 
 
+def decode_json_once(data: bytes | str) -> Any:
+    """The value in a JSON text in which no object names a field twice: readers differ in which of the two counts.
+
+    Slower than `decode_json`. Raises `InvalidData`; its reason is `repeated` for such a text.
+    """
+    import json
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) != len(pairs):
+            raise InvalidData("repeated", "an object names a field twice")
+        return found
+
+    def no_number(name: str) -> Any:
+        raise InvalidData("malformed", f"{name} is not a number of JSON")
+
+    check_json_depth(data)
+    try:
+        return json.loads(data, object_pairs_hook=once, parse_constant=no_number)
+    except InvalidData:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise _refusal(error) from None
+
+
 @overload
 def decode_msgpack(data: bytes) -> Any: ...
 @overload

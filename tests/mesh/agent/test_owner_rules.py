@@ -10,10 +10,10 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from mesh import Agent, AiraError, ConfigurationError, Empty, Progress
-from mesh.agent._owner_rules import Hours
 from mesh.agent.contracts import Contract
 from mesh.agent.errors import DemandDeclined
 from mesh.amounts import InvalidAmount
+from mesh.base.hours import Hours
 from tests.mesh.agent.conftest import other_token
 from tests.support.market import MODEL, QUICK_RESEND, Place, offering
 from tests.support.waiting import until, until_found

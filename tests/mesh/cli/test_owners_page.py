@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import pytest
 
-from mesh.agent._owner_rules import Hours
+from mesh.base.hours import Hours
 from mesh.settings import load
 from mesh.settings.groups import OwnerEvent
 from tests.support.commands import Serving
