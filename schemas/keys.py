@@ -278,7 +278,7 @@ parse_agent_key: Final[Callable[[str], AgentKey]] = key_parser(*AGENT_KEYS)
 
 
 MarketKind: TypeAlias = Literal[
-    "demand", "offer", "withdrawal", "result", "feedback", "pending", "created", "reject", "decline", "report"
+    "demand", "offer", "withdrawal", "permit", "result", "feedback", "pending", "created", "reject", "decline", "report"
 ]
 
 
@@ -306,6 +306,12 @@ class WithdrawalKey(LighthouseKey, frozen=True):
     """The Withdrawals of orders; put by the orders' makers."""
 
     pattern: ClassVar = "aira/{lighthouse}/withdrawal"
+
+
+class PermitKey(LighthouseKey, frozen=True):
+    """The Permits beside demands; put by promisees."""
+
+    pattern: ClassVar = "aira/{lighthouse}/permit"
 
 
 class ResultKey(LighthouseKey, frozen=True):
@@ -376,6 +382,7 @@ MarketKey: TypeAlias = (
     DemandKey
     | OfferKey
     | WithdrawalKey
+    | PermitKey
     | ResultKey
     | FeedbackKey
     | PendingKey
@@ -407,6 +414,7 @@ KINDS: Final[Mapping[MarketKind, Kind]] = MappingProxyType(
         "demand": Kind(DemandKey, ("person", "bridge"), is_legacy=True),
         "offer": Kind(OfferKey, ("agent", "bridge"), is_legacy=True),
         "withdrawal": Kind(WithdrawalKey, ("agent", "person", "bridge")),
+        "permit": Kind(PermitKey, ("person",)),
         "result": Kind(ResultKey, ("agent", "validator", "bridge"), is_legacy=True),
         "feedback": Kind(FeedbackKey, ("provider", "bridge"), is_legacy=True),
         "pending": Kind(PendingKey, ("provider", "bridge"), is_legacy=True),
@@ -416,7 +424,7 @@ KINDS: Final[Mapping[MarketKind, Kind]] = MappingProxyType(
         "report": Kind(ReportKey, ("validator",)),
     }
 )
-"""Every kind of message on a market. The first six are the classes in `schemas.messages`, which say what is checked."""
+"""Every kind of message on a market. Of the first seven, `schemas.messages` has the classes and what is checked."""
 
 
 def market_key(lighthouse: str, kind: MarketKind, model: str) -> str:

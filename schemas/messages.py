@@ -130,6 +130,8 @@ class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, om
     """Whether it has a `lighthouse` and a `deadline`, which a market checks."""
     is_order: ClassVar[bool] = False
     """Whether it has a nonce and a validator besides, which a market checks, too."""
+    is_typed_data: ClassVar[bool] = False
+    """Whether its signature is one of EIP-712, which covers its hash as it is; else it is a personal message."""
 
     @property
     def key_model(self) -> str:
@@ -324,8 +326,44 @@ class TransactionFeedback(_Message, frozen=True, kw_only=True):
         set_hash(self, "tx", self.tx)
 
 
+@final
+class Permit(_Message, frozen=True, kw_only=True):
+    """An owner's approval (EIP-2612) that `spender` may take `value` of `token`, which anybody may bring to the token.
+
+    A promisee publishes one beside a demand, for the factory, so that it needs no transaction and no ether. It replaces
+    the allowance, and is for no particular demand. `value` is in the token's smallest unit, `nonce` the token's
+    `nonces(owner)`, `deadline` the last second (Unix time) in which the token takes it, `domain` the token's
+    `DOMAIN_SEPARATOR`: 64 hexadecimal digits. Whether nonce and domain are the token's, only the chain can tell.
+    """
+
+    kind: ClassVar[MarketKind] = "permit"
+    mark: ClassVar[str] = "spender"
+    address_fields: ClassVar[tuple[str, ...]] = ("owner", "spender", "token")
+    is_typed_data: ClassVar[bool] = True
+
+    owner: str
+    spender: str
+    token: str
+    value: int
+    nonce: int
+    deadline: int
+    domain: str
+    signature: str = ""
+
+    def __post_init__(self) -> None:
+        try:
+            for field in self.address_fields:
+                set_address(self, field, getattr(self, field))
+        except InvalidAddress as error:
+            _raise_invalid(self, error)
+        for field in ("value", "nonce", "deadline"):
+            check_uint256(field, getattr(self, field))
+        set_hash(self, "domain", self.domain)
+        set_signature(self, self.signature)
+
+
 Order: TypeAlias = Demand | Offer
-SignedMessage: TypeAlias = Demand | Offer | Withdrawal | Result
+SignedMessage: TypeAlias = Demand | Offer | Withdrawal | Result | Permit
 Message: TypeAlias = SignedMessage | OrderFeedback | TransactionFeedback
 
 MESSAGE_TYPES: Final[tuple[type[Message], ...]] = (
@@ -335,6 +373,7 @@ MESSAGE_TYPES: Final[tuple[type[Message], ...]] = (
     TransactionFeedback,
     Result,
     Withdrawal,
+    Permit,
 )
 """Every kind of message, in the order in which a reader looks for their marks: the first that is present decides."""
 
@@ -394,6 +433,8 @@ _SMALL_ORDER: Final = Layout(">34s34s20s24xQ20s20s24xQ24xQ")
 _TWELVE_ZEROS: Final = bytes(12)
 _WITHDRAWAL_TYPE: Final = keccak256(b"Withdrawal(bytes32 order,address lighthouse,uint256 deadline)")
 """The first word of what a withdrawal's signature covers; no order and no Result begins like this."""
+_PERMIT_TYPE: Final = keccak256(b"Permit(address owner,address spender,uint256 value,uint256 nonce,uint256 deadline)")
+"""The first word of a permit's fields (EIP-2612)."""
 
 
 def decode(payload: bytes, likely: type[Any] | None = None) -> Message:
@@ -598,11 +639,19 @@ def _pack_withdrawal(message: Withdrawal) -> bytes:
     return b"".join((_WITHDRAWAL_TYPE, bytes.fromhex(message.order), lighthouse, _word(message.deadline)))
 
 
+def _pack_permit(message: Permit) -> bytes:
+    owner, spender = (_padded(address_bytes(address)) for address in (message.owner, message.spender))
+    numbers = (_word(number) for number in (message.value, message.nonce, message.deadline))
+    fields = keccak256(b"".join((_PERMIT_TYPE, owner, spender, *numbers)))
+    return b"\x19\x01" + bytes.fromhex(message.domain) + fields
+
+
 _PACKERS: Final[dict[type[Message], Callable[[Any], bytes]]] = {
     Demand: _pack_order,
     Offer: _pack_order,
     Withdrawal: _pack_withdrawal,
     Result: _pack_result,
+    Permit: _pack_permit,
 }
 """What the hash of a message covers, by its type; for the feedback messages it is not defined."""
 

@@ -29,6 +29,7 @@ from schemas.errors import InputError, InvalidMessage, InvalidRecord
 from schemas.messages import (
     SIGNATURE_SIZE,
     OrderFeedback,
+    Permit,
     SignedMessage,
     TransactionFeedback,
     decode,
@@ -140,9 +141,9 @@ class Signer:
         Raises `InvalidMessage`: `unresolved-name` if the message contains an ENS name, `sender` if its sender is not
         this account.
         """
-        signature = self.sign_hash(message_hash(message))
+        digest = signable(message_hash(message), is_typed_data=message.is_typed_data)
         _check_sender(message, self.address)
-        return replace(message, signature=signature.hex())
+        return replace(message, signature=self._sign(digest).hex())
 
     def sign_hash(self, digest: bytes) -> bytes:
         """The 65-byte signature (r, s, v = 27 or 28) of a 32-byte message hash, as a personal message of Ethereum.
@@ -151,8 +152,16 @@ class Signer:
         """
         if len(digest) != 32:
             raise InputError(f"a message hash has 32 bytes, not {len(digest)}")
-        signature = sign_recoverable(keccak256(_PREFIX + digest), self.__key)
+        return self._sign(signable(digest))
+
+    def _sign(self, digest: bytes) -> bytes:
+        signature = sign_recoverable(digest, self.__key)
         return signature[:64] + bytes((signature[64] + 27,))
+
+
+def signable(digest: bytes, *, is_typed_data: bool = False) -> bytes:
+    """What a key signs for a message hash: the hash of a personal message of Ethereum; of EIP-712, the hash itself."""
+    return digest if is_typed_data else keccak256(_PREFIX + digest)
 
 
 def recover(digest: bytes, signature: str | bytes) -> str:
@@ -168,7 +177,7 @@ SignedDigest: TypeAlias = tuple[bytes, bytes, int]
 """What a key is recovered from: the 32 bytes that were signed, the signature's 65 bytes, and its recovery id."""
 
 
-def signed_digest(digest: bytes, signature: str | bytes) -> SignedDigest:
+def signed_digest(digest: bytes, signature: str | bytes, *, is_typed_data: bool = False) -> SignedDigest:
     """What `recover_keys` takes for a 32-byte message hash and its signature. Raises as `recover`."""
     if isinstance(signature, str):
         try:
@@ -181,7 +190,7 @@ def signed_digest(digest: bytes, signature: str | bytes) -> SignedDigest:
         raise InvalidMessage("signature", f"v is {signature[64]}, expected 27 or 28")
     if signature[32:64] > _HIGHEST_S:
         raise InvalidMessage("signature", "s is in the upper half of the curve's order")
-    return keccak256(_PREFIX + digest), signature, recovery_id
+    return signable(digest, is_typed_data=is_typed_data), signature, recovery_id
 
 
 def recover_keys(signed: Iterable[SignedDigest]) -> list[bytes]:
@@ -230,7 +239,8 @@ def verify(payload: bytes) -> Verified[SignedMessage]:
 def verify_message(message: _M) -> Verified[_M]:
     """As `verify`, for a message that is decoded already and whose ENS names are resolved."""
     digest = message_hash(message)
-    return verify_recovered(message, digest, recover_keys((signed_digest(digest, message.signature),))[0])
+    signed = signed_digest(digest, message.signature, is_typed_data=message.is_typed_data)
+    return verify_recovered(message, digest, recover_keys((signed,))[0])
 
 
 def verify_recovered(message: _M, digest: bytes, key: bytes) -> Verified[_M]:
@@ -385,9 +395,9 @@ def is_word(text: str) -> bool:
 
 
 def _check_sender(message: SignedMessage, signer: str) -> None:
-    sender = getattr(message, "sender", None)
+    sender = message.owner if isinstance(message, Permit) else getattr(message, "sender", None)
     if sender is not None and sender != signer:
-        raise InvalidMessage("sender", f"the order names {sender} as its sender, but the key is that of {signer}")
+        raise InvalidMessage("sender", f"it names {sender} as its sender, but the key is that of {signer}")
 
 
 @lru_cache(maxsize=_CACHED)

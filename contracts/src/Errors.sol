@@ -11,6 +11,10 @@ interface TokenErrors {
     error ERC20InsufficientAllowance(address spender, uint256 allowance, uint256 needed);
     /// Tokens cannot be sent to the zero address (ERC-6093).
     error ERC20InvalidReceiver(address receiver);
+    /// The last second of the permit is over.
+    error ERC2612ExpiredSignature(uint256 deadline);
+    /// The owner has not signed this permit with its next nonce, for this token on this chain.
+    error ERC2612InvalidSigner(address signer, address owner);
 }
 
 interface OrderErrors is TokenErrors {
@@ -48,6 +52,8 @@ interface OrderErrors is TokenErrors {
     error TokenTransferFailed(address token);
     /// The token moved another amount than it was asked to, as fee-on-transfer tokens do.
     error TokenAmountMismatch(address token, uint256 expected, uint256 received);
+    /// The demand has a fee for carrying its permit, but the token's last permit of the promisee is another one.
+    error FeeNotPermitted(address promisee);
 }
 
 interface LiabilityErrors {

@@ -9,6 +9,7 @@ import {ILiabilityFactory, Liability} from "./Liability.sol";
 import {ILighthouseFactory, Lighthouse} from "./Lighthouse.sol";
 import {LighthouseNames} from "./LighthouseNames.sol";
 import {Order, Orders} from "./Orders.sol";
+import {Permit, Permits} from "./Permits.sol";
 import {PullPayments} from "./PullPayments.sol";
 import {Signatures} from "./Signatures.sol";
 import {Terms, TermsCode} from "./Terms.sol";
@@ -89,12 +90,32 @@ contract Factory is
     /// @param demand canonical ABI encoding of the promisee's order.
     /// @param offer the same of the promisor's.
     function createLiability(bytes calldata demand, bytes calldata offer) external {
-        if (!isLighthouse(msg.sender)) revert NotALighthouse(msg.sender);
+        _make(_agree(Orders.read(demand), Orders.read(offer)));
+    }
+
+    /// @notice As `createLiability`, with the promisee's permit for this factory (EIP-2612), so that the promisee needs
+    /// no transaction to approve the cost. If somebody has brought the permit to the token before, the approval stands.
+    /// Without a validator, the demand's fee is what the promisee pays the provider for this, in the demand's token.
+    /// @param value what the permit approves: the cost and the fee at least, in the token's smallest unit.
+    /// @param deadline the permit's last second.
+    function createLiabilityWithPermit(
+        bytes calldata demand,
+        bytes calldata offer,
+        uint256 value,
+        uint256 deadline,
+        uint8 v,
+        bytes32 r,
+        bytes32 s
+    ) external {
         Terms memory terms = _agree(Orders.read(demand), Orders.read(offer));
-        _collect(terms, _provider());
-        address liability = Clone.create(liabilityCode, LIABILITY, TermsCode.pack(terms, address(xrt)));
-        // slither-disable-next-line reentrancy-events (nobody but the token was called, and it changes nothing here)
-        emit NewLiability(liability);
+        Permit memory permit = Permit(value, deadline, v, r, s);
+        Permits.submit(terms.token, terms.promisee, permit);
+        if (terms.validator == address(0) && terms.validatorFee > 0) {
+            // Elsewhere such a fee means nothing, and nobody may be charged it for an approval of another day.
+            Permits.requireLast(terms.token, terms.promisee, permit);
+            Tokens.take(terms.token, terms.promisee, _provider(), terms.validatorFee);
+        }
+        _make(terms);
     }
 
     /// @notice Generation 3: makes an order of the caller's unusable, whatever a provider does with it.
@@ -200,8 +221,9 @@ contract Factory is
         return gasConsumedOf(liability);
     }
 
-    /// Checks both orders and uses them up.
+    /// Checks who calls and both orders, and uses them up.
     function _agree(Order calldata demand, Order calldata offer) private returns (Terms memory terms) {
+        if (!isLighthouse(msg.sender)) revert NotALighthouse(msg.sender);
         Orders.requireMatch(demand, offer);
         terms.lighthouse = address(uint160(demand.firstAccount));
         if (terms.lighthouse != msg.sender) revert WrongLighthouse(terms.lighthouse, msg.sender);
@@ -219,6 +241,14 @@ contract Factory is
         terms.offerDeadline = offer.deadline;
         (terms.promisee, terms.demandHash, terms.demandNonce) = _use(demand);
         (terms.promisor, terms.offerHash, terms.offerNonce) = _use(offer);
+    }
+
+    /// Takes the money for what was agreed, and makes the liability.
+    function _make(Terms memory terms) private {
+        _collect(terms, _provider());
+        address liability = Clone.create(liabilityCode, LIABILITY, TermsCode.pack(terms, address(xrt)));
+        // slither-disable-next-line reentrancy-events (nobody but the token was called, and it changes nothing here)
+        emit NewLiability(liability);
     }
 
     /// An Offer (lighthouse L, validator V) is, with the same signature, a Demand (lighthouse V, validator L). So no
@@ -345,7 +375,9 @@ contract Factory is
     }
 
     /// The account behind the lighthouse's call; only to be believed when a lighthouse is calling.
-    function _provider() private pure returns (address) {
-        return address(bytes20(msg.data[msg.data.length - 20:]));
+    function _provider() private pure returns (address provider) {
+        assembly ("memory-safe") {
+            provider := shr(96, calldataload(sub(calldatasize(), 20)))
+        }
     }
 }

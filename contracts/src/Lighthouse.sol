@@ -37,6 +37,17 @@ contract Lighthouse is RobonomicsErrors, Turns {
         return true;
     }
 
+    /// @notice As `createLiability`, with the promisee's permit (EIP-2612) for the factory: the promisee needs no
+    /// transaction, and pays the provider the fee in the demand, see `Factory.createLiabilityWithPermit`.
+    function createLiabilityWithPermit(bytes calldata, bytes calldata, uint256, uint256, uint8, bytes32, bytes32)
+        external
+        returns (bool)
+    {
+        _useTurn();
+        _callFactory(abi.encodePacked(msg.data, msg.sender));
+        return true;
+    }
+
     /// @notice Ends a liability of this lighthouse with a signed result, on the provider's turn.
     /// @dev The arguments go to the factory as they came: liability, 34-byte multihash of the result, success and the
     /// signature of the promisor or, in generation 5, the signatures of those whom the validator accepts.

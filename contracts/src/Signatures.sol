@@ -40,15 +40,20 @@ library Signatures {
 
     /// @return signer never the zero address.
     function recover(bytes32 hash, uint8 v, bytes32 r, bytes32 s) internal pure returns (address signer) {
-        if (uint256(s) > HALF_ORDER) revert OrderErrors.InvalidSignature();
         bytes32 prefixed;
         assembly ("memory-safe") {
             mstore(0, "\x19Ethereum Signed Message:\n32")
             mstore(28, hash)
             prefixed := keccak256(0, 60)
         }
+        return recoverDigest(prefixed, v, r, s);
+    }
+
+    /// @notice As `recover`, of what was signed without the prefix (EIP-712).
+    function recoverDigest(bytes32 digest, uint8 v, bytes32 r, bytes32 s) internal pure returns (address signer) {
+        if (uint256(s) > HALF_ORDER) revert OrderErrors.InvalidSignature();
         // Zero for every v but 27 and 28, and for what no key can have signed.
-        signer = ecrecover(prefixed, v, r, s);
+        signer = ecrecover(digest, v, r, s);
         if (signer == address(0)) revert OrderErrors.InvalidSignature();
     }
 }

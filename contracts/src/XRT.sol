@@ -2,6 +2,8 @@
 pragma solidity ^0.8.28;
 
 import {TokenErrors} from "./Errors.sol";
+import {Permits} from "./Permits.sol";
+import {Signatures} from "./Signatures.sol";
 
 /// @title XRT, the network's token: ERC-20 with 9 decimals, so that 1 XRT = 10^9 wn.
 /// @notice Providers stake it and are paid in it; the factory mints it for work that was paid for.
@@ -19,7 +21,11 @@ contract XRT is TokenErrors {
     mapping(address account => uint256) public balanceOf;
     /// @notice wn that `spender` may still take from `owner`; the maximum is never used up.
     mapping(address owner => mapping(address spender => uint256)) public allowance;
+    /// @notice The nonce that an account's next permit is signed with (EIP-2612).
+    mapping(address owner => uint256) public nonces;
     address private immutable _deployer = msg.sender;
+    uint256 private immutable _chain = block.chainid;
+    bytes32 private immutable _domain;
 
     event Transfer(address indexed from, address indexed to, uint256 value);
     event Approval(address indexed owner, address indexed spender, uint256 value);
@@ -32,6 +38,7 @@ contract XRT is TokenErrors {
 
     /// @param initialSupply wn that the deployer receives.
     constructor(uint256 initialSupply) {
+        _domain = _domainSeparator();
         _mint(msg.sender, initialSupply);
     }
 
@@ -62,6 +69,26 @@ contract XRT is TokenErrors {
         return true;
     }
 
+    /// @notice Approves as `approve` of the owner does, by the owner's signature (EIP-2612); anybody may call.
+    /// @param deadline the last second, as blocks have it, in which it counts.
+    function permit(
+        address owner,
+        address spender,
+        uint256 value,
+        uint256 deadline,
+        uint8 v,
+        bytes32 r,
+        bytes32 s
+    ) external {
+        // slither-disable-next-line timestamp (EIP-2612 has it so)
+        if (block.timestamp > deadline) revert ERC2612ExpiredSignature(deadline);
+        bytes32 digest = Permits.digestOf(DOMAIN_SEPARATOR(), owner, spender, value, nonces[owner]++, deadline);
+        address signer = Signatures.recoverDigest(digest, v, r, s);
+        if (signer != owner) revert ERC2612InvalidSigner(signer, owner);
+        allowance[owner][spender] = value;
+        emit Approval(owner, spender, value);
+    }
+
     function transfer(address to, uint256 value) external returns (bool) {
         _transfer(msg.sender, to, value);
         return true;
@@ -77,6 +104,24 @@ contract XRT is TokenErrors {
         }
         _transfer(from, to, value);
         return true;
+    }
+
+    /// @notice What ties a permit to this token on this chain (EIP-712); another one after the chain has split in two.
+    // slither-disable-next-line naming-convention (EIP-2612 has it so)
+    function DOMAIN_SEPARATOR() public view returns (bytes32) {
+        return block.chainid == _chain ? _domain : _domainSeparator();
+    }
+
+    function _domainSeparator() private view returns (bytes32) {
+        return keccak256(
+            abi.encode(
+                keccak256("EIP712Domain(string name,string version,uint256 chainId,address verifyingContract)"),
+                keccak256(bytes(name)),
+                keccak256("1"),
+                block.chainid,
+                address(this)
+            )
+        );
     }
 
     function _transfer(address from, address to, uint256 value) private {

@@ -335,7 +335,7 @@ class MessageValidator(Generic[M]):
                 if identity in seen or identity in new:
                     self._count_duplicates(1)
                     continue
-                signed = signed_digest(digest, message.signature)
+                signed = signed_digest(digest, message.signature, is_typed_data=message.is_typed_data)
             except InvalidMessage as error:
                 self.reject(error.reason)
             else:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from eth.vm.chain_context import ChainContext
 from eth.vm.message import Message
 from eth_abi.abi import encode
 from eth_typing import Address
@@ -56,6 +57,11 @@ class Evm:
         """Back to how the chain is. The state is a new one: py-evm's own gets slower with each account it has seen."""
         self._vm: Any = self._chain.get_vm()
         self._state: Any = self._vm.state
+
+    def become_chain(self, chain_id: int) -> None:
+        """Go on as a chain with another number, as after a split."""
+        context = self._vm.create_execution_context(self._vm.get_header(), [], ChainContext(chain_id))
+        self._state.execution_context = context
 
     def call(self, target: str, function: str, *arguments: Any, sender: str) -> Answer:
         """Call `function`, which is written as `name(type,type)`; nothing changes when it is refused."""

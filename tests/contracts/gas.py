@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from schemas import parse_cid
 from tests.contracts.chains import py_evm
 from tests.contracts.juries import Panel
-from tests.contracts.market import RESULT, Market
+from tests.contracts.market import FUNDS, RESULT, Market
 from tests.contracts.suite import REFUND_DELAY, XRT, Suite
 
 Gas = dict[str, dict[str, int]]
@@ -36,6 +36,8 @@ ROWS: Final = {
     "create_cost_0": Row("createLiability, cost 0", ("796,277", "809,155"), (145_000, 190_000)),
     "create_cost": Row("createLiability, cost > 0", ("858,781", "870,450"), (165_000, 212_000)),
     "create_cost_fee": Row("  + lighthouseFee", ("901,585", "914,228"), (185_000, 232_000)),
+    "create_permit": Row("  with a permit", ("-", "-"), (178_000, 222_000)),
+    "create_permit_fee": Row("  and a fee for it", ("-", "-"), (212_000, 255_000)),
     "create_validator": Row("  + validator, no fees", ("-", "-"), (175_000, 220_000)),
     "finalize_cost_0": Row("finalize, cost 0", ("268,656", "214,894"), (102_000, 102_000)),
     "finalize_cost": Row("finalize, cost > 0", ("279,670", "226,793"), (115_000, 115_000)),
@@ -75,6 +77,7 @@ def _measure(market: Market) -> dict[str, int]:
         created = suite.send(market.creation(*market.pair(**terms)), market.provider)
         used[f"create_{ending}"] = created["gasUsed"]
         used[f"finalize_{ending}"] = market.finalize(market.liability_of(created))["gasUsed"]
+    used |= _measure_permits(market)
     used |= _measure_validator(market)
     used |= _measure_foreign_token(market)
     used["withdraw_order"] = suite.send(market.withdrawal(market.demand()), market.promisee)["gasUsed"]
@@ -87,6 +90,19 @@ def _measure(market: Market) -> dict[str, int]:
     suite.chain.mine(REFUND_DELAY)
     used["refund"] = suite.send(suite.factory.functions.refund(liability.address), market.promisee)["gasUsed"]
     return {key: used[key] for key in ROWS if key in used}
+
+
+def _measure_permits(market: Market) -> dict[str, int]:
+    """Of a promisee without an allowance, whose nonce is used already."""
+    suite, used = market.suite, {}
+    nobody = suite.xrt.functions.approve(suite.factory.address, 0)
+    suite.send(nobody, market.promisee)
+    suite.send(market.permission(market.permit(0)))
+    for key, fee in (("create_permit", 0), ("create_permit_fee", XRT)):
+        orders, permit = market.pair(cost=XRT, validator_fee=fee), market.permit(XRT + fee)
+        used[key] = suite.send(market.permitted_creation(*orders, permit), market.provider)["gasUsed"]
+    suite.send(suite.xrt.functions.approve(suite.factory.address, FUNDS), market.promisee)
+    return used
 
 
 def _measure_validator(market: Market) -> dict[str, int]:

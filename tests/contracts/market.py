@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from web3.logs import DISCARD
 
-from schemas import ZERO_ADDRESS, Demand, Offer, Result, cid_of_digest, message_hash, order_abi, parse_cid
+from schemas import ZERO_ADDRESS, Demand, Offer, Permit, Result, cid_of_digest, message_hash, order_abi, parse_cid
 from tests.contracts.suite import XRT, Person, Suite
 
 if TYPE_CHECKING:
@@ -22,6 +22,12 @@ OTHER: Final = cid_of_digest(bytes.fromhex("44" * 32))
 FUNDS: Final = 1000 * XRT
 QUOTA: Final = 1000
 FINALIZE: Final = "finalize"
+
+
+def permit_arguments(permit: Permit) -> tuple[int, int, int, bytes, bytes]:
+    """Value, deadline and signature, as contracts take them."""
+    signature = bytes.fromhex(permit.signature)
+    return permit.value, permit.deadline, signature[64], signature[:32], signature[32:64]
 
 
 class Market:
@@ -58,6 +64,30 @@ class Market:
         """The call that makes a liability; bytes are taken as they are."""
         orders = (order if isinstance(order, bytes) else order_abi(order) for order in (demand, offer))
         return (lighthouse or self.lighthouse).functions.createLiability(*orders)
+
+    def permit(self, value: int, *, by: Person | None = None, token: Contract | None = None, **changes: Any) -> Permit:
+        """The promisee's signed permit for the factory; `token` is XRT by default."""
+        owner, token = by or self.promisee, token or self.suite.xrt
+        fields = {
+            "owner": owner.address,
+            "spender": self.suite.factory.address,
+            "token": token.address,
+            "value": value,
+            "nonce": token.functions.nonces(owner.address).call(),
+            "deadline": self.suite.web3.eth.get_block("latest")["timestamp"] + 3600,
+            "domain": token.functions.DOMAIN_SEPARATOR().call().hex(),
+        }
+        return owner.signer.sign(Permit(**{**fields, **changes}))
+
+    def permitted_creation(self, demand: Demand, offer: Offer, permit: Permit, at: Contract | None = None) -> Any:
+        """The call that makes a liability with the promisee's permit."""
+        functions = (at or self.lighthouse).functions
+        return functions.createLiabilityWithPermit(order_abi(demand), order_abi(offer), *permit_arguments(permit))
+
+    def permission(self, permit: Permit) -> Any:
+        """The call by which anybody brings a permit to its token."""
+        token = self.suite.contract("XRT", permit.token)
+        return token.functions.permit(permit.owner, permit.spender, *permit_arguments(permit))
 
     def create(self, **changes: Any) -> Contract:
         """A liability on matching orders with these changes."""
