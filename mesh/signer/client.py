@@ -24,7 +24,7 @@ from mesh.signer.protocol import (
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
     from types import TracebackType
 
@@ -160,7 +160,8 @@ class SignerClient:
         """See `UsePolicy`."""
         return await self._call(protocol.PolicyInUse, "use_policy")
 
-    async def _call(self, kind: type[A], operation: str, **fields: Any) -> A:
+    async def ask(self, operation: str, fields: Mapping[str, Any]) -> protocol.Answer:
+        """Any operation by its name in `DOOR` or `OWNER`, with the fields of its request."""
         known = DOOR.get(operation) or OWNER[operation]
         try:
             body = msgspec.json.encode(msgspec.convert(fields, known.request))
@@ -169,11 +170,16 @@ class SignerClient:
         status, data = await self._post(operation, body)
         try:
             if status == 200:
-                return decode_json(data, kind)
+                return decode_json(data, known.answer)
             failure = decode_json(data, protocol.ErrorAnswer).error
         except InvalidData:
             raise SignerUnavailable("what answers on the socket is no signer of this version") from None
         raise SignerError(failure.message, hint=failure.next, code=failure.code, from_strangers=failure.from_strangers)
+
+    async def _call(self, kind: type[A], operation: str, **fields: Any) -> A:
+        answer = await self.ask(operation, fields)
+        assert isinstance(answer, kind)
+        return answer
 
     async def _post(self, operation: str, body: bytes) -> tuple[int, bytes]:
         if self._session is None:

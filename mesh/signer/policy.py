@@ -1,7 +1,7 @@
 """The policy: what programs may order for a person, in a TOML file of that person. What it does not allow is refused.
 
-Pure: `parse_policy` reads the text, `Policy` judges orders. `read_policy_file` is the one door to the disk, and takes only
-a file that nobody else can change.
+Pure: `parse_policy` reads the text, `Policy` judges orders. `read_policy_file` is the one door to the disk, and takes
+only a file that nobody else can change.
 """
 
 from __future__ import annotations

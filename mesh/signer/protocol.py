@@ -283,6 +283,8 @@ class NeededConsent(Answer, frozen=True, kw_only=True):
     why: str
     expires: str
     command: str
+    by_client: bool = False
+    """Whether the policy also takes the person's answer from a program that asks them."""
 
 
 class Failure(Answer, frozen=True, kw_only=True):
@@ -331,7 +333,7 @@ class ReadJob(Request, frozen=True, kw_only=True):
     """The job now; with `wait_seconds`, once its revision is another than `revision`, or they have passed."""
 
     job_id: JobId
-    revision: int = -1
+    revision: Annotated[int, Meta(ge=-1)] = -1
     wait_seconds: Annotated[float, Meta(ge=0, le=30)] = 0.0
 
 

@@ -154,7 +154,18 @@ def _local_time(time: str) -> str:
         return "--:--:--"
 
 
-LIBRARIES: Final = ("aiohttp", "asyncio", "eth", "eth_tester", "urllib3", "web3", "websockets", "zenoh")
+LIBRARIES: Final = (
+    "aiohttp",
+    "asyncio",
+    "eth",
+    "eth_tester",
+    "mcp",
+    "urllib3",
+    "uvicorn",
+    "web3",
+    "websockets",
+    "zenoh",
+)
 """Loggers of libraries; below level debug only their warnings are shown."""
 MAX_EVENTS: Final = 2_000
 """Events that a process keeps."""

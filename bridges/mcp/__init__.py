@@ -1,0 +1,1 @@
+"""A door for programs that speak the Model Context Protocol, such as assistants with a language model: `aira mcp`."""

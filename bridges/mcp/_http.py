@@ -1,0 +1,213 @@
+"""The door over HTTP: its options, who may use it, and the application that is served."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import logging
+import os
+import secrets
+import stat
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import aiohttp
+import jwt
+from mcp.server.auth.provider import AccessToken, TokenVerifier
+from mcp.server.auth.settings import AuthSettings
+from mcp.server.transport_security import TransportSecuritySettings
+
+from bridges.web.access import ServerOptions, require_loopback
+from mesh.base.log_context import log_event
+from mesh.base.private_files import write_new
+from mesh.errors import ConfigurationError
+from mesh.signer.protocol import LARGEST_REQUEST
+from schemas.decoding import InvalidData, decode_json
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mcp.server.lowlevel import Server
+
+log = logging.getLogger(__name__)
+
+PATH: Final = "/mcp"
+SHORTEST_TOKEN: Final = 16
+MOST_SESSIONS: Final = 64
+"""Sessions of clients of the older revisions; those of the current one have none."""
+ALGORITHMS: Final = ("ES256", "RS256")
+KEYS_KEPT: Final = 600.0
+"""Seconds until the keys of the authorization server are asked for again; at once for a key that is not known."""
+KEYS_PAUSE: Final = 10.0
+"""Seconds between two such requests: anybody can name a key that is not known."""
+LARGEST_DOCUMENT: Final = 1 << 18
+"""Bytes of what the authorization server says."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HttpOptions(ServerOptions):
+    """Where the door listens, and who may use it: the holders of `token`, or those to whom `issuer` gave a token."""
+
+    names: tuple[str, ...] = ()
+    """Names besides its own address by which clients reach it."""
+    issuer: str = ""
+    """The OAuth authorization server whose tokens for `url` are taken; then `token` is not."""
+    url: str = ""
+    """The door's URL as clients know it, the audience of their tokens."""
+
+    def check(self) -> None:
+        """Raise `ConfigurationError` for a server that other machines can reach without TLS, or one without a login."""
+        if not (self.certificate and self.key):
+            require_loopback(self.host, "--certificate and --key")
+        if self.issuer and not self.url:
+            raise ConfigurationError(
+                "with --issuer the tokens must name this server",
+                hint="give its URL as clients know it, as in --url https://robots.example.org/mcp",
+                code="mcp-url-missing",
+            )
+
+
+def application(server: Server[Any], options: HttpOptions) -> Any:
+    """The ASGI application of the door."""
+    hosts = [f"{name}:*" for name in ("127.0.0.1", "localhost", "[::1]")]
+    for name in (options.host, *options.names):
+        shown = f"[{name}]" if ":" in name and not name.startswith("[") else name
+        hosts += [shown, f"{shown}:*"]
+    origins = [f"{scheme}://{host}" for scheme in ("http", "https") for host in hosts]
+    if options.issuer:
+        verifier: TokenVerifier = IssuedTokens(options.issuer, options.url)
+        auth = AuthSettings.model_validate(
+            {"issuer_url": options.issuer, "resource_server_url": options.url, "validate_token_resource": True}
+        )
+    else:
+        verifier = OneToken(options.token)
+        # Named by nothing that is served: there is no authorization server.
+        auth = AuthSettings.model_validate({"issuer_url": "http://localhost", "resource_server_url": None})
+    return server.streamable_http_app(
+        streamable_http_path=PATH,
+        max_request_body_size=LARGEST_REQUEST,
+        max_sessions=MOST_SESSIONS,
+        transport_security=TransportSecuritySettings(allowed_hosts=hosts, allowed_origins=origins),
+        host=options.host,
+        auth=auth,
+        token_verifier=verifier,
+    )
+
+
+class OneToken(TokenVerifier):
+    """Takes the token of the private file, compared in constant time."""
+
+    def __init__(self, token: str) -> None:
+        if len(token) < SHORTEST_TOKEN:
+            raise ConfigurationError("the door needs a token", hint="give --token-file", code="token-too-short")
+        self._token = token.encode()
+
+    async def verify_token(self, token: str) -> AccessToken | None:
+        """The access that a token gives; None for a wrong one."""
+        if not hmac.compare_digest(self._token, token.encode(errors="replace")):
+            return None
+        return AccessToken(token="", client_id="owner", scopes=[])
+
+
+class IssuedTokens(TokenVerifier):
+    """Takes the tokens (JWT, RFC 9068) that an authorization server issued for this door, and no others.
+
+    A token is for the door alone: it is passed on to nobody.
+    """
+
+    def __init__(self, issuer: str, url: str) -> None:
+        self._issuer = issuer
+        self._url = url
+        self._keys: dict[str, Any] = {}
+        self._asked = -KEYS_KEPT
+        self._asking = asyncio.Lock()
+
+    async def verify_token(self, token: str) -> AccessToken | None:
+        """The access that a token gives; None for one that is forged, over, or for another server."""
+        try:
+            head = jwt.get_unverified_header(token)
+            key = await self._key(str(head.get("kid", "")))
+            claims = jwt.decode(
+                token,
+                key,
+                algorithms=ALGORITHMS,
+                issuer=self._issuer,
+                audience=self._url,
+                options={"require": ["exp", "iss", "aud"]},
+            )
+        except (jwt.PyJWTError, LookupError, ValueError) as error:
+            log.debug("a token is refused: %s", type(error).__name__)
+            return None
+        return AccessToken(
+            token="",
+            client_id=str(claims.get("client_id") or claims.get("azp") or claims.get("sub") or "client"),
+            scopes=str(claims.get("scope", "")).split(),
+            expires_at=int(claims["exp"]),
+            resource=self._url,
+            subject=str(claims["sub"]) if claims.get("sub") else None,
+            claims={"iss": self._issuer},
+        )
+
+    async def _key(self, name: str) -> Any:
+        """The key of that name. Raises `KeyError`."""
+        async with self._asking:
+            now = asyncio.get_running_loop().time()
+            if now - self._asked > (KEYS_PAUSE if name not in self._keys else KEYS_KEPT):
+                self._asked = now
+                try:
+                    self._keys = await self._fetch()
+                except (aiohttp.ClientError, OSError, TimeoutError, InvalidData, LookupError, TypeError) as error:
+                    fields = log_event("oauth-keys-unavailable", code=type(error).__name__)
+                    log.warning("the authorization server gives no keys: %s", type(error).__name__, extra=fields)
+        return self._keys[name]
+
+    async def _fetch(self) -> dict[str, Any]:
+        timeout = aiohttp.ClientTimeout(total=10)
+        async with aiohttp.ClientSession(timeout=timeout) as session:
+            base = self._issuer.rstrip("/")
+            about = await _document(session, f"{base}/.well-known/oauth-authorization-server")
+            about = about or await _document(session, f"{base}/.well-known/openid-configuration")
+            if about.get("issuer") != self._issuer:
+                raise LookupError("another issuer")
+            listed = (await _document(session, str(about["jwks_uri"])))["keys"]
+        keys = {}
+        for each in listed[:100]:
+            if each.get("alg", "ES256") in ALGORITHMS and each.get("use", "sig") == "sig" and each.get("kid"):
+                keys[str(each["kid"])] = jwt.PyJWK(each, each.get("alg")).key
+        return keys
+
+
+async def _document(session: aiohttp.ClientSession, url: str) -> dict[str, Any]:
+    """A JSON object; an empty one if there is none. Only over TLS, or from this machine."""
+    if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
+        raise LookupError("not over TLS")
+    async with session.get(url, allow_redirects=False) as response:
+        if response.status != 200:
+            return {}
+        found = decode_json(await response.content.read(LARGEST_DOCUMENT))
+        return found if isinstance(found, dict) else {}
+
+
+def private_token(path: Path) -> str:
+    """The token in a file that only this user can read, which is made if it is missing. Raises `ConfigurationError`."""
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not path.exists():
+            write_new(path, secrets.token_urlsafe(32).encode() + b"\n")
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+            status = os.fstat(file.fileno())
+            token = file.read(4096).decode("ascii").strip()
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or "not a text in ASCII"
+        raise ConfigurationError(f"can't use the token file {path}: {why}", code="token-file-unusable") from None
+    if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077:
+        raise ConfigurationError(
+            f"others can read the token file {path}", hint=f"chmod 600 {path}", code="token-file-unusable"
+        )
+    if len(token) < SHORTEST_TOKEN:
+        raise ConfigurationError(
+            f"the token in {path} is too short",
+            hint=f"use at least {SHORTEST_TOKEN} characters, or remove the file: a new one is made",
+            code="token-too-short",
+        )
+    return token

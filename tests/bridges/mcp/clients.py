@@ -1,0 +1,39 @@
+"""Clients of the door: the SDK's own, over stdio and HTTP, of each revision of the protocol."""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import httpx2
+from mcp import Client, StdioServerParameters
+from mcp.client.streamable_http import streamable_http_client
+from mcp_types.version import LATEST_HANDSHAKE_VERSION
+
+from tests.support.commands import AIRA
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+
+def _mode(version: str) -> str:
+    """How the SDK's client is told to speak a revision."""
+    return "legacy" if version == LATEST_HANDSHAKE_VERSION else "auto"
+
+
+@asynccontextmanager
+async def http_client(url: str, token: str, version: str, **options: Any) -> AsyncIterator[Client]:
+    headers = {"Authorization": f"Bearer {token}"}
+    async with httpx2.AsyncClient(headers=headers, timeout=60) as http:
+        transport = streamable_http_client(url, http_client=http)
+        async with Client(transport, mode=_mode(version), **options) as client:
+            yield client
+
+
+@asynccontextmanager
+async def stdio_client(*arguments: str, version: str, **options: Any) -> AsyncIterator[Client]:
+    """A client that starts `aira mcp` as assistants do."""
+    program, *before = AIRA
+    process = StdioServerParameters(command=str(program), args=[*map(str, before), "mcp", *arguments])
+    async with Client(process, mode=_mode(version), **options) as client:
+        yield client

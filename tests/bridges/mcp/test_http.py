@@ -1,0 +1,249 @@
+"""The door over HTTP: Host and Origin, tokens of a file and of an authorization server, sizes, slow clients."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import stat
+import time
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import aiohttp
+import jwt
+import pytest
+from aiohttp import web
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
+
+from bridges.mcp._door import McpDoor
+from bridges.mcp._http import PATH, HttpOptions, application, private_token
+from mesh.base.asgi_server import AsgiServer
+from mesh.base.door import DoorLimits
+from mesh.base.http_server import HttpServer
+from mesh.errors import ConfigurationError, PortUnavailable
+from mesh.signer.client import SignerClient
+from mesh.signer.protocol import LARGEST_REQUEST
+from tests.bridges.mcp.clients import http_client
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+TOKEN = "a token of a private file"
+HEADERS = {"Content-Type": "application/json", "Accept": "application/json, text/event-stream"}
+CALL = {
+    "jsonrpc": "2.0",
+    "id": 1,
+    "method": "initialize",
+    "params": {"protocolVersion": "2025-11-25", "capabilities": {}, "clientInfo": {"name": "test", "version": "1"}},
+}
+
+
+@asynccontextmanager
+async def served(options: HttpOptions, *, limits: DoorLimits = DoorLimits()) -> AsyncIterator[str]:  # noqa: B008
+    """The door over HTTP, in this process, of a signer that does not run; its URL."""
+    async with SignerClient(Path("/nowhere/door.sock")) as signer:
+        app = application(McpDoor(signer).server, options)
+        async with AsgiServer(app, options.host, options.port, limits=limits) as server:
+            yield f"http://127.0.0.1:{server.port}{PATH}"
+
+
+@asynccontextmanager
+async def posting(url: str, **headers: str) -> AsyncIterator[aiohttp.ClientResponse]:
+    async with (
+        aiohttp.ClientSession() as session,
+        session.post(url, json=CALL, headers=HEADERS | headers) as response,
+    ):
+        yield response
+
+
+@pytest.mark.parametrize("version", [LATEST_MODERN_VERSION, LATEST_HANDSHAKE_VERSION])
+async def test_both_revisions_of_the_protocol_are_served(version: str) -> None:
+    async with served(HttpOptions(token=TOKEN)) as url, http_client(url, TOKEN, version) as client:
+        assert client.protocol_version == version
+        assert {tool.name for tool in (await client.list_tools()).tools} >= {"find_robots", "order", "verify"}
+        result = await client.call_tool("balance", {})
+        assert result.is_error
+        assert result.structured_content is not None
+        assert result.structured_content["code"] == "signer-unavailable"
+        assert result.structured_content["next"]
+        assert "/nowhere" not in json.dumps(result.structured_content)
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{}, {"Authorization": "Bearer another token"}, {"Authorization": TOKEN}, {"Authorization": "Bearer "}],
+    ids=["none", "wrong", "no-bearer", "empty"],
+)
+async def test_without_the_token_nothing_is_served(headers: dict[str, str]) -> None:
+    async with served(HttpOptions(token=TOKEN)) as url, posting(url, **headers) as response:
+        assert response.status == 401
+        assert "Bearer" in response.headers["WWW-Authenticate"]
+
+
+async def test_a_token_in_the_url_is_none() -> None:
+    async with served(HttpOptions(token=TOKEN)) as url, posting(f"{url}?access_token={TOKEN}") as response:
+        assert response.status == 401
+
+
+@pytest.mark.parametrize(
+    ("header", "value", "status"),
+    [
+        ("Host", "evil.example", 421),
+        ("Host", "127.0.0.1.evil.example:80", 421),
+        ("Origin", "http://evil.example", 403),
+        ("Origin", "null", 403),
+        ("Host", "robots.example", 200),
+        ("Origin", "http://localhost:3000", 200),
+    ],
+)
+async def test_pages_of_other_sites_reach_nothing(header: str, value: str, status: int) -> None:
+    options = HttpOptions(token=TOKEN, names=("robots.example",))
+    async with (
+        served(options) as url,
+        posting(url, **{"Authorization": f"Bearer {TOKEN}", header: value}) as response,
+    ):
+        assert response.status == status
+
+
+async def test_a_body_that_is_too_large_is_refused() -> None:
+    async with served(HttpOptions(token=TOKEN)) as url, aiohttp.ClientSession() as session:
+        body = io.BytesIO(b" " * (LARGEST_REQUEST + 1))
+        headers = HEADERS | {"Authorization": f"Bearer {TOKEN}"}
+        async with session.post(url, data=body, headers=headers) as response:
+            assert response.status == 413
+
+
+async def test_a_client_that_sends_nothing_is_ended() -> None:
+    limits = DoorLimits(head=0.2)
+    async with served(HttpOptions(token=TOKEN), limits=limits) as url:
+        host, port = url.removeprefix("http://").removesuffix(PATH).split(":")
+        reader, writer = await asyncio.open_connection(host, int(port))
+        writer.write(b"POST /mcp HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        async with asyncio.timeout(10):
+            with suppress(ConnectionError):
+                assert await reader.read() == b""
+        writer.close()
+
+
+async def test_connections_of_one_address_are_limited() -> None:
+    limits = DoorLimits(per_address=4)
+    async with served(HttpOptions(token=TOKEN), limits=limits) as url:
+        host, port = url.removeprefix("http://").removesuffix(PATH).split(":")
+        silent = [await asyncio.open_connection(host, int(port)) for _ in range(8)]
+        async with posting(url, Authorization=f"Bearer {TOKEN}") as response:
+            assert response.status == 200
+        for _, writer in silent:
+            writer.close()
+
+
+async def test_a_port_that_is_taken_is_an_error() -> None:
+    async with served(HttpOptions(token=TOKEN)) as url:
+        port = int(url.removesuffix(PATH).rpartition(":")[2])
+        with pytest.raises(PortUnavailable) as caught:
+            async with served(HttpOptions(token=TOKEN, port=port)):
+                pass
+        assert caught.value.port == port
+
+
+def test_other_machines_need_tls() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        HttpOptions(host="0.0.0.0", token=TOKEN).check()
+    assert "--certificate" in caught.value.hint
+
+
+def test_the_token_is_made_once_and_private(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "mcp-token"
+    token = private_token(path)
+    assert len(token) > 30
+    assert private_token(path) == token
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize("spoil", ["open", "short", "link", "folder"])
+def test_a_token_file_that_is_not_private_is_refused(tmp_path: Path, spoil: str) -> None:
+    path = tmp_path / "token"
+    if spoil == "folder":
+        path.mkdir()
+    else:
+        path.write_text("short" if spoil == "short" else TOKEN)
+        path.chmod(0o644 if spoil == "open" else 0o600)
+    if spoil == "link":
+        (tmp_path / "link").symlink_to(path)
+        path = tmp_path / "link"
+    with pytest.raises(ConfigurationError) as caught:
+        private_token(path)
+    assert caught.value.code in ("token-file-unusable", "token-too-short")
+    assert TOKEN not in str(caught.value)
+
+
+class AuthorizationServer:
+    """An OAuth authorization server that gives its keys, and issues tokens."""
+
+    def __init__(self) -> None:
+        self.key = ec.generate_private_key(ec.SECP256R1())
+        self.issuer = ""
+        self.asked = 0
+
+    async def about(self, request: web.Request) -> web.Response:
+        return web.json_response({"issuer": self.issuer, "jwks_uri": f"{self.issuer}/keys"})
+
+    async def keys(self, request: web.Request) -> web.Response:
+        self.asked += 1
+        public = json.loads(jwt.algorithms.ECAlgorithm.to_jwk(self.key.public_key()))
+        return web.json_response({"keys": [public | {"kid": "one", "alg": "ES256", "use": "sig"}]})
+
+    def token(self, *, key: Any = None, algorithm: str = "ES256", kid: str = "one", **claims: Any) -> str:
+        body = {"iss": self.issuer, "aud": AUDIENCE, "exp": time.time() + 60, "sub": "ann", "scope": "work"} | claims
+        return jwt.encode(body, self.key if key is None else key, algorithm=algorithm, headers={"kid": kid})
+
+
+AUDIENCE = "https://robots.example/mcp"
+
+
+@asynccontextmanager
+async def authorization_server() -> AsyncIterator[AuthorizationServer]:
+    issuing, app = AuthorizationServer(), web.Application()
+    app.router.add_get("/.well-known/oauth-authorization-server", issuing.about)
+    app.router.add_get("/keys", issuing.keys)
+    async with HttpServer(app, "127.0.0.1", 0) as server:
+        issuing.issuer = f"http://127.0.0.1:{server.port}"
+        yield issuing
+
+
+async def test_tokens_of_the_authorization_server_are_taken() -> None:
+    async with authorization_server() as issuing, served(HttpOptions(issuer=issuing.issuer, url=AUDIENCE)) as url:
+        for _ in range(3):
+            async with posting(url, Authorization=f"Bearer {issuing.token()}") as response:
+                assert response.status == 200
+        assert issuing.asked == 1
+        about = url.removesuffix(PATH) + "/.well-known/oauth-protected-resource/mcp"
+        async with aiohttp.ClientSession() as session, session.get(about) as response:
+            named = await response.json()
+        assert named["resource"] == AUDIENCE
+        assert named["authorization_servers"] == [issuing.issuer]
+
+
+async def test_other_tokens_are_not_taken() -> None:
+    async with authorization_server() as issuing, served(HttpOptions(issuer=issuing.issuer, url=AUDIENCE)) as url:
+        other = ec.generate_private_key(ec.SECP256R1())
+        form, kind = serialization.Encoding.X962, serialization.PublicFormat.UncompressedPoint
+        public = issuing.key.public_key().public_bytes(form, kind)
+        forged = {
+            "for another server": issuing.token(aud="https://other.example/mcp"),
+            "for no server": issuing.token(aud=None),
+            "of another issuer": issuing.token(iss="https://other.example"),
+            "over": issuing.token(exp=time.time() - 5),
+            "by another key": issuing.token(key=other),
+            "by a key that is not known": issuing.token(kid="two"),
+            "by the public key as a secret": issuing.token(key=public, algorithm="HS256"),
+            "unsigned": issuing.token(key="", algorithm="none"),
+            "no token": "x.y.z",
+        }
+        for why, token in forged.items():
+            async with posting(url, Authorization=f"Bearer {token}") as response:
+                assert response.status == 401, why
+        assert issuing.asked == 1, "keys that are not known are not asked for again and again"
