@@ -48,7 +48,7 @@ from mesh.base.flood import SENDERS, KnownSenders, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.chain import Allowances, OrderAlreadyUsed
-from mesh.errors import AiraError
+from mesh.errors import AiraError, ChainError
 from mesh.network import PresentAgents
 from mesh.role.database import LedgerUnusable
 from schemas import Demand, Offer, Withdrawal, decode
@@ -235,6 +235,8 @@ class Trader(Lifecycle):
         self._changing = asyncio.Lock()
         self._withdrawing = asyncio.Lock()
         """Held while it withdraws on the chain unasked."""
+        self._renewing = asyncio.Lock()
+        """Held while it asks which nonces are used."""
         self.contracts = WatchedContracts(parts, reports)
         self.customers = KnownSenders()
         """Who demanded the contracts of this account."""
@@ -660,6 +662,8 @@ class Trader(Lifecycle):
         await self.contracts.settle()
         self.answered.expire(block)
         await self.load()
+        if not self._renewing.locked() and any(one.is_open and one.nonce is not None for one in self._orders.values()):
+            self._tasks.start(self._renew_used(), "sign orders again")
 
     async def load(self) -> list[TradedOrder]:
         """Take up the orders of the ledger that are not known yet, and what other programs have withdrawn."""
@@ -719,6 +723,21 @@ class Trader(Lifecycle):
         """The robot that an order is for has agreed before, and does not any more."""
         if (order := self._orders.get(decline.order)) is not None and order.is_open:
             order.decline(decline)
+
+    async def _renew_used(self) -> None:
+        """Sign the orders of generation 5 again whose nonce is used, though no contract of theirs was read.
+
+        A withdrawal has used it, or another program of the account. Nobody else says so: robots take such an order for
+        one that has become a contract, and offer nothing.
+        """
+        async with self._renewing:
+            try:
+                # In the state of the block that was handled last: all contracts until then are known.
+                used = await self._chain.liabilities.next_nonce(self._address, block=self._parts.chain_head.head)
+            except ChainError as error:
+                log.debug("the nonces of the open orders are looked at after the next block: %s", error)
+            else:
+                await self._renew_overtaken(used - 1)
 
     async def _renew_overtaken(self, used: int | None) -> None:
         """Sign the orders of generation 5 again whose nonce another order of the account has used."""

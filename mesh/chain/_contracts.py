@@ -151,9 +151,9 @@ class ContractVersion:
         """Units of a token that it refused to pay to an account, and that the factory keeps for it."""
         return int(await self._node.read(self._factory.owed(token, account)))
 
-    async def nonce_of(self, address: str) -> int:
-        """The nonce of an account's next generation-5 order. Raises `NotOffered`."""
-        return int(await self._node.read(self._factory.nonceOf(address)))
+    async def nonce_of(self, address: str, *, block: int | str = "latest") -> int:
+        """The nonce of an account's next generation-5 order, after a block. Raises `NotOffered`."""
+        return int(await self._node.read(self._factory.nonceOf(address), block=block))
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
         """Whether the generation-3 order that `signer` signed has created its liability or was withdrawn."""
@@ -261,10 +261,10 @@ class OriginalContracts(ContractVersion):
         """Nothing: a payment that is refused reverts the whole transaction."""
         return 0
 
-    async def nonce_of(self, address: str) -> int:
+    async def nonce_of(self, address: str, *, block: int | str = "latest") -> int:
         if self.generation == 3:
             raise NotOffered("nonceOf", self.generation)
-        return await super().nonce_of(address)
+        return await super().nonce_of(address, block=block)
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
         """By any signer: the originals accept the same terms only once, even if another account signs them."""

@@ -127,9 +127,9 @@ class Liabilities:
         """Whether the factory created the contract at an address."""
         return await self._version.is_liability(address)
 
-    async def next_nonce(self, address: str | None = None) -> int:
-        """The nonce that an account's next generation-5 order must have."""
-        return await self._version.nonce_of(await self._contracts.address_or_own(address))
+    async def next_nonce(self, address: str | None = None, *, block: int | str = "latest") -> int:
+        """The nonce that an account's next generation-5 order must have after a block."""
+        return await self._version.nonce_of(await self._contracts.address_or_own(address), block=block)
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
         """Whether a generation-3 order of `signer` (address) was used or withdrawn; generation 5 uses nonces."""

@@ -243,6 +243,22 @@ async def test_a_withdrawal_on_the_chain_that_a_reorganisation_reverts_is_made_a
         await until_found(used)
 
 
+@pytest.mark.parametrize("is_own", [True, False])
+async def test_an_order_is_signed_again_when_a_withdrawal_has_used_its_nonce(place: Place, is_own: bool) -> None:
+    """Robots take it for one that has become a contract, and offer nothing: no provider ever looks at it."""
+    async with place.agent("person", generation=5) as person:
+        other = await person.order(OBJECTIVE, cost=2)
+        order = await person.order(OBJECTIVE, cost=3)
+        used = int(order.message.nonce)
+        assert int(other.message.nonce) == used, "one of them becomes a contract first"
+        if is_own:
+            await other.withdraw_on_chain()
+        else:  # by a program with another ledger
+            await place.chains["person"].liabilities.withdraw(other.message)
+        await until(lambda: all(int(one.message.nonce) == used + 1 for one in person.orders()), what="a fresh nonce")
+        assert 3 in [one.message.cost for one in person.orders()]
+
+
 async def test_orders_of_another_program_of_the_account_are_followed_too(place: Place) -> None:
     """Both use one ledger: what one posts and withdraws, the other one learns of."""
     async with place.agent("person") as person, place.agent("person") as other:
