@@ -105,7 +105,9 @@ async def test_nonces_that_a_reorganisation_freed_do_not_keep_the_next_order_wai
         liabilities = person.parts.chain.liabilities
         free = await liabilities.next_nonce()
 
-        async def before_the_reorganisation(liabilities: Liabilities, address: str | None = None, **_block: object) -> int:
+        async def before_the_reorganisation(
+            liabilities: Liabilities, address: str | None = None, **_block: object
+        ) -> int:
             return free + 2
 
         with monkeypatch.context() as patch:
