@@ -7,18 +7,33 @@ import logging
 import sys
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
+import msgspec
 
 from mesh.base.extras import needs_extra
-from mesh.cli.options import FILE, with_settings
-from mesh.cli.output import announce
+from mesh.cli.options import FILE, with_json, with_settings
+from mesh.cli.output import (
+    announce,
+    json_text,
+    plural,
+    print_facts,
+    print_json,
+    print_line,
+    print_result,
+    printable,
+)
+from mesh.errors import AiraError
 from mesh.role.running import run_until_stopped
 from mesh.settings import StorageSettings
+from mesh.signer.policy import InvalidPolicy, parse_policy, read_policy_file
+from mesh.signer.protocol import DOOR_SOCKET, OWNER_SOCKET
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
+    from mesh.signer.client import SignerClient
+    from mesh.signer.protocol import Consent
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +67,6 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
     with needs_extra("mcp", "aira mcp"):
         from bridges.mcp._door import McpDoor
         from mesh.signer.client import SignerClient
-    from mesh.signer.protocol import DOOR_SOCKET
 
     socket = options["socket"] or settings.state_directory / "signer" / DOOR_SOCKET
     async with SignerClient(socket) as signer:
@@ -97,3 +111,142 @@ def _http_options(settings: Settings, options: dict[str, Any]) -> Any:
         url=options["url"],
         token="" if options["issuer"] else private_token(path),
     )
+
+
+OWNER: Final = click.option(
+    "--socket", type=click.Path(path_type=Path), help="owner.sock of the signer [in its folder]"
+)
+"""The option of commands for the person alone."""
+
+
+@command.command("approve", short_help="list the orders that wait for your yes, or allow one")
+@click.argument("consent", required=False, metavar="[ID]")
+@OWNER
+@with_json
+@with_settings("data_dir")
+async def approve(settings: Settings, socket: Path | None, consent: str | None, as_json: bool) -> None:
+    """Allow the order with ID, once. Without ID, list the orders that wait for a person's yes."""
+    async with _owner(settings, socket) as signer:
+        if consent is None:
+            _print_consents(await signer.consents(), as_json=as_json)
+        else:
+            job = await signer.approve(consent)
+            print_result(msgspec.to_builtins(job), f"allowed: {job.job_id} is {job.state}", as_json=as_json)
+
+
+@command.command("deny", short_help="refuse an order that waits for your yes")
+@click.argument("consent", metavar="ID")
+@OWNER
+@with_json
+@with_settings("data_dir")
+async def deny(settings: Settings, socket: Path | None, consent: str, as_json: bool) -> None:
+    """Refuse the order with ID. Nothing was signed for it, and nothing will be."""
+    async with _owner(settings, socket) as signer:
+        job = await signer.deny(consent)
+    print_result(msgspec.to_builtins(job), f"denied: {job.job_id}", as_json=as_json)
+
+
+@command.command("log", short_help="what programs asked for, and what came of it")
+@click.option("--verify", is_flag=True, help="check that the log is complete and unchanged")
+@click.option("--limit", type=click.IntRange(1, 1000), default=100, show_default=True, help="latest entries to show")
+@OWNER
+@with_json
+@with_settings("data_dir")
+async def show_log(settings: Settings, socket: Path | None, verify: bool, limit: int, as_json: bool) -> None:
+    """Print the signer's log: everything that was asked, allowed, refused and approved.
+
+    With --verify, check it instead, and exit with 1 if an entry was changed, removed or added.
+    """
+    async with _owner(settings, socket) as signer:
+        if verify:
+            checked = await signer.verify_log()
+            words = f"{checked.entries:,} entries, all signed by {checked.signer} and in order"
+            if not checked.holds:
+                raise AiraError(f"the log does not hold: {checked.fault}", code="log-broken")
+            print_result(msgspec.to_builtins(checked), words, as_json=as_json)
+            return
+        found = await signer.log(limit=limit)
+    if as_json:
+        print_json(found)
+    for entry in () if as_json else found.entries:
+        facts = " ".join(f"{name}={json_text(value)}" for name, value in entry.facts.items())
+        print_line(printable(f"{entry.number:>6}  {entry.time}  {entry.event}  {facts}"))
+
+
+@command.group("policy", short_help="check, explain and use a policy")
+def policy() -> None:
+    """The policy: what programs may order for you."""
+
+
+@policy.command("check", short_help="find the mistakes in a policy")
+@click.argument("file", type=FILE)
+@with_json
+def check(file: Path, as_json: bool) -> None:
+    """Check FILE, and that only you can change it. Lists all mistakes, each with its line."""
+    try:
+        found = parse_policy(read_policy_file(file), name=file.name)
+    except InvalidPolicy as error:
+        for fault in error.faults[1:]:
+            click.echo(printable(fault), err=True)
+        raise
+    result = {"file": str(file), "hash": found.hash, "rules": len(found.rules)}
+    print_result(result, f"{file} holds {plural(len(found.rules), 'rule')}, no mistakes", as_json=as_json)
+
+
+@policy.command("explain", short_help="say in plain words what a policy allows")
+@click.argument("file", type=FILE)
+@with_json
+def explain(file: Path, as_json: bool) -> None:
+    """Say in plain words what the policy in FILE allows."""
+    found = parse_policy(read_policy_file(file), name=file.name)
+    _print_words(found.hash, found.words(), as_json=as_json)
+
+
+@policy.command("use", short_help="let the signer read its policy again")
+@OWNER
+@with_json
+@with_settings("data_dir")
+async def use(settings: Settings, socket: Path | None, as_json: bool) -> None:
+    """Let the signer read its policy's file again, and follow it from now on. Orders that wait for a yes are void."""
+    async with _owner(settings, socket) as signer:
+        found = await signer.use_policy()
+    _print_words(found.hash, found.words, as_json=as_json)
+
+
+def _owner(settings: Settings, socket: Path | None) -> SignerClient:
+    """The client of the owner's socket."""
+    with needs_extra("mcp", "aira mcp"):
+        from mesh.signer.client import SignerClient
+
+    return SignerClient(socket or settings.state_directory / "signer" / OWNER_SOCKET)
+
+
+def _print_words(digest: str, words: tuple[str, ...], *, as_json: bool) -> None:
+    if as_json:
+        print_json({"hash": digest, "words": words})
+        return
+    for line in words:
+        print_line(printable(line))
+
+
+def _print_consents(consents: tuple[Consent, ...], *, as_json: bool) -> None:
+    if as_json:
+        print_json({"consents": consents})
+        return
+    if not consents:
+        print_line("no orders wait for your yes")
+    for one in consents:
+        title = f" ({printable(one.title.text)})" if one.title else ""
+        facts: dict[str, object] = {
+            one.id: f"{one.cost.text} at most, until {one.expires}",
+            "  robot": one.robot,
+            "  model": f"{one.model}{title}",
+            "  why": printable(one.why),
+            "  note": printable(one.note.text) or None,
+            "  job": one.job_id,
+        }
+        print_facts(facts)
+        for line in one.messages:
+            print_line(f"    {printable(line.text)}")
+        if one.more:
+            print_line(f"    and {plural(one.more, 'message')} more")

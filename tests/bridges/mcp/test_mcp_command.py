@@ -1,0 +1,74 @@
+"""`aira mcp`: the commands of the person: the policy's, and those that need a signer."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.errors import ConfigurationError
+from tests.support.commands import invoke, refused
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+POLICY = """\
+[budget]
+per_job = "5 XRT"
+per_hour = "20 XRT"
+per_day = "50 XRT"
+
+[[allow]]
+models = ["*"]
+robots = ["*"]
+[allow.topics."/drive"]
+radius = { min = 0.2, max = 2.0 }
+"""
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    path = tmp_path / "policy.toml"
+    path.write_text(POLICY)
+    path.chmod(0o600)
+    return path
+
+
+def test_a_policy_is_explained(policy: Path) -> None:
+    done = invoke("mcp", "policy", "explain", policy)
+    assert done.returncode == 0
+    assert "A job may cost at most 5 XRT." in done.stdout
+    assert "/drive" in done.stdout
+
+
+def test_a_policy_is_checked(policy: Path) -> None:
+    done = invoke("mcp", "policy", "check", policy, "--json")
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["rules"] == 1
+
+
+def test_all_mistakes_of_a_policy_are_listed(policy: Path) -> None:
+    policy.write_text(POLICY.replace("per_day", "per_dya").replace('"5 XRT"', '"five"'))
+    done = invoke("mcp", "policy", "check", policy)
+    assert done.returncode == 2
+    assert "policy.toml:2:" in done.stderr
+    assert "did you mean per_day?" in done.stderr
+
+
+def test_a_policy_that_others_can_write_is_refused(policy: Path) -> None:
+    policy.chmod(0o666)
+    refused(invoke("mcp", "policy", "check", policy), ConfigurationError, code="policy-unsafe")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("approve",), ("approve", "consent-0123456789abcdef"), ("deny", "consent-0123456789abcdef"), ("log",)],
+    ids=" ".join,
+)
+def test_without_a_signer_the_error_says_how_to_start_it(tmp_path: Path, words: tuple[str, ...]) -> None:
+    done = invoke("mcp", *words, "--data-dir", tmp_path)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert "[signer-unavailable]" in done.stderr
+    assert "aira signer" in done.stderr
