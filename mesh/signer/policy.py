@@ -37,7 +37,7 @@ MOST_VALUES: Final = 1_000_000
 """Values of an order's messages that are checked."""
 _SECTIONS: Final = ("budget", "consent", "allow")
 _BUDGET: Final = ("per_job", "per_hour", "per_day", "jobs_at_a_time", "hours")
-_CONSENT: Final = ("above", "always", "valid")
+_CONSENT: Final = ("above", "always", "valid", "by_client")
 _ALLOW: Final = ("models", "robots", "topics")
 _DURATION: Final = re.compile(r"(?P<count>[0-9]{1,6})\s*(?P<unit>s|min|h|d)")
 _UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": DAY}
@@ -108,6 +108,8 @@ class Policy:
     """Orders of a higher cost need a person's yes; None: none does."""
     valid: float
     """How long a person may take."""
+    consent_by_client: bool = False
+    """Whether a yes also counts that a program brings, which asked the person by its client. It may not have."""
     rules: tuple[Rule, ...]
 
     def rules_for(self, model: str, robot: str = "") -> list[Rule]:
@@ -192,6 +194,8 @@ class Policy:
         else:
             which = "Each order" if self.consent_above < 0 else f"An order above {show(self.consent_above)}"
             lines.append(f"{which} needs a person's yes, within {_span(self.valid)}.")
+            if self.consent_by_client:
+                lines.append("The program that orders may bring that yes: nothing proves that it asked a person.")
         for number, rule in enumerate(self.rules, 1):
             models = "any model" if rule.models is None else _listed("the model", "the models", rule.models)
             robots = "any robot" if rule.robots is None else _listed("the robot", "the robots", rule.robots)
@@ -319,6 +323,9 @@ class _Reader:
             self._fault(("budget", "jobs_at_a_time"), "jobs_at_a_time is a number from 1 to 1000")
         above = self._consent_above(consent)
         valid = self._duration(consent.get("valid", "10 min"), ("consent", "valid"))
+        by_client = consent.get("by_client", False)
+        if type(by_client) is not bool:
+            self._fault(("consent", "by_client"), "by_client is true or false")
         hours = self._hours(budget.get("hours", ""))
         rules = self._rules(table.get("allow"))
         if self.faults:
@@ -334,6 +341,7 @@ class _Reader:
             hours_text=budget.get("hours", ""),
             consent_above=above,
             valid=valid,
+            consent_by_client=by_client,
             rules=rules,
         )
 

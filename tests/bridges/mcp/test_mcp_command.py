@@ -72,3 +72,13 @@ def test_without_a_signer_the_error_says_how_to_start_it(tmp_path: Path, words: 
     assert done.stdout == ""
     assert "[signer-unavailable]" in done.stderr
     assert "aira signer" in done.stderr
+
+
+def test_whether_a_program_may_bring_the_yes_is_explained(policy: Path) -> None:
+    words = "nothing proves that it asked a person"
+    policy.write_text(POLICY + '\n[consent]\nabove = "1 XRT"\n')
+    assert words not in invoke("mcp", "policy", "explain", policy).stdout
+    policy.write_text(POLICY + '\n[consent]\nabove = "1 XRT"\nby_client = true\n')
+    assert words in invoke("mcp", "policy", "explain", policy).stdout
+    policy.write_text(POLICY + '\n[consent]\nabove = "1 XRT"\nby_client = "yes"\n')
+    assert "by_client is true or false" in invoke("mcp", "policy", "check", policy).stderr
