@@ -115,7 +115,7 @@ def test_lock_files_name_no_registry() -> None:
     assert len(locks) == 7
     for lock in locks:
         assert '"resolved"' not in lock.read_text(), lock
-        assert not any(line.startswith(("-", "http")) for line in lock.read_text().splitlines()), lock
+        assert not any(line.startswith(("-", "http:", "https:")) for line in lock.read_text().splitlines()), lock
 
 
 @pytest.mark.parametrize("manifest", ["chain", "ipfs"])

@@ -79,12 +79,14 @@ async def test_a_board_stops_and_its_recording_says_that_it_was_told(place: Plac
 
 async def test_commands_that_wait_for_the_board_are_not_sent_after_a_stop(place: Place) -> None:
     robot = offering(place.agent("robot"))
-    device, failed = Device(robot, patience=LONG), []
+    device, failed, waits = Device(robot, patience=LONG), [], asyncio.Event()
 
     @robot.on("/work")
     async def work(job: Job, message: object) -> None:
         job.publish("/slow", 5000)
+        await until(lambda: uno.changes(11), what="the slow call", seconds=LONG)
         job.publish("/move", None)
+        waits.set()
         try:
             await device.call("/move")
         except CallFailed as error:
@@ -96,7 +98,8 @@ async def test_commands_that_wait_for_the_board_are_not_sent_after_a_stop(place:
         async with place.at_work(robot) as person:
             await device.call("/reason")
             contract = await person.demand(source, cost=1)
-            await until(lambda: bool(robot.runtime.executor.runs), what="the job", seconds=LONG)
+            async with asyncio.timeout(LONG):
+                await waits.wait()
             await asyncio.sleep(0.3)  # the calls are on their way; /slow takes longer
             await contract.stop("no")
             assert (await contract.outcome()).code == "stopped"

@@ -1,5 +1,5 @@
 // Moves (pin 13 high) from /move until /stop, which keeps the reason; /reason answers it. /home moves for a moment (pin 12),
-// /slow does nothing else for its milliseconds.
+// /slow does nothing else for its milliseconds, with pin 11 high.
 #include <AiraFrames.h>
 
 #ifndef BAUD
@@ -35,11 +35,16 @@ void home(aira::Call &call) {
   digitalWrite(12, LOW);
 }
 
-void slow(aira::Call &call) { mesh.wait(call.arguments.integer()); }
+void slow(aira::Call &call) {
+  digitalWrite(11, HIGH);
+  mesh.wait(call.arguments.integer());
+  digitalWrite(11, LOW);
+}
 
 void reason(aira::Call &call) { call.answer.text(why); }
 
 void setup() {
+  pinMode(11, OUTPUT);
   pinMode(12, OUTPUT);
   pinMode(13, OUTPUT);
   Serial.begin(BAUD);
