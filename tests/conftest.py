@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gc
+import os
+import shutil
+import tempfile
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
@@ -27,6 +30,18 @@ ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
 
 MEASURED: Final = ("tests/schemas/", "tests/mesh/")
 """Whose tests measure coverage: those of the packages that have a bar for it."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Give the run a temporary folder of its own: what Chromium and ROS leave behind there goes with it."""
+    if hasattr(config, "workerinput"):
+        return
+    before, here = tempfile.gettempdir(), tempfile.mkdtemp(prefix="aira-")
+    # That of `tmp_path` stays where it was: the paths of sockets must be short.
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", before)
+    os.environ["TMPDIR"] = tempfile.tempdir = here
+    config.add_cleanup(lambda: shutil.rmtree(here, ignore_errors=True))
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
