@@ -346,7 +346,7 @@ class Daemon:
 
     async def add(self, path: Path, *, timeout: float = CALL_TIMEOUT) -> str:
         """Add and pin a file with `ADD_OPTIONS`; returns the daemon's CID. Raises `OSError` when it can't be read."""
-        with path.open("rb") as stream:  # noqa: ASYNC230 - opened in a thread it is lost when this is cancelled
+        with path.open("rb") as stream:
             form = aiohttp.FormData()
             form.add_field("file", stream, filename=path.name, content_type="application/octet-stream")
             added = await self._call(
