@@ -52,6 +52,7 @@ from mesh.errors import AiraError, ChainError, public_text
 from mesh.network import call
 from mesh.recording import NotARecording
 from mesh.role.local_stop import control_here, stop_folder
+from mesh.signer.client import SignerClient
 from mesh.watching.presence import LogReader
 from schemas import parse_address, parse_cid
 from schemas.decoding import InvalidData, decode_json
@@ -171,6 +172,12 @@ class RobotStop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     why: str = ""
 
 
+class ConsentAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Whether an operator allows an order that a program asks for."""
+
+    allow: bool
+
+
 class Api(Lifecycle):
     """The handlers of the interface, and what they show: the market, files, the stream."""
 
@@ -247,6 +254,8 @@ class Api(Lifecycle):
             post("/api/v1/agents/{address}/stop", self.stop_robot),
             post("/api/v1/agents/{address}/release", self.release_robot),
             post("/api/v1/agents/{address}/{action}", self.drive),
+            get("/api/v1/consents", self.consents),
+            post("/api/v1/consents/{id}", self.answer_consent),
             get("/api/v1/lighthouse", self.lighthouse),
             get("/api/v1/stream", self.open_stream),
             post("/rpc", self.rpc),
@@ -299,6 +308,7 @@ class Api(Lifecycle):
             "providers": sorted(await self._market.providers()),
             "limits": {"upload": self.files.upload_limit, "orders": PER_SIGNER, "lifetime": settings.deadline_limit},
             "robot": self._options.robot,
+            "asksForConsent": bool(self._options.signer),
             "explorer": self._options.explorer,
             "version": mesh.__version__,
             "stream": self.stream.id,
@@ -388,6 +398,23 @@ class Api(Lifecycle):
 
     async def stop(self, request: web.Request) -> web.Response:
         return answer(await self._stops.send(StopRequest.decode(await request.read())))
+
+    async def consents(self, request: web.Request) -> web.Response:
+        async with self._signer(request) as signer:
+            return answer({"consents": await signer.consents()})
+
+    async def answer_consent(self, request: web.Request) -> web.Response:
+        allow = (await body_of(request, ConsentAnswer)).allow
+        async with self._signer(request) as signer:
+            answered = await (signer.approve if allow else signer.deny)(request.match_info["id"])
+        return answer({"job": answered.job_id, "state": answered.state})
+
+    def _signer(self, request: web.Request) -> SignerClient:
+        """The signer of the page's owner, for people who logged in as operators. Raises `WebError`."""
+        if not self._options.signer:
+            raise WebError("this server knows no signer", hint="start it with --signer", code="page-not-found")
+        self._logins.require_operator_login(request, "allow orders of programs")
+        return SignerClient(Path(self._options.signer))
 
     async def model(self, request: web.Request) -> web.Response:
         return answer(await self.files.model(cid_in(request)))

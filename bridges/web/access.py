@@ -161,6 +161,8 @@ class WebOptions(ServerOptions):
     """Origins that may show the page in a frame."""
     robot: dict[str, Any] | None = None
     """The one robot that the page orders from: see Robot in openapi.json."""
+    signer: str = ""
+    """The `owner.sock` of a signer: operators who logged in allow or deny what programs order there."""
     explorer: str = ""
     from_block: int = 0
     static: Path = STATIC
@@ -171,6 +173,13 @@ class WebOptions(ServerOptions):
             raise ConfigurationError(
                 "members of a roster log in by TLS",
                 hint="with --roster give --certificate, --key and --tls-ca",
+                code="web-not-protected",
+            )
+        if self.signer and not (self.operator_token or self.roster):
+            # On this machine everybody is an operator without a login: the programs that ask, too.
+            raise ConfigurationError(
+                "people who allow orders of programs must log in as operators",
+                hint="with --signer give --operator-token-file",
                 code="web-not-protected",
             )
         if not (self.certificate and self.key and self.has_login):
@@ -257,6 +266,12 @@ class Logins:
         """Raise `WebError` for who may not do `what`."""
         if self.role_of(request) != "operator":
             raise WebError(f"only operators {what}", hint="log in as an operator", code="operators-only")
+
+    def require_operator_login(self, request: web.Request, what: str) -> None:
+        """The same, also where all are operators without a login."""
+        login = self.login_of(request)
+        if login is None or login.role != "operator":
+            raise WebError(f"only operators who logged in {what}", hint="log in as an operator", code="operators-only")
 
     def login_of(self, request: web.Request) -> Login | None:
         """Whose request it is; None without a login."""

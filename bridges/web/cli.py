@@ -47,6 +47,7 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 )
 @click.option("--token-file", type=FILE, help="file with the token that people log in with")
 @click.option("--operator-token-file", type=FILE, help="file with the token that operators log in with")
+@click.option("--signer", type=FILE, help="owner.sock of a signer: operators allow its programs' orders on the page")
 @click.option("--embed", multiple=True, metavar="ORIGIN", help="site that may show the page in a frame")
 @click.option("--explorer", default="", metavar="URL", help="block explorer to link to [the chain's]")
 @click.option("--from-block", type=click.IntRange(min=0), default=0, help="first block whose contracts are listed")
@@ -124,6 +125,7 @@ def web_options(settings: Settings, options: dict[str, Any]) -> WebOptions:
         proxies=options["proxies"],
         embed=options["embed"],
         robot=robot_of(options),
+        signer=str(options["signer"] or ""),
         explorer=options["explorer"] or settings.profile.explorer,
         from_block=options["from_block"],
     )

@@ -79,6 +79,21 @@ export const texts = {
   tokenHint: "It is in the token file of the server.",
   logIn: "Log in",
 
+  // Orders of programs
+  consents: "Programs ask you",
+  consentsHint: "A program wants to order this for you, and your policy asks for your yes. It counts for this order, once.",
+  noConsents: "No order waits for your yes.",
+  consentLogin: "Only operators can see and allow them. Log in as one",
+  consentCost: "Costs at most",
+  consentWhy: "Why you are asked",
+  consentNote: "What the program says",
+  consentUntil: "Answer until",
+  consentAllow: "Allow once",
+  consentDeny: "Deny",
+  consentGiven: "Allowed. It is ordered now.",
+  consentDenied: "Denied. Nothing was signed.",
+  moreMessages: (count: number) => `and ${plural(count, "message")} more`,
+
   // Robots
   homeTitle: "What should be done?",
   search: "Search robots",

@@ -34,9 +34,24 @@ export interface Market {
   connected: { router: boolean; chain: boolean };
   limits: { upload: number; orders: number; lifetime: number };
   robot: Robot | null;
+  /** Whether operators who logged in allow orders of programs here. */
+  asksForConsent: boolean;
   explorer: string;
   version: string;
   stream: string;
+}
+
+/** An order of a program that waits for a person's yes. */
+export interface Consent {
+  id: string;
+  model: string;
+  robot: string;
+  cost: { text: string };
+  messages: { text: string }[];
+  more: number;
+  why: string;
+  note: { text: string };
+  expires: string;
 }
 
 export interface JobRecord {
