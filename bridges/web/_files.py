@@ -7,8 +7,6 @@ block: they run in a thread.
 from __future__ import annotations
 
 import asyncio
-import base64
-import json
 import math
 import tempfile
 from collections import Counter
@@ -18,11 +16,19 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
-
 from bridges.web.access import WebError
 from mesh.errors import ContentError
-from mesh.recording import GENEROUS, Limits, messages_in, numbers_of, open_objective, pack, preflight
+from mesh.recording import (
+    GENEROUS,
+    Limits,
+    described_line,
+    messages_in,
+    numbers_of,
+    open_objective,
+    pack,
+    preflight,
+    shown_value,
+)
 from mesh.role.models import description_in
 from schemas import parse_cid
 from schemas.decoding import decode_json
@@ -40,8 +46,6 @@ if TYPE_CHECKING:
 MOST_MESSAGES: Final = 500
 """Messages in one answer."""
 MOST_POINTS: Final = 4000
-LONGEST_VALUE: Final = 4096
-"""Bytes of a message's JSON that are returned."""
 MOST_NUMBERS: Final = 1_000_000
 """Messages of a topic that are read for a plot."""
 _MAGIC: Final = (
@@ -137,17 +141,6 @@ def _of_topic(recording: Objective, topic: str, first: int) -> Iterator[tuple[in
     """The messages from a number on, those of a topic or all."""
     numbered = enumerate(recording.messages(from_index=first), first)
     return ((number, message) for number, message in numbered if not topic or message.topic == topic)
-
-
-def shown_value(message: Played) -> tuple[Any, bool]:
-    """A message's value for JSON, at most `LONGEST_VALUE` bytes of it, and whether it was cut. Bytes are in base 64."""
-    value, is_cut = message.value, False
-    if isinstance(value, bytes):
-        is_cut = len(value) > LONGEST_VALUE
-        value = base64.b64encode(value[:LONGEST_VALUE]).decode()
-    elif len(encoded := msgspec.json.encode(value)) > LONGEST_VALUE:
-        value, is_cut = encoded[:LONGEST_VALUE].decode(errors="ignore"), True
-    return value, is_cut
 
 
 def _facts(message: Played, number: int, start_ns: int, cid: str) -> dict[str, Any]:
@@ -313,7 +306,9 @@ class Files:
         if len(values) > MOST_LINES:
             raise WebError(f"a form has at most {MOST_LINES} messages")
         described, _ = await asyncio.to_thread(_described, await self.fetch(model))
-        lines = [_line(value, described) for value in values]
+        lines = [
+            described_line(str(one.get("topic")), one.get("value"), described, time=one.get("at", 0)) for one in values
+        ]
         with tempfile.TemporaryDirectory(prefix="aira-form-") as folder:
             path = Path(folder) / "objective.mcap"
             await self.in_thread(lambda: pack(messages_in(lines), path))
@@ -355,17 +350,3 @@ def _described(path: Path) -> tuple[ModelDescription | None, str | None]:
     with path.open("rb") as file:
         # Characters of a model without a description.
         return None, file.read(MAX_MODEL_SIZE).decode(errors="replace")[:20_000]
-
-
-def _line(value: dict[str, Any], model: ModelDescription | None) -> bytes:
-    """A value of a form as a line of `mesh.recording._converting`."""
-    line = {"topic": value.get("topic"), "time": value.get("at", 0), "value": value.get("value")}
-    described = model.topic(str(line["topic"])) if model else None
-    encoding = described.encoding if described else ""
-    if encoding in ("ros1;std_msgs/Empty", "ros1;std_msgs/String"):
-        line["type"] = encoding.partition(";")[2]
-    elif encoding.startswith("application/json"):
-        line["type"] = "json" + encoding.removeprefix("application/json")
-    elif encoding:
-        line["type"] = encoding
-    return json.dumps(line).encode()

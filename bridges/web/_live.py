@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from bridges.web._files import picture_in, shown_value
+from bridges.web._files import picture_in
 from mesh.base.background import Background
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.errors import AiraError
 from mesh.network import Pump
-from mesh.recording import Played, numbers_of
+from mesh.recording import Played, numbers_of, shown_value
 from schemas import parse_address, parse_key
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, ReadingKey, job_selector, reading_selector
 from schemas.payloads import payload_type

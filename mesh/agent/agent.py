@@ -90,7 +90,7 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import Job, TopicHandlers
     from mesh.agent.orders import Terms
     from mesh.agent.statement import Statement
-    from mesh.agent.trade import Order
+    from mesh.agent.trade import OnSigned, Order
     from mesh.agent.validators import AnnouncedValidator
     from mesh.base.retry import RetryPolicy
     from mesh.chain import Account, Chain
@@ -541,6 +541,7 @@ class Agent(Program):
         max_cost: int | str | None = None,
         retry: int = 0,
         start_within: float | None = None,
+        on_signed: OnSigned | None = None,
     ) -> Order:
         """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
 
@@ -562,6 +563,9 @@ class Agent(Program):
         robot that does not begin within `start_within` seconds after the contract is told to stop, and has failed. The
         contract of the order stands for all attempts. It ends with this agent: a restarted one orders nothing again.
 
+        `on_signed` is awaited with the signed demand before that is posted, unless the robot is chosen by its quote:
+        a program that was killed knows by it whether its order was posted.
+
         Raises `InputError`, `InsufficientTokens`, `ObjectiveUnfit` if a file is not playable, or
         if the model's description is available and excludes the objective, `UnsafeValidator` and its like for a
         validator that can't be named, and `ValidatorSilent` if its fee is not known because nobody answers.
@@ -578,7 +582,14 @@ class Agent(Program):
             others |= {"lifetime": lifetime, "attempts": attempts}
             return await self._order_by_quote(cid, **chosen, robot=robot, **others)
         return await self._order(
-            cid, cost=cost, model=model, lifetime=lifetime, robot=robot, attempts=attempts, **others
+            cid,
+            cost=cost,
+            model=model,
+            lifetime=lifetime,
+            robot=robot,
+            attempts=attempts,
+            on_signed=on_signed,
+            **others,
         )
 
     async def _order(
@@ -593,6 +604,7 @@ class Agent(Program):
         lifetime: int | None,
         robot: str,
         attempts: Attempts | None,
+        on_signed: OnSigned | None = None,
     ) -> Order:
         """Demand a job at a price, of any robot or of one that was named."""
         writer = self.runtime.trader.writer
@@ -604,7 +616,9 @@ class Agent(Program):
         named = ""
         if robot:
             named = await robot_address(self.network.session, self.channel, robot, model=terms["model"])
-        return await self.runtime.trader.post(Demand, terms, robot=named, attempts=attempts, validator_fee=fee)
+        return await self.runtime.trader.post(
+            Demand, terms, robot=named, attempts=attempts, on_signed=on_signed, validator_fee=fee
+        )
 
     async def demand(
         self,

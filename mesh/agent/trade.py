@@ -14,7 +14,7 @@ import time
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.agent.contracts import (
     Attempt,
@@ -68,6 +68,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+OnSigned: TypeAlias = "Callable[[Demand | Offer], Awaitable[object]]"
 PER_AGENT: Final = Rate(per_second=1.0, burst=32)
 """Declines by one agent that are looked at: it may decline many demands."""
 HEARD: Final = Rate(per_second=20.0, burst=200)
@@ -314,13 +315,15 @@ class Trader(Lifecycle):
         *,
         robot: str = "",
         attempts: JobAttempts | None = None,
+        on_signed: OnSigned | None = None,
         **fee: Any,
     ) -> Order:
         """Sign an order, which perhaps answers a demand, ensure its allowance, and post it. Cancelling withdraws it.
 
         A demand for one `robot` (address) alone is posted once that has agreed; raises `DemandDeclined`, `RemoteError`.
 
-        `attempts` are what follows when the contract of a demand fails.
+        `attempts` are what follows when the contract of a demand fails. `on_signed` is awaited with the signed order
+        before anybody else gets that.
 
         Raises `InsufficientTokens`, and for an offer that answers a demand `TooManyOffers`, the error of a demand that
         is taken, and `Declined` while a demand with equal terms is open that the agent has declined, or the agent has
@@ -332,6 +335,8 @@ class Trader(Lifecycle):
             order.attempts, order.created = attempts, asyncio.get_running_loop().create_future()
         if isinstance(order.signed, Demand) and robot:
             await self.hiring.agree(order.signed, robot)
+        if on_signed is not None:
+            await on_signed(order.signed)
         if kind is Offer and (asked := ALONE.get()) is not None:
             if equal_terms(order.signed) != equal_terms(asked.demand.message):
                 raise Declined("other-terms", f"it asks for other terms: a cost of {order.signed.cost}")

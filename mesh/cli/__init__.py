@@ -35,6 +35,7 @@ COMMANDS: Final = {
     "router": ("mesh.cli.router:command", "run a Zenoh router for the mesh"),
     "rpc": ("mesh.cli.rpc:command", "call a service of an agent"),
     "settings": ("mesh.cli.settings:command", "show the effective settings"),
+    "signer": ("mesh.cli.signer:command", "order for programs what a policy allows; it has the key"),
     "state": ("mesh.cli.state:command", "show, back up and restore the state of agents"),
     "statement": ("mesh.cli.statement:statement", "show what an account has earned and spent, by contract and month"),
     "status": ("mesh.cli.status:status", "show the status of agents, providers and bridges"),

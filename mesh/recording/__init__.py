@@ -6,6 +6,7 @@ from mesh.recording._converting import (
     PackSummary,
     RecordingFormat,
     convert,
+    described_line,
     messages_in,
     pack,
     pack_values,
@@ -45,6 +46,7 @@ from mesh.recording.objective import (
     open_objective,
     preflight,
     rates_of,
+    shown_value,
 )
 from mesh.recording.playback import (
     AtOnce,

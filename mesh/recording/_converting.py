@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from mesh.content import Progress
     from mesh.recording._source import RecordedMessage, RecordingChannel, RecordingSource
     from mesh.recording.ros import RosConversion
+    from schemas.model import ModelDescription
 
     OnRecord: TypeAlias = Callable[[RecordingChannel, RosConversion, RecordedMessage], None]
     FormatWriter: TypeAlias = Callable[
@@ -92,6 +93,20 @@ def messages_in(lines: Iterable[bytes]) -> Iterator[Played]:
             hint = 'a line is like {"topic": "/blink", "time": 0.5, "value": "blue"}'
             raise InputError(f"line {number}: {error}", hint=hint, code="invalid-line") from None
         yield Played(topic, payload, moment, moment, 0, kind)
+
+
+def described_line(topic: str, value: Any, model: ModelDescription | None, *, time: float | Decimal | int = 0) -> bytes:
+    """A value as a line for `messages_in`, of the type that the model's description says."""
+    described = model.topic(topic) if model else None
+    encoding = described.encoding if described else ""
+    line: dict[str, Any] = {"topic": topic, "time": time, "value": value}
+    if encoding in (EMPTY.zenoh_encoding, STRING.zenoh_encoding):
+        line["type"] = encoding.partition(";")[2]
+    elif encoding.startswith("application/json"):
+        line["type"] = "json" + encoding.removeprefix("application/json")
+    elif encoding:
+        line["type"] = encoding
+    return msgspec.json.encode(line)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import stat
 from collections import Counter
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
 from msgspec import Struct
 
 from mesh.errors import InvalidKey
@@ -194,6 +196,21 @@ def _played(channel: RecordingChannel, payload: bytes, log_time: int, publish_ti
 
 LONGEST_LIST: Final = 12
 """Members of a list whose numbers are read."""
+
+
+LONGEST_SHOWN: Final = 4096
+"""Bytes of a message's JSON that are shown."""
+
+
+def shown_value(message: Played) -> tuple[Any, bool]:
+    """A message's value for JSON, at most `LONGEST_SHOWN` bytes of it, and whether it was cut. Bytes are in base 64."""
+    value, is_cut = message.value, False
+    if isinstance(value, bytes):
+        is_cut = len(value) > LONGEST_SHOWN
+        value = base64.b64encode(value[:LONGEST_SHOWN]).decode()
+    elif len(encoded := msgspec.json.encode(value)) > LONGEST_SHOWN:
+        value, is_cut = encoded[:LONGEST_SHOWN].decode(errors="ignore"), True
+    return value, is_cut
 
 
 def numbers_of(message: Played) -> Iterator[tuple[str, float]]:

@@ -1,0 +1,243 @@
+"""The log of a signer: what programs asked for, what was allowed and refused, what people said, and what came of it.
+
+Each entry is a line of JSON with a number, the hash of the entry before and the account's signature. The database has
+the last entry and the number of the first one that is kept, so an entry that was changed, removed, added, or cut off at
+either end is found. An entry is in the database before it is in the file: one that a crash keeps from the file is
+written when the log is opened again.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from datetime import UTC, datetime
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
+
+from mesh.base.private_files import make_private_folder, open_private, sync_directory, sync_file
+from schemas.address import keccak256
+from schemas.decoding import InvalidData, decode_json
+from schemas.errors import AiraError, InputError
+from schemas.signing import recover
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from mesh.signer.budget import Budget
+    from schemas import Signer
+
+FILE_BYTES: Final = 4 << 20
+"""Bytes after which another file is begun."""
+FILES: Final = 16
+"""Files that are kept: the oldest goes when there is one more."""
+FIRST: Final = "0" * 64
+"""What stands for the hash of the entry before the first one."""
+_NAME: Final = re.compile(r"log-(\d{12})\.jsonl")
+_LONGEST_LINE: Final = 1 << 16
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """An entry: `time` is Unix time, `previous` the hash of the entry before. The `signature` is over `hash`."""
+
+    number: int
+    time: float
+    event: str
+    facts: dict[str, Any]
+    previous: str
+    signature: str = ""
+
+    @property
+    def digest(self) -> bytes:
+        """What is signed: the hash of all but the signature."""
+        return keccak256(b"aira log\0" + msgspec.json.encode(msgspec.structs.replace(self, signature="")))
+
+    @property
+    def hash(self) -> str:
+        """The digest, 64 hexadecimal digits."""
+        return self.digest.hex()
+
+
+class Head(NamedTuple):
+    """Where a log begins and ends: the number of the first entry that is kept, and the hash of the one before it; the
+    number of the last one, its hash, and its line."""
+
+    first: int = 1
+    before: str = FIRST
+    last: int = 0
+    hash: str = FIRST
+    line: str = ""
+
+
+class LogUnusable(AiraError, code="log-unusable"):
+    """The log can't be written, or is not the one that the database says. Nothing is ordered without it."""
+
+
+class SignerLog:
+    """The log in a folder, signed by an account. `budget` is the open database that has its head."""
+
+    def __init__(
+        self,
+        folder: Path,
+        signer: Signer,
+        budget: Budget,
+        *,
+        file_bytes: int = FILE_BYTES,
+        files: int = FILES,
+    ) -> None:
+        self.folder = folder
+        self._signer = signer
+        self._budget = budget
+        self._file_bytes = file_bytes
+        self._files = files
+
+    def open(self) -> None:
+        """Write the last entry to its file if a crash kept it from that. Raises `LogUnusable`, `OSError`."""
+        make_private_folder(self.folder)
+        head = self._budget.log_head()
+        if not head.last:
+            return
+        path = self._paths()[-1] if self._paths() else self._path_of(head.last)
+        data = path.read_bytes() if path.exists() else b""
+        whole, torn = data.rpartition(b"\n")[0], data.rpartition(b"\n")[2]
+        last = whole.rpartition(b"\n")[2].decode(errors="replace")
+        if last == head.line and not torn:
+            return
+        number = _number_in(last)
+        if (number == head.last - 1 or (not whole and head.last == head.first)) and head.line.encode().startswith(torn):
+            with open(path, "wb" if not whole else "r+b", opener=open_private) as file:
+                file.truncate(len(data) - len(torn))
+                file.seek(0, os.SEEK_END)
+                file.write(head.line.encode() + b"\n")
+            sync_file(path)
+            sync_directory(self.folder)
+            return
+        raise LogUnusable(
+            f"the signer's log was changed: entry {head.last} is not the last one",
+            hint="`aira mcp log --verify` says where; keep the folder for inquiry, and begin with another --data-dir",
+        )
+
+    def add(self, event: str, **facts: Any) -> Entry:
+        """Add an entry. It survives a crash of the program at once, and one of the machine after `Budget.sync`.
+
+        Raises `OSError`, `sqlite3.Error`.
+        """
+        head = self._budget.log_head()
+        entry = Entry(number=head.last + 1, time=self._budget.now(), event=event, facts=facts, previous=head.hash)
+        entry = msgspec.structs.replace(entry, signature=self._signer.sign_hash(entry.digest).hex())
+        line = msgspec.json.encode(entry)
+        if len(line) > _LONGEST_LINE:
+            raise InputError(f"an entry of the log has {len(line)} bytes", code="too-large")
+        path, first, before = self._place(head)
+        self._budget.keep_log_head(Head(first, before, entry.number, entry.hash, line.decode()))
+        with open(path, "ab", opener=open_private) as file:
+            file.write(line + b"\n")
+        return entry
+
+    def entries(self, first: int | None = None, limit: int = 100) -> list[Entry]:
+        """Up to `limit` entries from a number on, or the latest. Blocks on the disk. Raises `LogUnusable`."""
+        head = self._budget.log_head()
+        start = max(head.first, head.last - limit + 1 if first is None else first)
+        found: list[Entry] = []
+        paths = self._paths()
+        for path, following in zip(paths, [*paths[1:], None], strict=True):
+            if following is not None and _first_of(following) <= start:
+                continue
+            for line in _lines(path):
+                entry = _decoded(line)
+                if entry is None:
+                    raise LogUnusable("the signer's log was changed", hint="`aira mcp log --verify` says where")
+                if entry.number >= start:
+                    found.append(entry)
+                if len(found) == limit:
+                    return found
+        return found
+
+    def _place(self, head: Head) -> tuple[Path, int, str]:
+        """The file of the next entry; and the first entry that is kept, and the hash before it."""
+        paths = self._paths()
+        if paths and paths[-1].stat().st_size < self._file_bytes:
+            return paths[-1], head.first, head.before
+        path = self._path_of(head.last + 1)
+        first, before = head.first, head.before
+        for old, following in pairwise(paths):
+            if len(paths) < self._files:
+                break
+            if (entry := next((_decoded(line) for line in _lines(following)), None)) is not None:
+                first, before = entry.number, entry.previous
+            self._budget.keep_log_head(Head(first, before, head.last, head.hash, head.line))
+            old.unlink()
+            break
+        return path, first, before
+
+    def _paths(self) -> list[Path]:
+        return log_files(self.folder)
+
+    def _path_of(self, number: int) -> Path:
+        return self.folder / f"log-{number:012d}.jsonl"
+
+
+def log_files(folder: Path) -> list[Path]:
+    """The files of a log, the oldest first."""
+    return sorted(path for path in folder.iterdir() if _NAME.fullmatch(path.name)) if folder.is_dir() else []
+
+
+def verify_log(folder: Path, signer: str, head: Head, *, on_entry: Callable[[Entry], object] = lambda _: None) -> str:
+    """What is wrong with the log of an account (address) whose head is known; an empty text if nothing is.
+
+    Blocks on the disk, and takes about a tenth of a millisecond an entry.
+    """
+    number, previous = head.first, head.before
+    for path in log_files(folder):
+        for line in _lines(path):
+            entry = _decoded(line)
+            if entry is None:
+                return f"entry {number} is unreadable ({path.name})"
+            if entry.number != number:
+                return f"entry {number} is missing: entry {entry.number} follows {number - 1}"
+            if entry.previous != previous:
+                return f"entry {number} does not follow entry {number - 1}: one of them was changed"
+            try:
+                by = recover(entry.digest, bytes.fromhex(entry.signature))
+            except (AiraError, ValueError):
+                by = ""
+            if by != signer:
+                return f"entry {number} was changed: it is not signed by {signer}"
+            on_entry(entry)
+            number, previous = number + 1, entry.hash
+    if number - 1 != head.last:
+        return f"the log ends with entry {number - 1}, and entry {head.last} was the last one"
+    return "" if previous == head.hash else f"entry {head.last} is another one than the database says"
+
+
+def time_text(unix: float) -> str:
+    """A time as ISO 8601 in UTC."""
+    return datetime.fromtimestamp(unix, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while line := file.readline(_LONGEST_LINE + 2):
+            yield line.removesuffix(b"\n")
+
+
+def _decoded(line: bytes) -> Entry | None:
+    """The entry in a line; None for what is none, or written in another way than it is."""
+    try:
+        entry = decode_json(line, Entry)
+    except InvalidData:
+        return None
+    return entry if msgspec.json.encode(entry) == line else None
+
+
+def _number_in(line: str) -> int:
+    entry = _decoded(line.encode()) if line else None
+    return 0 if entry is None else entry.number
+
+
+def _first_of(path: Path) -> int:
+    found = _NAME.fullmatch(path.name)
+    assert found is not None
+    return int(found[1])
