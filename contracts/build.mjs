@@ -30,6 +30,7 @@ const wanted = {
     PhantomToken: tests,
     LyingToken: tests,
     CallingToken: tests,
+    DollarToken: tests,
   },
   "fixtures/Crowd.sol": { Crowd: tests },
   "fixtures/Validators.sol": { OneSigner: tests, BrokenValidator: tests },

@@ -1,8 +1,8 @@
 """Amounts of tokens as people write them, in commands and in programs.
 
 One rule: a number alone counts whole tokens (`1.5` is one and a half XRT, as is `1.5 XRT`); a number that ends in `wn`
-(XRT, 10^-9), `wei` (ETH, 10^-18) or `units` (any token) counts the smallest unit. In JSON amounts are text, in the
-smallest unit.
+(XRT, 10^-9), `wei` (ETH, 10^-18) or `units` (any token) counts the smallest unit. Where any token pays, the amount may
+name it: `3.50 USDC`, or by its address, `3.50 0x…`. In JSON amounts are text, in the smallest unit.
 """
 
 from __future__ import annotations
@@ -19,14 +19,29 @@ AMOUNT: Final = re.compile(
     r"(?P<whole>[0-9][0-9_]*|(?=\.[0-9]))(?:\.(?P<part>[0-9]+))?\s*(?P<ending>[A-Za-z]*)", re.ASCII
 )
 
+TOKEN_AMOUNT: Final = re.compile(
+    r"(?P<number>(?:[0-9][0-9_]*|(?=\.[0-9]))(?:\.[0-9]+)?)(?:\s*(?P<name>[A-Za-z][A-Za-z0-9._-]*)"
+    r"|\s+(?P<address>0[xX][0-9A-Fa-f]{40}))?",
+    re.ASCII,
+)
+"""An amount that may name its token."""
+
 
 class InvalidAmount(InputError, code="invalid-amount"):
     """A text is not an amount of the token."""
 
 
+def split_amount(text: str) -> tuple[str, str]:
+    """The number in an amount, and the name of its token; empty if it names none. Raises `InvalidAmount`."""
+    found = TOKEN_AMOUNT.fullmatch(text.strip())
+    if found is None:
+        raise InvalidAmount(f"{text[:40]!r} is not an amount", hint="write it like 1.5, 1.5 XRT or 3.50 USDC")
+    return found["number"], found["name"] or found["address"] or ""
+
+
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A token's symbol, its decimals, and the name of its smallest unit."""
+    """What a token is called for people, its decimals, and the name of its smallest unit."""
 
     symbol: str
     decimals: int

@@ -66,6 +66,11 @@ def parse_address(text: str) -> str:
     return checksum
 
 
+def shortened(address: str) -> str:
+    """An address shortened to its ends."""
+    return f"{address[:6]}…{address[-4:]}"
+
+
 @lru_cache(maxsize=_CACHED)
 def address_bytes(text: str) -> bytes:
     """The 20 bytes of an address text. Raises `InvalidAddress`, also for an ENS name."""

@@ -25,6 +25,7 @@ from schemas.decoding import InvalidData, decode_json, without_mark
 from schemas.errors import InputError, InvalidKey
 from schemas.keys import topic_chunks
 from schemas.payloads import EMPTY, RAW, STRING, Empty, String
+from schemas.records import LONGEST_PRICE
 from schemas.unixfs import cid_of_bytes
 
 if TYPE_CHECKING:
@@ -278,7 +279,7 @@ FORMAT: Final = "aira-model/1"
 MAX_MODEL_SIZE: Final = 65_536
 """Bytes of the longest description."""
 MAX_TOPICS: Final = 64
-PRICE: Final = r"[0-9]{1,30}(\.[0-9]{1,18})? (XRT|wn|units)"
+PRICE: Final = r"[0-9]{1,30}(\.[0-9]{1,18})? ([A-Za-z][A-Za-z0-9.]{0,15}|0x[0-9a-fA-F]{40})"
 _YEAR: Final = 31_536_000
 
 Seconds: TypeAlias = Annotated[int, Meta(gt=0, le=_YEAR)] | Annotated[float, Meta(gt=0, le=_YEAR)]
@@ -365,7 +366,8 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
 
     `objective` are the topics that an objective plays, and no others, unless `other_topics`. `result` are those of the
     recording that comes back; a success has at least one message on each required one, and is what `success` says.
-    `price` is typical (`5 XRT`; `units` is the smallest unit of another token), as are the `seconds` that a job takes.
+    `price` is typical, as are the `seconds` that a job takes. It names its token by a symbol that is known on the chain
+    (`5 XRT`, `3.50 USDC`), or by the address (`3.50 0x…`); `units` is the smallest unit of the token that pays there.
     `on_stop` says what becomes of the cost when the customer stops a job that has begun: it comes back (`refund`), or
     the robot keeps it (`paid`).
     """
@@ -376,7 +378,7 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
     other_topics: bool = False
     result: Annotated[tuple[ModelTopic, ...], Meta(max_length=MAX_TOPICS)] = ()
     success: Prose = ""
-    price: Annotated[str, Meta(max_length=60, extra_json_schema={"pattern": f"^{PRICE}$"})] = ""
+    price: Annotated[str, Meta(max_length=LONGEST_PRICE, extra_json_schema={"pattern": f"^{PRICE}$"})] = ""
     seconds: Seconds | None = None
     on_stop: Literal["refund", "paid"] = "refund"
     limits: ModelLimits | None = None
@@ -387,7 +389,7 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
         for text in (self.description, self.success):
             require_plain_text(text, lines=True)
         if self.price and not re.fullmatch(PRICE, self.price):
-            raise ValueError("a price is like `5 XRT`, `100 wn` or `3 units`")
+            raise ValueError("a price is like `5 XRT`, `3.50 USDC` or `3 units`")
         for topics in (self.objective, self.result):
             if len({topic.topic for topic in topics}) != len(topics):
                 raise ValueError("a topic is described twice")

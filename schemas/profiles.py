@@ -11,7 +11,7 @@ from schemas.address import parse_address
 from schemas.cid import is_cid
 from schemas.errors import InvalidAddress, InvalidRecord
 from schemas.model import PRICE, require_plain_text
-from schemas.records import Record
+from schemas.records import LONGEST_PRICE, Record
 from schemas.signing import SignedRecord
 
 ProfileState: TypeAlias = Literal["idle", "working", "stopped", "closed"]
@@ -42,10 +42,10 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
 
     `agent` is the EIP-55 address of its account, `model` a CIDv0 or empty. `name`, `about` and `place` are plain text
     that the owner chose: two robots may have one name. `picture` is the CID of an image, `price` what a job usually
-    costs (`5 XRT`); both may be empty. `queue` jobs wait, and a new one would begin in about `wait` seconds. `stopped`
-    says that somebody stopped the robot, `closed` that it takes no jobs now. `readings` are the latest ones that the
-    robot has published outside of jobs, as plain text by their topics. `time` is the robot's time of day in Unix
-    seconds. Trust it only if it `is_signed`, and is on the agent's key.
+    costs, as in a description of a model; both may be empty. `queue` jobs wait, and a new one would begin in about
+    `wait` seconds. `stopped` says that somebody stopped the robot, `closed` that it takes no jobs now. `readings` are
+    the latest ones that the robot has published outside of jobs, as plain text by their topics. `time` is the robot's
+    time of day in Unix seconds. Trust it only if it `is_signed`, and is on the agent's key.
     """
 
     domain: ClassVar = b"aira profile\0"
@@ -57,7 +57,7 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
     about: Annotated[str, Meta(max_length=LONGEST_ABOUT)] = ""
     picture: str = ""
     place: _Name = ""
-    price: Annotated[str, Meta(max_length=60)] = ""
+    price: Annotated[str, Meta(max_length=LONGEST_PRICE)] = ""
     state: ProfileState = "idle"
     queue: _Waiting = 0
     wait: _Waiting = 0

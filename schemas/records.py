@@ -62,6 +62,10 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return record
 
 
+LONGEST_PRICE: Final = 100
+"""Characters of a price."""
+
+
 class ControlRobot(Record, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
     """What the owner of a robot changes while it runs; what is left out stays as it is.
 
@@ -70,10 +74,10 @@ class ControlRobot(Record, frozen=True, kw_only=True, rename="camel", omit_defau
     the least cost of a job; empty for any. `stop` says why it is stopped: it takes and begins no job until `release`.
     """
 
-    price: Annotated[str, msgspec.Meta(max_length=60)] | None = None
+    price: Annotated[str, msgspec.Meta(max_length=LONGEST_PRICE)] | None = None
     paused: bool | None = None
     refuse: Annotated[tuple[str, ...], msgspec.Meta(max_length=1000)] | None = None
-    least_price: Annotated[str, msgspec.Meta(max_length=60)] | None = None
+    least_price: Annotated[str, msgspec.Meta(max_length=LONGEST_PRICE)] | None = None
     stop: str | None = None
     release: bool = False
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self
 
 import msgspec
 
-from schemas.address import keccak256
-from schemas.errors import InvalidMessage
+from schemas.address import keccak256, parse_address
+from schemas.errors import InvalidAddress, InvalidMessage, InvalidRecord
 from schemas.messages import Demand, Offer, Result, equal_terms
 from schemas.records import (
     MAX_UINT256,
@@ -215,6 +215,14 @@ class Quote(SignedRecord, frozen=True, kw_only=True, omit_defaults=True):
     until: int = 0
     code: str = ""
     detail: str = ""
+
+    def __post_init__(self) -> None:
+        Record.__post_init__(self)
+        try:
+            if not self.code and parse_address(self.token) != self.token:
+                raise InvalidRecord("Quote", "token: expected the address in EIP-55 form")
+        except InvalidAddress as error:
+            raise InvalidRecord("Quote", f"token: {error}") from None
 
 
 class Published(Record, frozen=True):

@@ -69,7 +69,7 @@ class LiveMessage(NamedTuple):
 
 async def show_market(server: FoxgloveServer, session: zenoh.Session, channel: Channel) -> None:
     """Show everything that happens on a market, until cancelled: a topic for each kind of event, and a log."""
-    formatter, counts = EventFormatter(None), Counter[str]()
+    formatter, counts = EventFormatter({}), Counter[str]()
     async with AsyncExitStack() as stack:
         watch = await stack.enter_async_context(MarketWatch(session, channel, readings=True))
         tasks = await stack.enter_async_context(Background())

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from bridges.web.access import WebError
 from mesh.agent.statement import read_statement
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
-from mesh.cli.statement import ENTRY_COLUMNS, csv_of, statement_json, units_of
+from mesh.cli.statement import ENTRY_COLUMNS, csv_of, statement_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,7 +62,8 @@ class PastContracts:
             if (known := self._known(account)) is None:
                 found = await read_statement(self._parts.chain, account)
                 found = replace(found, entries=found.entries[-LONGEST:])
-                known = found, await units_of(self._parts.chain, found)
+                units = await self._parts.chain.tokens.units(one.token for one in found.entries)
+                known = found, units
                 self._statements[account] = *known, time.monotonic()
             return known
 

@@ -25,7 +25,7 @@ from mesh.base.background import Background
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.retry import Backoff
-from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation, Reverted
+from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation
 from mesh.cli.demand import JudgedTerms
 from mesh.cli.liability import liability_json as record_json
 from mesh.cli.liability import refund_words
@@ -71,23 +71,20 @@ if TYPE_CHECKING:
 
 
 class Labels:
-    """How tokens call themselves, by address. Only the address can be trusted."""
+    """What tokens are called, by address."""
 
     def __init__(self, chain: Chain) -> None:
         self._chain = chain
         self._known: BoundedDict[str, dict[str, Any]] = BoundedDict(1024)
 
     async def learn(self, token: str) -> dict[str, Any]:
-        """The label of a token; asked of the chain once. A contract that is no token has an empty one."""
+        """The label of a token; asked of the chain once. One that is not well-known has its address in its symbol."""
         if token not in self._known:
             try:
-                info = await self._chain.tokens.info(token)
-            except (NoContracts, Reverted):
-                self._known[token] = self.of(token)
+                unit = (await self._chain.tokens.units([token]))[token]
             except ChainError:
                 return self.of(token)
-            else:
-                self._known[token] = {"address": info.address, "symbol": info.symbol, "decimals": info.decimals}
+            self._known[token] = {"address": token, "symbol": unit.symbol, "decimals": unit.decimals}
         return self._known[token]
 
     def of(self, token: str) -> dict[str, Any]:

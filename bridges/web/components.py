@@ -89,7 +89,7 @@ async def opened(
             agent=agent,
             asker=Account(new_private_key()).signer if agent is None else agent.parts.signer,
             lighthouse=await opened_chain.names.address(settings.lighthouse_contract),
-            token=await opened_chain.names.address(settings.erc20_token),
+            token=await opened_chain.tokens.address(settings.erc20_token),
         )
 
 

@@ -70,7 +70,9 @@ class OwnerRules:
         """The token (address) of the least price, that price in its smallest unit, and for people."""
 
     async def open(self) -> None:
-        """Read what the owner has changed before. Raises `InvalidAmount` for a `least_price` that is none."""
+        """Read what the owner has changed before. Raises `InputError` for prices that are none."""
+        if self._described:
+            await self._price_of(self._described)
         changed = await self._parts.ledger.control()
         self._use(changed, await self._least_of(changed))
 
@@ -152,16 +154,15 @@ class OwnerRules:
         text = settings.least_price if changed.least_price is None else changed.least_price
         if not text:
             return None
-        token = await chain.retrying(partial(chain.names.address, settings.erc20_token), outages=outages)
-        unit = await chain.retrying(partial(chain.tokens.unit, token), outages=outages)
-        price = unit.parse(text)
+        amounts = partial(chain.tokens.amounts, text, default=settings.erc20_token)
+        token, unit, (price,) = await chain.retrying(amounts, outages=outages)
         return token, price, unit.show(price)
 
     async def _price_of(self, text: str) -> str:
         """A price that an owner has written, as profiles say it. Raises `InvalidAmount`, `ChainError`."""
-        unit = await self._parts.chain.tokens.unit(self._parts.settings.erc20_token)
-        amount = unit.parse(text)
-        price = f"{unit.decimal(amount)} XRT" if unit.symbol == "XRT" else f"{amount} units"
+        tokens = self._parts.chain.tokens
+        token, unit, (amount,) = await tokens.amounts(text, default=self._parts.settings.erc20_token)
+        price = tokens.price(amount, token, unit)
         if not re.fullmatch(PRICE, price):
             raise InvalidAmount(f"{text[:40]!r} is more than a price can be", hint=unit.hint())
         return price

@@ -96,10 +96,8 @@ class Quoting:
             price = await call_handler(handler, request)
         if price is None:
             raise Declined("no-price", "it names no price; its answer to a demand says whether that is enough")
-        token = parts.settings.erc20_token
-        unit = await parts.chain.retrying(partial(parts.chain.tokens.unit, token), outages=parts.outages)
-        named = partial(parts.chain.names.address, token)
-        cost, paid_in = unit.amount(price), await parts.chain.retrying(named, outages=parts.outages)
+        amounts = partial(parts.chain.tokens.amounts, price, default=parts.settings.erc20_token)
+        paid_in, _, (cost,) = await parts.chain.retrying(amounts, outages=parts.outages)
         if (refused := await self._rules.refusal(request.asker, cost=cost, token=paid_in)) is not None:
             raise refused
         _, wait = await self._profile.queue()

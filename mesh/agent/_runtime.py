@@ -328,7 +328,7 @@ class AgentRuntime(Lifecycle):
         """Read the chain from where the account's agent stopped. Raises `ChainWentBack` and `UnknownName`."""
         parts, chain, token = self.parts, self.parts.chain, ""
         if parts.settings.erc20_token:
-            find_token = partial(chain.names.address, parts.settings.erc20_token)
+            find_token = partial(chain.tokens.address, parts.settings.erc20_token)
             token = await chain.retrying(find_token, outages=parts.outages)
         await follow_chain(
             self,
@@ -504,8 +504,8 @@ class AgentRuntime(Lifecycle):
 
     async def handle_demands(self, subscription: Subscription[Demand], handlers: Sequence[Handler]) -> None:
         """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
-        parts, names = self.parts, self.parts.chain.names
-        token = await parts.chain.retrying(partial(names.address, parts.settings.erc20_token), outages=parts.outages)
+        parts, tokens = self.parts, self.parts.chain.tokens
+        token = await parts.chain.retrying(partial(tokens.address, parts.settings.erc20_token), outages=parts.outages)
         dispatcher = DemandDispatcher(subscription, handlers, parts, self.trader, self.rules, token=token)
         async with parts.channel.subscribe(Withdrawal) as withdrawals, asyncio.TaskGroup() as tasks:
             tasks.create_task(dispatcher.run(), name="demands")

@@ -471,8 +471,9 @@ class Agent(Program):
         """Offer to do a job; returns the order's hash (hex). The offer is resent until it is matched or expires.
 
         With a `demand` the offer agrees to its terms, once its objective was examined; an open offer with the same fee
-        for it, or in generation 5 for another version of it, is enough. Else `objective` (CID), `cost` (`"5 XRT"`, or a
-        number of the token's smallest unit), `token` and `validator` (names or addresses) are the terms, valid for
+        for it, or in generation 5 for another version of it, is enough. Else `objective` (CID), `cost` (`"5 XRT"`,
+        `"3.50 USDC"`, `"3.50 0x…"`, or a number of the token's smallest unit), `token` (address, name or known symbol;
+        by default what `cost` names, else the setting `erc20_token`) and `validator` are the terms, valid for
         `lifetime` blocks, by default about ten minutes. `lighthouse_fee` (`"0.1 XRT"`, or wn) is paid to the provider.
 
         An offer is for its terms: it matches every demand with equal ones. It is withdrawn when its demand has become a
@@ -555,7 +556,8 @@ class Agent(Program):
         and as `robot_address` for a name.
 
         `robot="cheapest"` and `"first"` (the one that would be done first) ask all for `quotes`, and order from one at
-        its price, if that is `max_cost` (else `cost`) at most; if it declines, from the next one. With a `max_cost`,
+        its price, if that is `max_cost` (else `cost`) at most; if it declines, from the next one. Only quotes in the
+        token of `max_cost` (else `cost`) count: prices in different tokens can't be compared. With a `max_cost`,
         `cost` is raised up to that if robots want more. Raises `RemoteError` (`no-robot-fits`).
 
         A job that fails is ordered again up to `retry` times (10 at most), once its cost has come back: from the
@@ -683,7 +685,8 @@ class Agent(Program):
     ) -> list[Quote]:
         """What the robots of a model (CID or name) that are present want for an objective, as in `order`.
 
-        The cheapest is first; those with a `code` don't want the job. Not listed is who does not answer within
+        The cheapest is first, of each token that robots want to be paid in; those in the token of the settings come
+        before the others. Those with a `code` don't want the job. Not listed is who does not answer within
         `timeout` seconds, and robots of the legacy network. A quote binds nobody. Raises `ObjectiveUnfit` as `order`.
         """
         cid, named = await self._cid_of(objective), await self.parts.chain.names.model(model or self.model)
@@ -696,6 +699,7 @@ class Agent(Program):
             robots=[one.address for one in robots],
             model=named,
             objective=cid,
+            token=await self.parts.chain.tokens.address(self.settings.erc20_token),
             timeout=timeout,
         )
 
@@ -716,9 +720,11 @@ class Agent(Program):
 
         None of `besides` (addresses) is asked.
         """
-        named = terms["token"] or self.settings.erc20_token
-        unit, token = await self.parts.chain.tokens.unit(named), await self.parts.chain.names.address(named)
-        least, most = unit.amount(cost), unit.amount(cost if max_cost is None else max_cost)
+        tokens = self.parts.chain.tokens
+        given = (cost,) if max_cost is None else (cost, max_cost)
+        token, unit, amounts = await tokens.amounts(*given, token=terms["token"], default=self.settings.erc20_token)
+        least, most = amounts[0], amounts[-1]
+        terms["token"] = token
         if robot in CHOICES:
             least = 0
         elif robot:
@@ -746,10 +752,11 @@ class Agent(Program):
                 log.info(
                     "%s does not answer: %s", quote.agent, error, extra=log_event("robot-silent", robot=quote.agent)
                 )
+        units = await tokens.units(one.token for one in found if one.token)
         refusals = [(one.agent, f"declines ({one.code})") for one in declined]
         for one in (one for one in found if one not in fitting):
             is_late = start_within is not None and one.start > start_within and not one.code
-            why = f"begins in {one.start:g} s" if is_late else f"wants {unit.show(one.cost)}"
+            why = f"begins in {one.start:g} s" if is_late else f"wants {units[one.token].show(one.cost)}"
             refusals.append((one.agent, f"declines ({one.code})" if one.code else why))
         said = [f"{labelled(agent, self.parts.robots.name(agent))} {why}" for agent, why in refusals]
         raise RemoteError(

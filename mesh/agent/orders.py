@@ -259,14 +259,13 @@ class TermsWriter:
         if lifetime is not None and not 0 < lifetime <= settings.deadline_limit:
             why = f"an order is valid for 1 to {settings.deadline_limit:,} blocks"
             raise InputError(why, hint="give another lifetime", code="invalid-lifetime")
-        if not isinstance(cost, int):
-            cost = (await self._chain.tokens.unit(token or settings.erc20_token)).amount(cost)
+        paid = await self._chain.tokens.amounts(cost, token=token, default=settings.erc20_token)
         blocks = await lifetime_of(self._chain) if lifetime is None else lifetime
         return {
             "model": await names.model(model),
             "objective": objective,
-            "token": await names.address(token or settings.erc20_token),
-            "cost": cost,
+            "token": paid.token,
+            "cost": paid.values[0],
             "lighthouse": await names.address(settings.lighthouse_contract),
             "validator": await names.address(validator) if validator else ZERO_ADDRESS,
             "deadline": await deadline_in(self._chain, blocks),

@@ -104,7 +104,7 @@ class Chain:
                 await stack.enter_async_context(self.node)
             self._contracts = await self._find_contracts()
             self._validators = Validators(self._contracts, listed=self._known_validators)
-            self._funds = Funds(self._contracts)
+            self._funds, self._tokens = Funds(self._contracts), Tokens(self._contracts)
             self._stack = stack.pop_all()
         return self
 
@@ -140,7 +140,8 @@ class Chain:
     @property
     def tokens(self) -> Tokens:
         """Ether, XRT and other tokens."""
-        return Tokens(self._opened())
+        self._opened()
+        return self._tokens
 
     @property
     def funds(self) -> Funds:

@@ -12,14 +12,16 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from mesh.amounts import XRT, Unit
+from mesh.amounts import XRT, InvalidAmount, Unit, split_amount
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import BoundedDict
 from mesh.base.log_context import log_event
 from mesh.chain._abi import decode
 from mesh.chain.errors import InsufficientTokens, NoContracts, RequestRefused, Reverted
 from mesh.chain.following import Approval, decode_log, topics_of
-from mesh.errors import ChainError
+from mesh.errors import ChainError, InputError
+from mesh.settings.chains import profile_of
+from schemas.address import is_ens_name, shortened
 from schemas.messages import Offer
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from mesh.base.clock import Clock
     from mesh.chain._abi import ContractCall, ContractFunctions
     from mesh.chain._contracts import Contracts
+    from mesh.chain._node import Call, Node
     from schemas import Liability, Verified
     from schemas.messages import Order
 
@@ -160,22 +163,36 @@ class Funds:
             return zip(batch, await self._read(batch), strict=True)
 
     async def _read(self, batch: Sequence[Holding]) -> list[Funding | None]:
-        """What the node says; of half the batch at a time if it refuses, as when some tokens use up their gas."""
         spender = bytes.fromhex(self._contracts.factory[2:])
         calls = []
         for token, holder in batch:
             account = bytes.fromhex(holder[2:])
-            calls += [(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)]
+            calls.append([(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)])
         self.requests += 1
-        try:
-            answers = await self._contracts.node.call_all(calls, gas=TOKEN_GAS, most=_WORD)
-        except (Reverted, RequestRefused) as error:
-            if len(batch) == 1:
-                log.debug("the funds of %s can't be read: %s", batch[0], error)
-                return [None]
-            half = len(batch) // 2
-            return [*await self._read(batch[:half]), *await self._read(batch[half:])]
-        return [_funding(*answers[at : at + 2]) for at in range(0, len(answers), 2)]
+        answers = await asked_together(self._contracts.node, calls, most=_WORD)
+        return [None if one is None else _funding(*one) for one in answers]
+
+
+async def asked_together(
+    node: Node, calls: Sequence[Sequence[Call]], *, most: int
+) -> list[Sequence[bytes | None] | None]:
+    """What tokens answer to the calls for each of them, `most` bytes at most; None where the node refuses to answer.
+
+    Half of them are asked at a time if it refuses all together, as when some tokens use up their gas.
+    """
+    try:
+        answers = await node.call_all([call for each in calls for call in each], gas=TOKEN_GAS, most=most)
+    except (Reverted, RequestRefused) as error:
+        if len(calls) == 1:
+            log.debug("a token can't be read: %s", error)
+            return [None]
+        half = len(calls) // 2
+        return [
+            *await asked_together(node, calls[:half], most=most),
+            *await asked_together(node, calls[half:], most=most),
+        ]
+    found = iter(answers)
+    return [[next(found) for _ in each] for each in calls]
 
 
 def _funding(balance: bytes | None, allowance: bytes | None) -> Funding:
@@ -279,7 +296,25 @@ def _sum(orders: Iterable[Mapping[str, int]], token: str) -> int:
 
 
 LONGEST_LABEL: Final = 64
-"""Characters of a token's name or symbol that are shown; anybody can deploy a token with any name."""
+"""Characters of a token's name that are shown; anybody can deploy a token with any name."""
+LONGEST_SYMBOL: Final = 16
+MOST_DECIMALS: Final = 77
+"""Of a token: 10^77 is the largest power of ten in a word."""
+UNITS_KEPT: Final = 1024
+"""Tokens whose units are remembered."""
+UNITS_AT_ONCE: Final = 64
+"""Tokens that are asked for their units in one request."""
+_SYMBOL, _DECIMALS, _SUPPLY = (bytes.fromhex(selector) for selector in ("95d89b41", "313ce567", "18160ddd"))
+LONGEST_ANSWER: Final = 5 * _WORD
+"""Bytes of a symbol as contracts return it, of which 96 are the text."""
+
+
+class Amounts(NamedTuple):
+    """Amounts of one token (its address), each a number of its smallest unit."""
+
+    token: str
+    unit: Unit
+    values: Sequence[int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -302,6 +337,75 @@ class Tokens:
 
     def __init__(self, contracts: Contracts) -> None:
         self._contracts, self._node, self._address = contracts, contracts.node, contracts.names.address
+        profile = contracts.node.profile
+        known = (profile if profile.tokens else profile_of(contracts.node.chain_id) or profile).tokens
+        self._known: Mapping[str, str] = {XRT.symbol: contracts.xrt, **known}
+        """The addresses of well-known tokens by their symbols."""
+        self._units: BoundedDict[str, Unit] = BoundedDict(UNITS_KEPT)
+
+    async def address(self, named: str) -> str:
+        """The address of a token: of a well-known one by its symbol (XRT, and those of the chain's profile), of any
+        other by its address or ENS name.
+
+        Raises `InputError` (`unknown-token`), `InvalidAddress`, `UnknownName`, `NodeUnreachable`.
+        """
+        found = next((known for symbol, known in self._known.items() if symbol.lower() == named.lower()), None)
+        if found is not None:
+            return found
+        if named[:2].lower() == "0x" or is_ens_name(named):
+            return await self._address(named)
+        raise InputError(
+            f"{named[:40]!r} is no token that is known here",
+            hint=f"known are {', '.join(self._known)}; name any other by its address",
+            code="unknown-token",
+        )
+
+    async def amounts(self, *given: int | str, token: str = "", default: str = "") -> Amounts:
+        """Amounts of one token: that which they name (`3.50 USDC`, `3.50 0x…`), else `token`, else `default`, else XRT.
+
+        Tokens are named as for `address`; `token` and `default` also by the symbol that they give themselves. Numbers
+        count the smallest unit. Raises `InvalidAmount`, also for amounts of several tokens, and as `address` and
+        `unit` do.
+        """
+        split = [split_amount(one) if isinstance(one, str) else None for one in given]
+        usual = await self.address(token or default or XRT.symbol)
+        found = {usual} if token else set()
+        for _, name in filter(None, split):
+            if name and name.lower() != "units":
+                found.add(await self._named(name, usual))
+        if len(found) > 1:
+            units = await self.units(found)
+            tokens = " and ".join(units[one].symbol for one in found)
+            raise InvalidAmount(f"amounts of two tokens, {tokens}, stand for one", hint="write all in one token")
+        address = next(iter(found), usual)
+        unit = await self.unit(address) if any(split) else (await self.units([address]))[address]
+        values = []
+        for one, parts in zip(given, split, strict=True):
+            number, name = parts or ("", "")
+            smallest = name if name.lower() in ("units", unit.smallest) else ""
+            values.append(unit.amount(one) if parts is None else unit.parse(number + smallest))
+        return Amounts(address, unit, values)
+
+    async def _named(self, name: str, usual: str) -> str:
+        """The token that an amount names; its own symbol is enough for the usual one, if no known token has it."""
+        if name.lower() == XRT.smallest:
+            return self._contracts.xrt
+        try:
+            return await self.address(name)
+        except InputError as error:
+            if error.code != "unknown-token":
+                raise
+            own = (await self.units([usual]))[usual].symbol.partition(" (")[0]
+            if own.lower() != name.lower():
+                raise
+            return usual
+
+    def price(self, amount: int, token: str, unit: Unit) -> str:
+        """A price as profiles and descriptions say it, with the symbol of a known token, else its address."""
+        return f"{unit.decimal(amount)} {self._known_symbol(token) or token}"
+
+    def _known_symbol(self, token: str) -> str:
+        return next((symbol for symbol, known in self._known.items() if known == token), "")
 
     async def eth_balance(self, address: str | None = None) -> int:
         """Wei of an account; of one's own by default."""
@@ -317,25 +421,52 @@ class Tokens:
         total_supply = int(await self._node.read(functions.totalSupply()))
         return Token(
             address=functions.address,
-            symbol=_label(await self._ask(functions.symbol())),
+            symbol=_label(await self._ask(functions.symbol()))[:LONGEST_SYMBOL].strip(),
             name=_label(await self._ask(functions.name())),
             decimals=_decimals(await self._ask(functions.decimals())),
             total_supply=total_supply,
         )
 
     async def unit(self, token: str | None = None) -> Unit:
-        """The unit that a token is counted in (an address or ENS name; XRT by default). Raises `ChainError`."""
-        try:
-            info = await self.info(token)
-        except (NoContracts, Reverted):
-            if token is None:
-                raise
+        """The unit that a token is counted in (named as for `address`; XRT by default), asked of the chain once.
+
+        Anybody can choose any symbol, so one that is not well-known has its address in it. Raises `ChainError`
+        (`not-a-token`) and as `address` does.
+        """
+        address = self._contracts.xrt if token is None else await self.address(token)
+        await self.units([address])
+        if address not in self._units:
             raise ChainError(
-                f"{token} is not a token", hint="name an ERC-20 by its address or ENS name", code="not-a-token"
-            ) from None
-        if info.address == self._contracts.xrt:
-            return Unit(info.symbol or XRT.symbol, info.decimals, XRT.smallest)
-        return Unit(info.symbol or "tokens", info.decimals)
+                f"{token or address} is not a token",
+                hint="name an ERC-20 by its address or ENS name",
+                code="not-a-token",
+            )
+        return self._units[address]
+
+    async def units(self, tokens: Iterable[str]) -> dict[str, Unit]:
+        """The units of tokens (addresses), to show amounts; of one that does not say it, its smallest unit.
+
+        Raises `NodeUnreachable`.
+        """
+        wanted = list(dict.fromkeys(tokens))
+        found = {token: self._units[token] for token in wanted if token in self._units}
+        asked = [token for token in wanted if token not in found]
+        for start in range(0, len(asked), UNITS_AT_ONCE):
+            some = asked[start : start + UNITS_AT_ONCE]
+            calls = [[(token, _SYMBOL), (token, _DECIMALS), (token, _SUPPLY)] for token in some]
+            for token, answers in zip(some, await asked_together(self._node, calls, most=LONGEST_ANSWER), strict=True):
+                if answers is None or answers[2] is None or len(answers[2]) < _WORD:
+                    found[token] = Unit(f"units of {shortened(token)}", 0)
+                else:
+                    found[token] = self._units[token] = self._unit_of(token, answers[0] or b"", answers[1] or b"")
+        return found
+
+    def _unit_of(self, token: str, symbol: bytes, decimals: bytes) -> Unit:
+        """The unit of a token by what it answers; its symbol counts only together with its address."""
+        if known := self._known_symbol(token):
+            return Unit(known, _decimals(decimals), XRT.smallest if token == self._contracts.xrt else "units")
+        label = _label(symbol)[:LONGEST_SYMBOL].strip() or ("tokens" if _decimals(decimals) else "units")
+        return Unit(f"{label} ({shortened(token)})", _decimals(decimals))
 
     async def balance(self, address: str | None = None, *, token: str | None = None) -> int:
         """Units of a token (XRT by default) that an account holds."""
@@ -381,7 +512,7 @@ class Tokens:
         return (await self._contracts.send(functions.transferFrom(owner, await self._address(to), value))).tx
 
     async def _token(self, token: str | None) -> ContractFunctions:
-        address = self._contracts.xrt if token is None else await self._address(token)
+        address = self._contracts.xrt if token is None else await self.address(token)
         return self._node.contract("XRT", address)
 
     async def _ask(self, call: ContractCall) -> bytes:
@@ -403,4 +534,4 @@ def _label(answer: bytes) -> str:
 
 def _decimals(answer: bytes) -> int:
     value = int.from_bytes(answer, "big") if len(answer) == 32 else 0
-    return value if value <= 255 else 0
+    return value if value <= MOST_DECIMALS else 0

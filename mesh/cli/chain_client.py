@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from mesh.amounts import Unit
-from mesh.cli.output import short_address
 from mesh.errors import ChainError, ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator
 
+    from mesh.amounts import Unit
     from mesh.chain import Chain
     from mesh.settings import AccountSettings, Settings
     from schemas import Order
@@ -110,28 +109,8 @@ async def spender_of(chain: Chain, named: str) -> str:
 
 
 async def units_of(chain: Chain, paid: Iterable[Liability | Order]) -> dict[str, Unit]:
-    """The units of the tokens that liabilities or orders are paid in, by the tokens' addresses.
-
-    The symbol of a token other than XRT includes its address, because anyone can choose any symbol. A token without a
-    known unit is counted in its smallest one.
-    """
-    return {token: await _unit_of(chain, token) for token in {one.token for one in paid}}
-
-
-async def token_unit(chain: Chain, token: str) -> Unit:
-    """The unit of a token as it says itself; without a symbol and decimals if it does not say it."""
-    try:
-        return await chain.tokens.unit(None if token == chain.xrt else token)
-    except ChainError:
-        return Unit("", 0)
-
-
-async def _unit_of(chain: Chain, token: str) -> Unit:
-    unit = await token_unit(chain, token)
-    if token == chain.xrt:
-        return unit
-    short = short_address(token)
-    return Unit(f"{unit.symbol} ({short})" if unit.symbol else f"units of {short}", unit.decimals)
+    """The units of the tokens that liabilities or orders are paid in, by the tokens' addresses."""
+    return await chain.tokens.units(one.token for one in paid)
 
 
 async def check_balance(chain: Chain, unit: Unit, needed: int, *, token: str | None = None) -> None:

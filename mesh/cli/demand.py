@@ -27,7 +27,7 @@ from mesh.base.background import Background
 from mesh.cli.chain_client import check_balance
 from mesh.cli.files import file_or_cid, model_named, require_writable
 from mesh.cli.liability import device_lines
-from mesh.cli.options import ADDRESS, PATH, SECONDS, AmountText, with_json, with_settings
+from mesh.cli.options import ADDRESS, PATH, SECONDS, AmountText, TokenAmountText, with_json, with_settings
 from mesh.cli.order import withdraw_orders, withdrawal_lines
 from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress, wait_for_broken_pipe
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
@@ -82,14 +82,15 @@ async def take_existing(
     printer: JobPrinter,
     validator: str,
     payable: range,
+    token: str,
     robot: str,
 ) -> Order | Contract | None:
     """What to wait for instead of a new demand: the open one for the same job, or its contract. None: post a new one.
 
-    `payable` are the costs that a new one may have, `robot` is the one that it names (address), if any. `existing` is
-    the choice; without one, the user is asked. Raises `ConfigurationError` without a terminal.
+    `payable` are the costs that a new one may have in `token`, `robot` is the one that it names (addresses), if any.
+    `existing` is the choice; without one, the user is asked. Raises `ConfigurationError` without a terminal.
     """
-    find = partial(_equal, agent, objective, validator=validator, payable=payable, robot=robot)
+    find = partial(_equal, agent, objective, validator=validator, payable=payable, token=token, robot=robot)
     demands, contract = await find()
     if demands:  # perhaps one became a contract while nothing of the account ran
         await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
@@ -124,14 +125,14 @@ async def take_existing(
 
 
 async def _equal(
-    agent: Agent, objective: str, *, validator: str, payable: range, robot: str
+    agent: Agent, objective: str, *, validator: str, payable: range, token: str, robot: str
 ) -> tuple[list[Order], Contract | None]:
     """The open demands that are equal, and the latest contract of one that has not ended, of the `RECENT` ones."""
     from mesh.agent.orders import is_repeated
     from schemas import Demand, decode
 
     fields: dict[str, Any] = {"model": agent.model, "objective": objective, "validator": validator}
-    wanted = await agent.runtime.trader.writer.terms(**fields, cost=payable.start, token="", lifetime=1)
+    wanted = await agent.runtime.trader.writer.terms(**fields, cost=payable.start, token=token, lifetime=1)
 
     def is_equal(message: object) -> bool:
         return isinstance(message, Demand) and is_repeated(message, wanted, payable=payable)
@@ -459,7 +460,7 @@ async def agreed_fee(
     if not validator:
         return 0
     runtime = agent.runtime
-    terms = await runtime.trader.writer.terms(model=agent.model, objective=cid, token="", validator=validator, **fields)
+    terms = await runtime.trader.writer.terms(model=agent.model, objective=cid, validator=validator, **fields)
     if terms["validator"] == ZERO_ADDRESS:
         return 0
     judged = await JudgedTerms.of(
@@ -491,10 +492,10 @@ async def agreed_fee(
 @click.option("--objective", required=True, help="objective to play: a file or a CID")
 @click.option(
     "--cost",
-    type=AmountText(),
+    type=TokenAmountText(),
     default="0",
     show_default=True,
-    help="what you pay: whole tokens (1.5), or the smallest unit (1500000000wn for XRT, 15units for other tokens)",
+    help="what you pay: whole tokens (1.5, 3.50 USDC, 3.50 0x…), or the smallest unit (1500000000wn, 15units)",
 )
 @click.option(
     "--robot",
@@ -502,7 +503,9 @@ async def agreed_fee(
     help="the only robot that gets the job: name, address, cheapest or first (done first) [any]",
 )
 @click.option(
-    "--max-cost", type=AmountText(), help="raise --cost up to this if robots want more; the most for a chosen robot"
+    "--max-cost",
+    type=TokenAmountText(),
+    help="raise --cost up to this if robots want more; the most for a chosen robot",
 )
 @click.option(
     "--retry",
@@ -606,7 +609,9 @@ async def demand(
     checked = await asyncio.to_thread(_check_objective, settings, source) if isinstance(source, Path) else None
     # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(model.name, settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
-        unit = await agent.parts.chain.tokens.unit(agent.settings.erc20_token)
+        given = (terms["cost"],) if max_cost is None else (terms["cost"], max_cost)
+        token, unit, amounts = await agent.parts.chain.tokens.amounts(*given, default=agent.settings.erc20_token)
+        terms |= {"token": token, "cost": amounts[0]}
         with closing(JobPrinter(unit, as_json=as_json, name_of=agent.parts.robots.name)) as printer:
             changes = print_connection_changes(agent.parts.network, before=printer.close)
             tasks.start(changes, "network losses")
@@ -616,8 +621,7 @@ async def demand(
             if model.file is not None:  # for robots and pages that read its description
                 await agent.add(model.file)
             cid = source if isinstance(source, str) else await agent.add(source)
-            cost = terms["cost"] = unit.parse(terms["cost"])
-            most = cost if max_cost is None else unit.parse(max_cost)
+            cost, most = amounts[0], amounts[-1]
             if most < cost:
                 raise InputError("--max-cost is less than --cost", hint="omit one of them", code="invalid-options")
             named = await _address_of(agent, robot) if robot and robot not in BY_QUOTE else ""
@@ -632,10 +636,11 @@ async def demand(
                 printer=printer,
                 validator=terms["validator"],
                 payable=payable,
+                token=token,
                 robot=named,
             )
             if order is None:
-                await check_balance(agent.parts.chain, unit, most, token=agent.settings.erc20_token)
+                await check_balance(agent.parts.chain, unit, most, token=token)
                 terms |= {"robot": named or robot, "max_cost": None if max_cost is None else most}
                 order = await _post(agent, cid, checked, printer, retry=retry, start_within=start_within, **terms)
             elif retry or start_within is not None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.amounts import AMOUNT, XRT, InvalidAmount
+from mesh.amounts import AMOUNT, TOKEN_AMOUNT, XRT, InvalidAmount
 from mesh.role.running import run_to_end
 from mesh.settings import DEFAULTS, MEANING, AccountSettings, load, options_of
 from schemas.address import parse_address_or_name
@@ -23,14 +23,21 @@ class AmountText(click.ParamType[str]):
     """An amount. Its syntax is checked here; its value depends on the token. Raises `InvalidAmount`."""
 
     name = "amount"
+    pattern = AMOUNT
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Return the text."""
         text = str(value)
-        if AMOUNT.fullmatch(text.strip()) is None:
+        if self.pattern.fullmatch(text.strip()) is None:
             flag = f"{param.opts[0]}: " if isinstance(param, click.Option) else ""
             raise InvalidAmount(f"{flag}{text[:40]!r} is not an amount", hint=XRT.hint())
         return text
+
+
+class TokenAmountText(AmountText):
+    """An amount that may name its token: `3.50 USDC`."""
+
+    pattern = TOKEN_AMOUNT
 
 
 class FiniteRange(click.FloatRange):
@@ -79,7 +86,23 @@ class AddressText(click.ParamType[str]):
         return str(value)
 
 
+class TokenText(AddressText):
+    """A token's address or ENS name, or the symbol of a token that is known on the chain, which is looked up later."""
+
+    name = "token"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the text."""
+        text = str(value)
+        return (
+            text
+            if text.isascii() and text.replace(".", "").isalnum() and text[0].isalpha()
+            else super().convert(value, param, ctx)
+        )
+
+
 ADDRESS: Final = AddressText()
+TOKEN: Final = TokenText()
 
 
 def with_settings(*named: str | type) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -17,6 +17,7 @@ import msgspec
 
 from mesh.errors import AiraError
 from mesh.role.running import INTERRUPTED, STOPPING, fail
+from schemas.address import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -136,7 +137,7 @@ def plural(count: int, one: str) -> str:
 
 def short_address(address: str, *, own: str | None = None) -> str:
     """An address shortened to its ends, for lines with a full address beside it; `you` for the user's own."""
-    return "you" if address == own else f"{address[:6]}…{address[-4:]}"
+    return "you" if address == own else shortened(address)
 
 
 def format_size(size: int) -> str:

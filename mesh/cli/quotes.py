@@ -16,6 +16,8 @@ from mesh.watching.robots import labelled
 from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mesh.amounts import Unit
     from mesh.settings import Settings
     from schemas.rpc import Quote
@@ -30,8 +32,9 @@ if TYPE_CHECKING:
 async def command(settings: Settings, model: str, objective: str, timeout: float, as_json: bool) -> None:
     """Ask the robots of a model what they want for a job, when they would begin, and how long it takes.
 
-    The cheapest is listed first; a robot that does not want the job says why. Nothing is ordered, and nobody is bound:
-    `aira demand --robot NAME|ADDRESS|cheapest|first` orders.
+    The cheapest is listed first, of each token that robots want to be paid in; those that want the token of the
+    settings come first. A robot that does not want the job says why. Nothing is ordered, and nobody is bound: `aira
+    demand --robot NAME|ADDRESS|cheapest|first` orders.
     """
     from mesh.agent.agent import Agent
 
@@ -39,13 +42,13 @@ async def command(settings: Settings, model: str, objective: str, timeout: float
     settings.keyfile_and_password()
     source = await asyncio.to_thread(file_or_cid, objective)
     async with Agent(named.name, settings=replace(settings, metrics_listen="")) as agent:
-        unit = await agent.parts.chain.tokens.unit(agent.settings.erc20_token)
         quotes = await agent.quotes(agent.model, source, timeout=timeout)
+        units = await agent.parts.chain.tokens.units(quote.token for quote in quotes if quote.token)
         names = {quote.agent: agent.parts.robots.name(quote.agent) for quote in quotes}
     if as_json:
         print_json({"quotes": [decode_json(quote.encode()) | {"name": names[quote.agent]} for quote in quotes]})
     elif quotes:
-        offers = [(*_shown(quote, unit), names[quote.agent], quote.agent) for quote in quotes if not quote.code]
+        offers = [(*_shown(quote, units), names[quote.agent], quote.agent) for quote in quotes if not quote.code]
         if offers:
             print_table(("cost", "begins", "takes", "name", "address"), offers)
         for quote in (quote for quote in quotes if quote.code):
@@ -55,7 +58,8 @@ async def command(settings: Settings, model: str, objective: str, timeout: float
         print_line("no robot of this model answers")
 
 
-def _shown(quote: Quote, unit: Unit) -> tuple[str, str, str]:
+def _shown(quote: Quote, units: Mapping[str, Unit]) -> tuple[str, str, str]:
     """What a robot wants, when it would begin, and how long it takes, for people."""
     begins = f"in {format_duration(round(quote.start * 1e9))}" if quote.start else "now"
-    return unit.show(quote.cost), begins, format_duration(round(quote.seconds * 1e9)) if quote.seconds else "unknown"
+    cost = units[quote.token].show(quote.cost)
+    return cost, begins, format_duration(round(quote.seconds * 1e9)) if quote.seconds else "unknown"

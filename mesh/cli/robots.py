@@ -8,17 +8,21 @@ from typing import TYPE_CHECKING
 import click
 import msgspec
 
+from mesh.amounts import split_amount
 from mesh.cli.chain_client import open_chain
 from mesh.cli.files import model_named
 from mesh.cli.options import CHAIN_SETTINGS, with_json, with_settings, with_timeout
 from mesh.cli.output import format_duration, plural, print_json, print_line, print_table
 from mesh.errors import ChainError
 from mesh.settings import NetworkSettings
-from schemas.address import is_ens_name
+from schemas.address import is_ens_name, parse_address
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
     import zenoh
 
+    from mesh.chain import Chain
     from mesh.network import Channel
     from mesh.settings import Settings
     from mesh.watching import Robot
@@ -41,12 +45,20 @@ async def command(settings: Settings, model: str | None, timeout: float, as_json
 
     named = None if model is None else (await asyncio.to_thread(model_named, model)).name
     async with watching(settings) as (network, channel):
-        robots = await _list(settings, network.session, channel, named, timeout=timeout)
+        robots, prices = await _list(settings, network.session, channel, named, timeout=timeout)
     if as_json:
         print_json({"lighthouse": channel.lighthouse, "robots": [msgspec.to_builtins(robot) for robot in robots]})
     elif robots:
         rows = [
-            (robot.name, robot.address, doing(robot), robot.price, record_of(robot), robot.place, reads(robot))
+            (
+                robot.name,
+                robot.address,
+                doing(robot),
+                prices.get(robot.price, robot.price),
+                record_of(robot),
+                robot.place,
+                reads(robot),
+            )
             for robot in robots
         ]
         print_table(("name", "address", "doing", "price", "record", "place", "reads"), rows)
@@ -56,8 +68,11 @@ async def command(settings: Settings, model: str | None, timeout: float, as_json
 
 async def _list(
     settings: Settings, session: zenoh.Session, channel: Channel, model: str | None, *, timeout: float
-) -> list[Robot]:
-    """The robots with their records, as far as the node answers. Raises `UnknownName` and its like for a model."""
+) -> tuple[list[Robot], Mapping[str, str]]:
+    """The robots with their records, and their prices for people where these name a token by its address.
+
+    As far as the node answers. Raises `UnknownName` and its like for a model.
+    """
     from mesh.watching import RobotDirectory
 
     directory = RobotDirectory(session, channel)
@@ -67,10 +82,18 @@ async def _list(
     robots = await directory.present(model or "", timeout=timeout)
     try:
         async with open_chain(settings) as chain:
-            return await directory.count(chain, robots)
+            return await directory.count(chain, robots), await _prices(chain, robots)
     except ChainError as error:
         click.echo(f"aira: no records: {error}", err=True)
-        return robots
+        return robots, {}
+
+
+async def _prices(chain: Chain, robots: Iterable[Robot]) -> Mapping[str, str]:
+    """Prices that name a token by its address, as amounts of it, by what the robots say."""
+    stated = {robot.price: split_amount(robot.price) for robot in robots if " 0x" in robot.price}
+    units = await chain.tokens.units(parse_address(token.lower()) for _, token in stated.values())
+    tokens = {price: units[parse_address(token.lower())] for price, (_, token) in stated.items()}
+    return {price: f"{number} {tokens[price].symbol}" for price, (number, _) in stated.items()}
 
 
 def doing(robot: Robot) -> str:

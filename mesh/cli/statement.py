@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 import click
 
 from mesh.agent.statement import Entry, Sum, period, read_statement
-from mesh.amounts import ETH, XRT, Unit
-from mesh.cli.chain_client import account_of, open_chain, token_unit
+from mesh.amounts import ETH, XRT
+from mesh.cli.chain_client import account_of, open_chain
 from mesh.cli.options import ADDRESS, with_chain_settings, with_json
 from mesh.cli.output import format_time, iso_time, print_json, print_line, print_table, printable, short_address
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from mesh.agent.statement import Statement
-    from mesh.chain import Chain
+    from mesh.amounts import Unit
     from mesh.settings import Settings
 
     Units: TypeAlias = Mapping[str, Unit]
@@ -56,7 +56,7 @@ async def statement(
     async with open_chain(settings) as chain:
         whose = await account_of(chain, settings, account)
         found = await read_statement(chain, whose, since=since, until=until)
-        units = await units_of(chain, found)
+        units = await chain.tokens.units(one.token for one in found.entries)
     if as_json:
         print_json(statement_json(found, units))
     elif as_csv and only_sums:
@@ -72,11 +72,6 @@ async def statement(
         _print_sums(found, units)
 
 
-async def units_of(chain: Chain, found: Statement) -> Units:
-    """The units of the tokens in a statement. Raises `ChainError`."""
-    return {token: await token_unit(chain, token) for token in {one.token for one in found.entries}}
-
-
 AMOUNTS: Final = ("EARNED", "SPENT", "FEE", "GAS", "OWN GAS")
 
 
@@ -88,7 +83,7 @@ def _amounts(one: Entry | Sum, unit: Unit) -> tuple[str, ...]:
 def _print_entries(found: Statement, units: Units) -> None:
     rows = []
     for entry in found.entries:
-        one, unit = entry.liability, _named(units, entry.token)
+        one, unit = entry.liability, units[entry.token]
         other = one.promisor if one.promisee == found.account else one.promisee
         amounts = (
             unit.show(entry.earned),
@@ -105,25 +100,17 @@ def _print_entries(found: Statement, units: Units) -> None:
 def _print_sums(found: Statement, units: Units) -> None:
     rows = []
     for one in found.sums:
-        amounts = _amounts(one, _named(units, one.token))
+        amounts = _amounts(one, units[one.token])
         rows.append((one.month, one.model, f"{one.contracts:,}", f"{one.paid:,}", *amounts))
     counts = ("CONTRACTS", "PAID")
     print_table(("MONTH", "MODEL", *counts, *AMOUNTS), rows, numbers=(*counts, *AMOUNTS))
-
-
-def _named(units: Units, token: str) -> Unit:
-    """The unit of a token for people, who see its address where anybody can have chosen the symbol."""
-    unit = units[token]
-    if unit == XRT:
-        return unit
-    return Unit(f"{printable(unit.symbol) or 'units of'} {short_address(token)}", unit.decimals)
 
 
 def _eth(wei: int | None) -> str:
     return "unknown" if wei is None else ETH.show(wei)
 
 
-Column = Callable[[T, Unit], str]
+Column: TypeAlias = Callable[[T, "Unit"], str]
 """Writes one cell of a row, whose token has this unit."""
 
 AMOUNT_COLUMNS: Final[Mapping[str, Column[Entry | Sum]]] = {

@@ -15,31 +15,34 @@ import click
 from mesh.agent.contracts import verdict_words
 from mesh.amounts import XRT, Unit
 from mesh.base.background import Background
-from mesh.base.flood import Rate, RateLimiter
+from mesh.base.flood import BoundedDict, Rate, RateLimiter
+from mesh.cli.chain_client import open_chain
 from mesh.cli.demand import print_connection_changes
 from mesh.cli.files import model_named
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.options import CHAIN_SETTINGS, with_json, with_settings
 from mesh.cli.output import json_text, plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
+from mesh.errors import AiraError, ChainError
 from mesh.network import Reading
 from mesh.role.running import run_until_stopped
 from mesh.settings import NetworkSettings
 from mesh.telemetry.logs import configure_logging
 from mesh.watching import JobEvent, PresenceChange, labelled
-from schemas import Demand, InvalidAddress, Result, Verified, parse_address
+from schemas import Demand, InvalidAddress, Offer, Result, Verified, parse_address
 from schemas.decoding import decode_json
 from schemas.signing import Decline, Rejection
 from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Mapping
 
     import zenoh
 
+    from mesh.chain import Chain
     from mesh.network import Channel, Network
     from mesh.recording import Recorder
     from mesh.settings import Settings
     from mesh.watching import MarketCounters, MarketEvent, MarketWatch, RobotDirectory
-    from schemas import Offer, PresenceKey
+    from schemas import PresenceKey
 
 
 LONGEST_TEXT: Final = 200
@@ -106,10 +109,10 @@ def _order_facts(order: Demand | Offer) -> dict[str, Any]:
 
 
 class EventFormatter:
-    """Formats events as lines for people. `xrt` is the address of XRT, None if unknown."""
+    """Formats events as lines for people, with the `units` of tokens (by address) that are known."""
 
-    def __init__(self, xrt: str | None) -> None:
-        self._xrt = xrt
+    def __init__(self, units: Mapping[str, Unit]) -> None:
+        self._units = units
 
     def line(self, seen: MarketEvent | PresenceChange, name: str = "") -> str:
         """The line of an event, without the time. `name` is what the robot calls itself that it is about."""
@@ -146,7 +149,7 @@ class EventFormatter:
 
     def cost(self, amount: int, token: str) -> str:
         """An amount of a token with its unit."""
-        return (XRT if token == self._xrt else Unit(f"units of {short_address(token)}", 0)).show(amount)
+        return (self._units.get(token) or Unit(f"units of {short_address(token)}", 0)).show(amount)
 
     def _order(self, seen: Verified[Any], who: str) -> str:
         order: Demand | Offer = seen.message
@@ -158,6 +161,49 @@ class EventFormatter:
         terms = f"{self.cost(order.cost, order.token)}{fee}, model {_short_cid(order.model)}"
         more = f"objective {_short_cid(order.objective)}, until block {order.deadline:,}"
         return f"{seen.hash.hex()[:HASH_DIGITS]}  {who} {does} {terms}, {more}"
+
+
+UNIT_TIMEOUT: Final = 1.0
+"""Seconds that the node has to say the unit of a token."""
+UNIT_QUESTIONS: Final = Rate(per_second=1.0, burst=20)
+"""Tokens that the node is asked about: strangers may name any."""
+
+
+class KnownUnits:
+    """The units of tokens by address: that of `xrt`, and of others as far as the settings' chain says it."""
+
+    def __init__(self, settings: Settings, xrt: str | None) -> None:
+        self.known: BoundedDict[str, Unit] = BoundedDict(1024)
+        if xrt is not None:
+            self.known[xrt] = XRT
+        self._settings = settings
+        self._chain: Chain | None = None
+        self._limiter = RateLimiter(per_sender=UNIT_QUESTIONS)
+
+    async def use_chain(self) -> None:
+        """Ask the chain of the settings, if its node answers, until cancelled."""
+        with suppress(AiraError):
+            async with open_chain(self._settings) as self._chain:
+                await asyncio.Event().wait()
+
+    async def learn(self, token: str) -> None:
+        """Ask for the unit of a token, if it is not known."""
+        if self._chain is None or token in self.known or not self._limiter.allow(""):
+            return
+        with suppress(ChainError, TimeoutError):
+            async with asyncio.timeout(UNIT_TIMEOUT):
+                for address, unit in (await self._chain.tokens.units([token])).items():
+                    self.known[address] = unit
+
+
+def token_in(seen: MarketEvent | PresenceChange) -> str:
+    """The token (address) that an event has an amount of; empty if it has none."""
+    match seen:
+        case Verified(message=Demand() | Offer() as order):
+            return order.token
+        case JobEvent(liability=liability):
+            return liability.token
+    return ""
 
 
 def _short_cid(cid: str) -> str:
@@ -181,14 +227,15 @@ PRESENCE_CHANGES: Final = Rate(per_second=4.0, burst=64)
     "--out", type=click.Path(dir_okay=False, path_type=Path), help="record the readings to this MCAP file (new)"
 )
 @with_json
-@with_settings(NetworkSettings, "lighthouse_contract", "xrt_contract")
+@with_settings(NetworkSettings, "lighthouse_contract", *CHAIN_SETTINGS)
 def command(
     settings: Settings, model: str | None, with_open: bool, readings: bool, out: Path | None, as_json: bool
 ) -> None:
     """Print one line for each event on a lighthouse's channel: orders, rejections, declines, contracts, jobs,
     results, validators' verdicts, and which validators are present. Ctrl-C stops it.
 
-    Needs a router, but no account and no chain. Prints only orders and results with valid signatures; invalid messages
+    Needs a router, but no account and no chain; without the chain's node, amounts of other tokens than XRT are in their
+    smallest unit. Prints only orders and results with valid signatures; invalid messages
     are counted, and the counts are printed at the end and on SIGUSR1. --json prints one object per line, with amounts
     in the token's smallest unit. With --model, only results of contracts seen since the start are printed.
 
@@ -221,7 +268,9 @@ async def watch(
         model = (await asyncio.to_thread(model_named, model)).cid()
     async with AsyncExitStack() as stack:
         network, channel = await stack.enter_async_context(watching(settings))
-        formatter = None if as_json else EventFormatter(await _xrt(settings, network.session, channel))
+        xrt = None if as_json else await _xrt(settings, network.session, channel)
+        units = KnownUnits(settings, xrt)
+        formatter = None if as_json else EventFormatter(units.known)
         recorder = None if out is None else await stack.enter_async_context(_recording(out, channel.lighthouse))
         robots = RobotDirectory(network.session, channel)
         show = partial(_show_event, formatter, recorder, robots)
@@ -230,6 +279,7 @@ async def watch(
         seen = await stack.enter_async_context(watched)
         tasks = await stack.enter_async_context(_report_beside(network, seen))
         if not as_json:
+            tasks.start(units.use_chain(), "chain")
             click.echo(f"watching {channel.lighthouse}; Ctrl-C stops it", err=True)
         if model is None:
             _show_validators(channel, show)
@@ -238,6 +288,8 @@ async def watch(
         async for event in seen:
             if robot := robot_in(event):
                 await robots.find(robot)
+            if token := token_in(event):
+                await units.learn(token)
             show(event)
             if fetcher is not None:
                 fetcher.handle(event)

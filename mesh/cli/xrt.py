@@ -15,7 +15,7 @@ from mesh.cli.chain_client import (
     open_signing_chain,
     spender_of,
 )
-from mesh.cli.options import ADDRESS, AmountText, with_chain_settings, with_json, with_signing_settings
+from mesh.cli.options import ADDRESS, TOKEN, TokenAmountText, with_chain_settings, with_json, with_signing_settings
 from mesh.cli.output import print_result
 
 if TYPE_CHECKING:
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from mesh.settings import Settings
 
-with_token = click.option("--token", type=ADDRESS, help="ENS name or address of another ERC-20 token [XRT]")
+with_token = click.option(
+    "--token", type=TOKEN, help="another ERC-20 token: its address, ENS name, or symbol if that is known [XRT]"
+)
 
 
 @click.group("xrt")
@@ -31,7 +33,8 @@ def command() -> None:
     """Show, approve and transfer XRT, the token of stakes and fees, or any other ERC-20.
 
     A plain AMOUNT counts whole tokens: 1.5 is one and a half XRT. With the suffix wn (10^-9 XRT), or units for any
-    token, it counts the smallest unit: 1500000000wn is the same amount. In JSON, amounts are text in the smallest unit.
+    token, it counts the smallest unit: 1500000000wn is the same amount. An amount may name its token instead of
+    --token: 3.50 USDC, or 3.50 0x… with its address. In JSON, amounts are text in the smallest unit.
     """
 
 
@@ -70,7 +73,7 @@ async def allowance(settings: Settings, *, spender: str, owner: str | None, toke
 
 @command.command("approve", short_help="allow a spender to transfer up to an amount")
 @click.argument("spender")
-@click.argument("amount", type=AmountText())
+@click.argument("amount", type=TokenAmountText())
 @with_token
 @with_json
 @with_signing_settings()
@@ -80,8 +83,8 @@ async def approve(settings: Settings, *, spender: str, amount: str, token: str |
     SPENDER is `factory` (for costs and fees), a lighthouse's name (for stakes), an ENS name or an address.
     """
     async with open_signing_chain(settings) as chain:
-        unit = await chain.tokens.unit(token)
-        value, by = unit.parse(amount), await spender_of(chain, spender)
+        token, unit, (value,) = await chain.tokens.amounts(amount, token=token or "")
+        by = await spender_of(chain, spender)
         with notice_when_slow():
             tx = await chain.tokens.approve(by, value, token=token)
         result = {"spender": by, **await _token_json(chain, token, unit), "allowance": str(value), "tx": tx}
@@ -91,15 +94,15 @@ async def approve(settings: Settings, *, spender: str, amount: str, token: str |
 
 @command.command("transfer", short_help="transfer an amount to another account")
 @click.argument("to", type=ADDRESS)
-@click.argument("amount", type=AmountText())
+@click.argument("amount", type=TokenAmountText())
 @with_token
 @with_json
 @with_signing_settings()
 async def transfer(settings: Settings, *, to: str, amount: str, token: str | None, as_json: bool) -> None:
     """Transfer AMOUNT from the account to TO, an address or ENS name."""
     async with open_signing_chain(settings) as chain:
-        unit = await chain.tokens.unit(token)
-        value, recipient = unit.parse(amount), await chain.names.address(to)
+        token, unit, (value,) = await chain.tokens.amounts(amount, token=token or "")
+        recipient = await chain.names.address(to)
         await check_balance(chain, unit, value, token=token)
         with notice_when_slow():
             tx = await chain.tokens.transfer(recipient, value, token=token)
@@ -111,5 +114,5 @@ async def transfer(settings: Settings, *, to: str, amount: str, token: str | Non
 
 async def _token_json(chain: Chain, token: str | None, unit: Unit) -> dict[str, Any]:
     """The token for JSON."""
-    address = chain.xrt if token is None else await chain.names.address(token)
+    address = chain.xrt if token is None else await chain.tokens.address(token)
     return {"token": address, "symbol": unit.symbol, "decimals": unit.decimals}

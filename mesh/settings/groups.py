@@ -183,7 +183,9 @@ class MarketSettings:
     """The market to trade on."""
 
     lighthouse_contract: str = option("", "ENS name of the lighthouse, the market to trade on")
-    erc20_token: str = option("", "ENS name or address of the token that pays for work")
+    erc20_token: str = option(
+        "", "the token that pays for work: its address, its ENS name, or its symbol if it is known on the chain (USDC)"
+    )
     open_orders_limit: PositiveInt = option(16_384, "most open orders that a provider keeps, 2 KB each")
     unmined_limit: PositiveInt = option(
         16, "most transactions of a provider that wait to be mined; some nodes keep no more of one account"
@@ -284,7 +286,9 @@ class AcceptanceSettings:
     queue_limit: NaturalInt = option(
         0, "most jobs that an agent has at a time: those that run, wait, or were offered (0: no limit)"
     )
-    least_price: str = option("", "least cost of a job that an agent takes, in the token erc20_token (1.5; empty: any)")
+    least_price: str = option(
+        "", "least cost of a job that an agent takes: 1.5, in the token erc20_token, or 3.50 USDC (empty: any)"
+    )
     accept: tuple[str, ...] = option((), "addresses of the only customers that an agent works for (empty: all)")
     refuse: tuple[str, ...] = option((), "addresses of customers that an agent never works for (banned)")
     hours: tuple[str, ...] = option(

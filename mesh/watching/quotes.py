@@ -33,9 +33,13 @@ async def asked_quotes(
     robots: Collection[str],
     model: str,
     objective: str,
+    token: str = "",
     timeout: float = QUOTE_TIMEOUT,
 ) -> list[Quote]:
-    """The quotes of these `robots` (addresses) that arrive in `timeout` seconds: the cheapest first, refusals last."""
+    """The quotes of these `robots` (addresses) that arrive in `timeout` seconds: the cheapest first, refusals last.
+
+    Costs are compared within a token only: those in `token` (an address) come first, then each other token's.
+    """
     request = QuoteRequest(
         model=model,
         objective=objective,
@@ -54,4 +58,7 @@ async def asked_quotes(
             is_asked = keys.get(str(reply.ok.key_expr)) == quote.agent and quote.request == request.identity
             if is_asked and quote.agent not in found and quote.is_signed:
                 found[quote.agent] = quote
-    return sorted(found.values(), key=lambda quote: (bool(quote.code), quote.cost, quote.start, quote.agent))
+    return sorted(
+        found.values(),
+        key=lambda one: (bool(one.code), one.token != token, one.token, one.cost, one.start, one.agent),
+    )

@@ -18,6 +18,7 @@ from mesh.errors import InputError
 from mesh.watching.market import TIMEOUT, query_all
 from mesh.watching.presence import BATCH, PATIENCE, present
 from schemas import InvalidRecord, ProfileKey, parse_address
+from schemas.address import shortened
 from schemas.profiles import LARGEST_PROFILE, Profile, ProfileState
 
 if TYPE_CHECKING:
@@ -93,11 +94,6 @@ def robot_of(profile: Profile) -> Robot:
     """The robot that a profile presents."""
     facts = msgspec.structs.asdict(profile)
     return Robot(address=facts.pop("agent"), **{name: facts[name] for name in facts if name != "signature"})
-
-
-def shortened(address: str) -> str:
-    """An address shortened to its ends."""
-    return f"{address[:6]}…{address[-4:]}"
 
 
 def labelled(address: str, name: str) -> str:

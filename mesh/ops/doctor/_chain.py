@@ -370,13 +370,13 @@ class AccountChecks:
         """
         chain, found = self._chain_checks.chain, list[str]()
         since, hints = await chain.block_number() + 1, list[str]()
-        for token in dict.fromkeys((chain.xrt, await chain.names.address(self._context.settings.erc20_token))):
+        for token in dict.fromkeys((chain.xrt, await chain.tokens.address(self._context.settings.erc20_token))):
             spenders, oldest = await self._approved(token)
-            since, info = min(since, oldest), await chain.tokens.info(token)
+            since, unit = min(since, oldest), await chain.tokens.unit(token)
             for spender in sorted(spenders - {chain.factory})[:SPENDERS]:
                 allowed = await chain.tokens.allowance(self.address, spender, token=token)
                 if allowed and not await chain.lighthouses.exists(spender):
-                    found.append(f"{spender} {_amount(allowed, Unit(info.symbol or 'tokens', info.decimals))}")
+                    found.append(f"{spender} {_amount(allowed, unit)}")
                     option = "" if token == chain.xrt else f" --token {token}"
                     hints.append(f"`aira xrt approve {spender} 0{option}`")
         looked = f"its approvals since block {since:,} were looked at, no earlier ones and no other tokens"
@@ -442,8 +442,7 @@ class AccountChecks:
         return passed(f"{self.address} is a juror of {court.contract}: {court.quorum} of {court.jurors} must agree")
 
     async def _coin(self) -> Unit:
-        token = await self._chain_checks.chain.tokens.info(self._context.settings.erc20_token)
-        return Unit(token.symbol or "tokens", token.decimals)
+        return await self._chain_checks.chain.tokens.unit(self._context.settings.erc20_token)
 
 
 def _amount(count: int, coin: Unit) -> str:

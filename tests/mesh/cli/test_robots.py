@@ -12,8 +12,9 @@ from mesh.cli import status as commands
 from mesh.cli.robots import command, doing, record_of
 from mesh.cli.watch import watch
 from mesh.network import Endpoints, Network
-from mesh.watching.robots import Robot, shortened
+from mesh.watching.robots import Robot
 from schemas import ProfileKey
+from schemas.address import shortened
 from tests.mesh.agent.test_own_model import DRIVE, driving
 from tests.mesh.agent.test_profile import robot_at
 from tests.support.commands import coroutine

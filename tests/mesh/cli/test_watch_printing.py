@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from mesh.amounts import XRT
 from mesh.cli.watch import EventFormatter, event_json, format_counters
 from mesh.network import Reading
 from mesh.watching import JobEvent, MarketCounters, PresenceChange, PresentPeer
@@ -20,7 +21,7 @@ NOON = "2026-01-01T12:00:00.000Z"
 
 
 def format_line(message: Any) -> str:
-    return EventFormatter(TOKEN).line(message)
+    return EventFormatter({TOKEN: XRT}).line(message)
 
 
 def test_an_order_is_printed_as_a_line() -> None:
@@ -34,7 +35,7 @@ def test_an_order_is_printed_as_a_line() -> None:
 
 
 def test_an_amount_of_an_unknown_token_is_printed_in_its_smallest_units() -> None:
-    line = EventFormatter(None).line(verify_message(demand(cost=1500)))
+    line = EventFormatter({}).line(verify_message(demand(cost=1500)))
     assert f"pays 1,500 units of {TOKEN[:6]}…{TOKEN[-4:]}, " in line
 
 

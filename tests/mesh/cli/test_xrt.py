@@ -11,6 +11,7 @@ from mesh.chain import XRT, Account, TransactionSender, new_private_key
 from mesh.chain._accounts import KeyfileError
 from mesh.chain.errors import InsufficientFunds, NodeUnreachable, UnknownName
 from mesh.errors import ChainError, InputError
+from schemas.address import shortened
 from tests.mesh.cli.served_chain import MONEY, ServedChain, columns, write_quick_keyfile
 from tests.support.commands import refused
 from tests.support.ports import free_port
@@ -69,7 +70,7 @@ def test_an_allowance_is_by_default_the_factorys_and_can_be_granted_and_revoked(
 
 def test_amounts_of_another_token_are_in_its_units(served: ServedChain) -> None:
     token = served.run(_deploy_token(served))
-    assert served.aira("xrt", "balance", "--token", token, by="provider").stdout == "123.45 XRT\n"
+    assert served.aira("xrt", "balance", "--token", token, by="provider").stdout == f"123.45 XRT ({shortened(token)})\n"
     assert served.run_json("xrt", "balance", NOBODY, "--token", token, by="provider")["token"] == token
 
 
@@ -89,9 +90,18 @@ def test_more_than_the_balance_is_refused_before_a_transaction_is_sent(served: S
     assert "smaller amount" in hint
 
 
-@pytest.mark.parametrize("amount", ["1,5", "lots", "1.0000000001", "5 ETH"])
+@pytest.mark.parametrize("amount", ["1,5", "lots", "1.0000000001"])
 def test_an_invalid_amount_is_one_clear_line(served: ServedChain, amount: str) -> None:
     assert "1.5" in refused(served.aira("xrt", "transfer", NOBODY, amount), InvalidAmount, repr(amount))
+
+
+def test_an_amount_may_name_its_token(served: ServedChain) -> None:
+    token = served.run(_deploy_token(served))
+    done = served.run_json("xrt", "transfer", NOBODY, f"1.5 {token}", by="provider")
+    assert (done["token"], done["amount"]) == (token, "1500000000")
+    refused(served.aira("xrt", "transfer", NOBODY, "5 ETH"), InputError, "'ETH'", code="unknown-token")
+    two = served.aira("xrt", "transfer", NOBODY, "5 XRT", "--token", token, by="provider")
+    refused(two, InvalidAmount, "two tokens", shortened(token))
 
 
 @pytest.mark.parametrize("address", ["0x709", "robot", "0x70997970c51812dc3A010C7d01b50e0d17dc79C8"])

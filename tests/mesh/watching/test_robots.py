@@ -12,8 +12,9 @@ import pytest
 
 from mesh.errors import InputError, InvalidAddress
 from mesh.watching import RobotDirectory, robot_address
-from mesh.watching.robots import CLOCK_ERROR, LOOKUP_TIMEOUT, OLDEST, shortened
+from mesh.watching.robots import CLOCK_ERROR, LOOKUP_TIMEOUT, OLDEST
 from schemas import ProfileKey, Signer
+from schemas.address import shortened
 from schemas.profiles import Profile
 from tests.mesh.watching.test_presence import Meeting, answering, meeting
 from tests.support.orders import OBJECTIVE, PERSON, ROBOT, STRANGER
