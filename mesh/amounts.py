@@ -20,8 +20,8 @@ AMOUNT: Final = re.compile(
 )
 
 TOKEN_AMOUNT: Final = re.compile(
-    r"(?P<number>(?:[0-9][0-9_]*|(?=\.[0-9]))(?:\.[0-9]+)?)(?:\s*(?P<name>[A-Za-z][A-Za-z0-9._-]*)"
-    r"|\s+(?P<address>0[xX][0-9A-Fa-f]{40}))?",
+    r"(?P<number>(?:[0-9][0-9_]*|(?=\.[0-9]))(?:\.[0-9]+)?)"
+    r"(?:\s*(?P<word>[A-Za-z]+)|\s+(?P<name>[A-Za-z][A-Za-z0-9._-]*|0[xX][0-9A-Fa-f]{40}))?",
     re.ASCII,
 )
 """An amount that may name its token."""
@@ -36,7 +36,7 @@ def split_amount(text: str) -> tuple[str, str]:
     found = TOKEN_AMOUNT.fullmatch(text.strip())
     if found is None:
         raise InvalidAmount(f"{text[:40]!r} is not an amount", hint="write it like 1.5, 1.5 XRT or 3.50 USDC")
-    return found["number"], found["name"] or found["address"] or ""
+    return found["number"], found["word"] or found["name"] or ""
 
 
 @dataclass(frozen=True, slots=True)

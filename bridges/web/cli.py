@@ -14,7 +14,7 @@ import click
 
 from mesh.base.extras import needs_extra
 from mesh.cli.files import file_or_cid, model_named, require_readable
-from mesh.cli.options import TokenAmountText, with_settings
+from mesh.cli.options import AmountText, with_settings
 from mesh.cli.output import announce
 from mesh.errors import InputError
 from mesh.role.running import open_when_ready, run_until_stopped, serve_on_each_chain, wait_for_files
@@ -25,7 +25,7 @@ from schemas.decoding import InvalidData, decode_toml, text_of
 
 if TYPE_CHECKING:
     from bridges.web.access import WebOptions
-    from mesh.chain import Chain
+    from mesh.amounts import Unit
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option("--model", help="page for one robot: its model, a file or a CID")
 @click.option("--objective", help="page for one robot: what it is ordered to do, a file or a CID")
 @click.option(
-    "--cost", type=TokenAmountText(), help="page for one robot: the price, in tokens (1.5) or their smallest unit (5wn)"
+    "--cost", type=AmountText(), help="page for one robot: the price, in tokens (1.5) or their smallest unit (5wn)"
 )
 @with_settings(
     NetworkSettings,
@@ -100,7 +100,8 @@ async def _serve(options: dict[str, Any], telemetry: Telemetry, settings: Settin
         make = partial(opened, settings)
         components = await open_when_ready(stack, settings, make, role="page", on_wait=telemetry.starting)
         if chosen.robot is not None:
-            chosen = replace(chosen, robot=await priced(chosen.robot, components.chain, settings.erc20_token))
+            unit = await components.chain.tokens.unit(settings.erc20_token)
+            chosen = replace(chosen, robot=priced(chosen.robot, unit))
             for file in files_of(options):
                 await asyncio.to_thread(components.store.put_file, file)
         server = await stack.enter_async_context(PageServer(components, chosen))
@@ -156,7 +157,7 @@ def robot_of(options: dict[str, Any]) -> dict[str, Any] | None:
     objective = _objective_in(given)
     cost = str(given.get("cost", "")) or None
     if cost is not None:
-        TokenAmountText().convert(cost, None, None)  # its value depends on the token
+        AmountText().convert(cost, None, None)  # its value depends on the token
     return {
         "model": model_named(str(given.get("model", ""))).cid(),
         "objective": cid_of_file(objective) if isinstance(objective, Path) else objective,
@@ -166,11 +167,9 @@ def robot_of(options: dict[str, Any]) -> dict[str, Any] | None:
     }
 
 
-async def priced(robot: dict[str, Any], chain: Chain, token: str) -> dict[str, Any]:
+def priced(robot: dict[str, Any], unit: Unit) -> dict[str, Any]:
     """The robot with its cost in the smallest unit of the token, as requests have it. Raises `InvalidAmount`."""
-    if robot["cost"] is None:
-        return robot
-    return robot | {"cost": str((await chain.tokens.amounts(robot["cost"], token=token)).values[0])}
+    return robot if robot["cost"] is None else robot | {"cost": str(unit.parse(robot["cost"]))}
 
 
 def files_of(options: dict[str, Any]) -> list[Path]:

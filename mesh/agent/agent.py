@@ -756,8 +756,8 @@ class Agent(Program):
         refusals = [(one.agent, f"declines ({one.code})") for one in declined]
         for one in (one for one in found if one not in fitting):
             is_late = start_within is not None and one.start > start_within and not one.code
-            why = f"begins in {one.start:g} s" if is_late else f"wants {units[one.token].show(one.cost)}"
-            refusals.append((one.agent, f"declines ({one.code})" if one.code else why))
+            why = f"begins in {one.start:g} s" if is_late else f"declines ({one.code})"
+            refusals.append((one.agent, why if is_late or one.code else f"wants {units[one.token].show(one.cost)}"))
         said = [f"{labelled(agent, self.parts.robots.name(agent))} {why}" for agent, why in refusals]
         raise RemoteError(
             f"no robot does it for {unit.show(most)}: {'; '.join(said[:5]) or 'none of this model answers'}",
