@@ -358,31 +358,31 @@ OTHER_FIELDS: Final = 64
 """Bytes of a transaction beside its data, about: number, fees, gas, recipient."""
 FEE_SECONDS: Final = 60.0
 """How long what the oracle said is used."""
+NO_ORACLE_SECONDS: Final = 600.0
+"""How long a chain counts as one without an oracle: a node may have answered nothing by mistake."""
 
 
 class DataFees:
     """What a rollup of the OP type charges for the data of transactions, which it brings to Ethereum, beside their gas.
 
-    Its oracle is asked once a minute at most. What is charged goes by the compressed length, to which zeros add
-    nothing, so each other byte costs about the same. On a chain without the oracle nothing is asked after the first
-    time. `call` calls it.
+    Its oracle is asked once a minute at most, or once in ten where it has never answered. What is charged goes by the
+    compressed length, to which zeros add nothing, so each other byte costs about the same. `call` calls it.
     """
 
     def __init__(self, call: Callable[[bytes], Awaitable[bytes | None]]) -> None:
         self._call = call
-        self._has_oracle = True
         self._per_byte = 0.0
         self._until = float("-inf")
 
     async def of(self, data: bytes) -> int:
         """What a transaction with this data is charged now, about; 0 elsewhere, wei."""
         now = asyncio.get_running_loop().time()
-        if self._has_oracle and now >= self._until:
+        if now >= self._until:
             answer = await self._call(GET_L1_FEE + encode(["bytes"], [FEE_SAMPLE]))
-            self._has_oracle = answer != b""
             if answer is not None and len(answer) == 32:
                 self._per_byte = int.from_bytes(answer) / len(FEE_SAMPLE)
-            self._until = now + FEE_SECONDS
+            has_oracle = self._per_byte or answer != b""
+            self._until = now + (FEE_SECONDS if has_oracle else NO_ORACLE_SECONDS)
         return round(self._per_byte * (len(data) - data.count(0) + OTHER_FIELDS))
 
 

@@ -6,9 +6,9 @@ Options keep the names and the defaults of the legacy stack where it had them.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from mesh.errors import ConfigurationError
 from mesh.settings._options import (
@@ -390,23 +390,31 @@ class Settings(
 ):
     """Every option of the mesh, with its default."""
 
+    _filled: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    """What the chain filled in: `dataclasses.replace(settings, chain=…)` fills it in again."""
+
     def __post_init__(self) -> None:
         """Contract names that are not given are those of the generation; other options are those of the chain."""
         for name, template in CONTRACT_NAMES.items():
             if not getattr(self, name):
                 object.__setattr__(self, name, template.format(self.generation))
+        filled = {}
         for name in FILLED:
-            if not getattr(self, name):
-                object.__setattr__(self, name, getattr(self.profile, name))
+            if not (given := getattr(self, name)) or given == self._filled.get(name):
+                filled[name] = getattr(self.profile, name)
+                object.__setattr__(self, name, filled[name])
+        object.__setattr__(self, "_filled", filled)
 
 
 def options_of(group: type) -> tuple[str, ...]:
     """The names of a group's options, in order."""
-    return tuple(each.name for each in fields(group))
+    return tuple(each.name for each in fields(group) if "meaning" in each.metadata)
 
 
 OPTIONS: Final = options_of(Settings)
-MEANING: Final[Mapping[str, str]] = {each.name: each.metadata["meaning"] for each in fields(Settings)}
+MEANING: Final[Mapping[str, str]] = {
+    each.name: each.metadata["meaning"] for each in fields(Settings) if "meaning" in each.metadata
+}
 """What each option means, in one line."""
 DEFAULTS: Final = Settings()
 """Every option with its default."""

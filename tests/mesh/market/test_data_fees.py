@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import pytest
 
 from mesh.agent.statement import read_statement
 from mesh.chain import Account, InsufficientFunds, Node, TransactionSender
+from mesh.chain._node import FEE_SECONDS, NO_ORACLE_SECONDS, DataFees
 from mesh.dev import EmbeddedChain
 from mesh.market.provider import check_account
 from mesh.market.transactions import LEAST_GAS, least_cost
@@ -128,3 +130,18 @@ async def test_a_chain_without_the_oracle_is_asked_once() -> None:
         assert [await node.data_fee(b"\x01" * 100) for _ in range(3)] == [0, 0, 0]
         assert await node.data_gas(b"\x01") == 0
     assert asked["eth_call"] == 1
+
+
+async def test_an_empty_answer_by_mistake_does_not_end_the_fees(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = [b"", (3200).to_bytes(32), b"", (6400).to_bytes(32)]
+
+    async def oracle(data: bytes) -> bytes:
+        return answers.pop(0)
+
+    now = 0.0
+    monkeypatch.setattr(asyncio.get_running_loop(), "time", lambda: now)
+    fees, found = DataFees(oracle), []
+    for wait in (0.0, NO_ORACLE_SECONDS, FEE_SECONDS, FEE_SECONDS):
+        now += wait
+        found.append(await fees.of(b"\x01" * 36) // 100)
+    assert found == [0, 3, 3, 6]

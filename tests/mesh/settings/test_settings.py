@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,14 @@ def test_a_named_chain_sets_what_is_not_given() -> None:
     assert (settings.confirmations, settings.reorg_depth) == (9, 77), "what is given is kept"
     assert (settings.poll_interval, settings.deadline_limit) == (known.poll_interval, 432_000)
     assert load(environ={"AIRA_CHAIN": "base"}).confirmations == known.confirmations
+
+
+def test_another_chain_brings_its_own_values_and_keeps_given_ones() -> None:
+    settings = replace(load(environ={"AIRA_CHAIN": "base", "AIRA_REORG_DEPTH": "77"}), chain="gnosis")
+
+    assert (settings.confirmations, settings.deadline_limit) == (CHAINS["gnosis"].confirmations, 17_280)
+    assert settings.reorg_depth == 77, "what is given is kept"
+    assert replace(settings, name="Lift 1").confirmations == settings.confirmations
 
 
 def test_without_a_chain_everything_is_as_on_any() -> None:

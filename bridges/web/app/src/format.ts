@@ -14,7 +14,7 @@ export function plain(text: string, most = 400): string {
 }
 
 export function amount(units: string | bigint, token: Token): string {
-  return `${grouped(formatUnits(BigInt(units), token.decimals))} ${plain(token.symbol, 12)}`;
+  return `${grouped(formatUnits(BigInt(units), token.decimals))} ${plain(token.symbol, 32)}`;
 }
 
 export function ether(wei: string | bigint): string {

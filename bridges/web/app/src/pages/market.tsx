@@ -94,8 +94,8 @@ function Prices({ jobs, token }: { jobs: PastJob[]; token: Token }) {
   if (points.length < 2) return <p class="quiet">{texts.noPrices}</p>;
   return (
     <>
-      <p class="hint">{texts.pricesOver(plain(token.symbol, 12))}</p>
-      <div class="plot" ref={box} role="img" aria-label={texts.pricesOver(plain(token.symbol, 12))} />
+      <p class="hint">{texts.pricesOver(plain(token.symbol, 32))}</p>
+      <div class="plot" ref={box} role="img" aria-label={texts.pricesOver(plain(token.symbol, 32))} />
     </>
   );
 }

@@ -79,7 +79,7 @@ function OrderForm({ model, robot, objective }: { model: Model; robot: string; o
         <Robots quotes={quotes} asking={make !== null} wanted={wanted} choose={choose} again={ask} />
         {wanted === "" ? (
           <div class="fields">
-            <NumberField label={texts.youPay(plain(market.token.symbol, 12))} text={price} change={setPrice} error={offered === null ? texts.notAnAmount : ""} hint={texts.youPayHint} class="big number" />
+            <NumberField label={texts.youPay(plain(market.token.symbol, 32))} text={price} change={setPrice} error={offered === null ? texts.notAnAmount : ""} hint={texts.youPayHint} class="big number" />
             <Field label={texts.waitFor} hint={texts.waitForHint}>
               {(id, described) => (
                 <select id={id} aria-describedby={described} class="big" value={minutes ?? ""} onChange={(event) => setMinutes(Number(event.currentTarget.value) || null)}>

@@ -158,7 +158,7 @@ function Controls(props: { robot: Agent; rules: Rules; changed: () => void }) {
       </div>
       <StopDialog title={texts.stopRobot} open={stopping} close={() => setStopping(false)} stop={stop} notNow={texts.notNow}><p>{texts.stopRobotHint}</p></StopDialog>
       <div class="fields owner-fields">
-        <PriceSetting id="set-price" label={texts.priceOfJob} hint={texts.priceOfJobHint(plain(market.token.symbol, 12))} now={rules.price} save={(price, forget) => change({ price }, forget)()} />
+        <PriceSetting id="set-price" label={texts.priceOfJob} hint={texts.priceOfJobHint(plain(market.token.symbol, 32))} now={rules.price} save={(price, forget) => change({ price }, forget)()} />
         <PriceSetting id="set-least" label={texts.leastPrice} hint={texts.leastPriceHint} now={rules.leastPrice} save={(leastPrice, forget) => change({ leastPrice }, forget)()} />
       </div>
       <h3>{texts.refused}</h3>
