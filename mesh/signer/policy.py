@@ -236,7 +236,7 @@ def read_policy_file(path: Path) -> bytes:
         why = "it is a link" if is_link else error.strerror or str(error)
         hint = "name the file itself" if is_link else ""
         raise ConfigurationError(f"can't use the policy {path}: {why}", hint=hint, code="policy-unsafe") from None
-    with os.fdopen(descriptor, "rb") as file:
+    try:
         status, folder = os.fstat(descriptor), path.absolute().parent.stat()
         own = {os.geteuid(), 0}
         is_shared = folder.st_mode & 0o022 and not folder.st_mode & stat.S_ISVTX
@@ -249,7 +249,9 @@ def read_policy_file(path: Path) -> bytes:
         ):
             if unsafe:
                 raise ConfigurationError(f"can't use the policy {path}: {why}", hint=hint, code="policy-unsafe")
-        return file.read(LARGEST_POLICY + 1)
+        return os.read(descriptor, LARGEST_POLICY + 1)
+    finally:
+        os.close(descriptor)
 
 
 def line_of(text: str, path: tuple[str | int, ...]) -> int:

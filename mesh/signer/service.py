@@ -426,6 +426,9 @@ class Signer(Lifecycle):
             parse_cid(cid)
             objective = await self.agent.examine(cid)
             return cid, await asyncio.to_thread(self._allowed_robots, model, objective, robot)
+        found = self.policy.rules_allowing(model, ((one.topic, one.value) for one in messages), robot)
+        if isinstance(found, Decision):  # before anything is made of them
+            raise _refusal(found)
         description = await self._description(model)
         return await asyncio.to_thread(self._packed, model, messages, description, robot)
 
