@@ -2,7 +2,7 @@
 
 `ipfs`: a bare client of one daemon publishes to a bare client of a connected daemon, as on the legacy network.
 `bridge`: a demand on a Zenoh key reaches a bare client of the second daemon. `zenoh`: the same demand reaches a
-verified subscription. The daemons are js-ipfs, or with `--daemon kubo` those that `AIRA_KUBO` names; a Kubo gets at
+verified subscription. The daemons are js-ipfs, or with `--daemon kubo` a current Kubo; a Kubo gets at
 most one message every 20 ms, and those pauses are not measured. Daemons and router run in processes of their own.
 Latencies are measured one message at a time, rates without waiting between messages.
 """

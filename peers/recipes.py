@@ -1,4 +1,4 @@
-"""How peers are installed: from npm, crates, PyPI and Debian; every version is exact where a recipe can say it.
+"""How peers are installed: from npm, crates, Go modules, PyPI and Debian; versions are exact where a recipe can say it.
 
 A recipe with a folder of its own marks it complete at the very end, with a fingerprint of what it was made from: a
 folder that was left half done, or made from other versions, is made again.
@@ -10,7 +10,7 @@ import hashlib
 import os
 import shutil
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -173,6 +173,54 @@ class SourceRecipe:
 
     def _files(self) -> list[Path]:
         return [self.source / "Cargo.toml", self.source / "Cargo.lock", *sorted((self.source / "src").glob("*.rs"))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoRecipe:
+    """One program built from Go modules, for a minute or more on all cores.
+
+    `package` is built at `version`; or, if `source` is given, the module in that folder. What the Go client downloads
+    and compiles on the way, some gigabytes, is removed.
+    """
+
+    name: str
+    program: str
+    package: str = ""
+    version: str = ""
+    source: Path | None = None
+    environment: Mapping[str, str] = field(default_factory=lambda: {"GOTOOLCHAIN": "auto", "GOFLAGS": "-modcacherw"})
+
+    @property
+    def folder(self) -> Path:
+        return cache_folder() / f"go-{self.program}"
+
+    def is_complete(self) -> bool:
+        return _is_marked(self.folder, self.made_from())
+
+    def install(self, run: Runner) -> None:
+        _make_empty(self.folder)
+        build = self.folder / "build"
+        run = replace(
+            run,
+            environment={
+                **run.environment,
+                "GOPATH": str(build / "path"),
+                "GOCACHE": str(build / "cache"),
+                "GOBIN": str(self.folder / "bin"),
+            },
+        )
+        flags = ["-trimpath", "-ldflags", "-s -w"]
+        if self.source is None:
+            run(["go", "install", *flags, f"{self.package}@{self.version}"], timeout=1800)
+        else:
+            to = ["-mod=readonly", "-o", str(self.folder / "bin" / self.program)]
+            run(["go", "build", *flags, *to, "."], timeout=1800, cwd=self.source)
+        shutil.rmtree(build)
+        _mark(self.folder, self.made_from())
+
+    def made_from(self) -> str:
+        """The version, or the hash of the module's files."""
+        return self.version if self.source is None else _fingerprint(sorted(self.source.iterdir()))
 
 
 @dataclass(frozen=True, kw_only=True)

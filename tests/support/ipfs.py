@@ -117,7 +117,7 @@ class JsIpfs(IpfsDaemon):
 
 
 class Kubo(IpfsDaemon):
-    """A current Kubo daemon. Without one in `AIRA_KUBO` the test is skipped."""
+    """A current Kubo daemon."""
 
     name = peer = "kubo"
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AIRA_PEERS_CACHE", str(tmp_path))
     monkeypatch.delenv("AIRA_REQUIRE_PEERS", raising=False)
-    monkeypatch.delenv("AIRA_KUBO", raising=False)
+    monkeypatch.delenv("AIRA_MCAP", raising=False)
 
 
 def test_a_missing_peer_skips_the_test_with_the_reason() -> None:
@@ -30,12 +30,12 @@ def test_a_missing_peer_fails_the_test_if_all_are_required(monkeypatch: pytest.M
 
 def test_a_peer_without_a_recipe_is_skipped_even_then(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AIRA_REQUIRE_PEERS", "1")
-    with pytest.raises(pytest.skip.Exception, match="AIRA_KUBO=/path/to/ipfs"):
-        require("kubo")
+    with pytest.raises(pytest.skip.Exception, match="AIRA_MCAP=/path/to/mcap"):
+        require("mcap")
 
 
-def test_the_caller_can_name_a_kubo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = tmp_path / "ipfs"
+def test_the_caller_can_name_an_mcap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "mcap"
     program.touch()
-    monkeypatch.setenv("AIRA_KUBO", str(program))
-    assert require("kubo") == program
+    monkeypatch.setenv("AIRA_MCAP", str(program))
+    assert require("mcap") == program

@@ -36,7 +36,7 @@ class Swarm:
 
 @pytest.fixture(scope="package", params=KINDS)
 def kind(request: pytest.FixtureRequest) -> type[JsIpfs | Kubo]:
-    """The kind of daemon: js-ipfs, and a current Kubo if `AIRA_KUBO` names one."""
+    """The kind of daemon: js-ipfs, and a current Kubo."""
     return KINDS[request.param]
 
 
