@@ -32,9 +32,27 @@ MOST_READINGS: Final = 4
 LONGEST_READING: Final = 80
 """Characters of a reading in a profile, and of its topic."""
 
+MOST_HANDOVERS: Final = 4
+"""Earlier keys of a robot that its profile can prove, the latest ones."""
+
 _Waiting: TypeAlias = Annotated[int, Meta(ge=0, le=MOST_WAITING)]
 _Name: TypeAlias = Annotated[str, Meta(max_length=LONGEST_NAME)]
 _Reading: TypeAlias = Annotated[str, Meta(max_length=LONGEST_READING)]
+
+
+class Handover(SignedRecord, frozen=True, kw_only=True):
+    """The word of an account that its robot goes on under another key, of `successor` (EIP-55).
+
+    `time` is the robot's time of day then, Unix seconds.
+    It counts only in a profile that the successor has signed, so that both keys say it: see `Profile.predecessors`.
+    """
+
+    domain: ClassVar = b"aira handover\0"
+    author: ClassVar = "agent"
+
+    agent: str
+    successor: str
+    time: int
 
 
 class Profile(SignedRecord, frozen=True, kw_only=True):
@@ -44,8 +62,8 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
     that the owner chose: two robots may have one name. `picture` is the CID of an image, `price` what a job usually
     costs, as in a description of a model; both may be empty. `queue` jobs wait, and a new one would begin in about
     `wait` seconds. `stopped` says that somebody stopped the robot, `closed` that it takes no jobs now. `readings` are
-    the latest ones that the robot has published outside of jobs, as plain text by their topics. `time` is the robot's
-    time of day in Unix seconds. Trust it only if it `is_signed`, and is on the agent's key.
+    the latest ones that the robot has published outside of jobs, as plain text by their topics. `handovers` are those
+    by which it got its key, oldest first. `time` is the robot's time of day in Unix seconds. Trust it only if it `is_signed`, and is on the agent's key.
     """
 
     domain: ClassVar = b"aira profile\0"
@@ -62,7 +80,19 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
     queue: _Waiting = 0
     wait: _Waiting = 0
     readings: Annotated[dict[_Reading, _Reading], Meta(max_length=MOST_READINGS)] = field(default_factory=dict)
+    handovers: Annotated[tuple[Handover, ...], Meta(max_length=MOST_HANDOVERS)] = ()
     time: int
+
+    @property
+    def predecessors(self) -> tuple[str, ...]:
+        """The robot's earlier addresses, latest first: each has signed that the next one goes on."""
+        found: list[str] = []
+        heir = self.agent
+        for handover in reversed(self.handovers):
+            if handover.successor != heir or handover.agent in (self.agent, *found) or not handover.is_signed:
+                break
+            found.append(heir := handover.agent)
+        return tuple(found)
 
     def __post_init__(self) -> None:
         Record.__post_init__(self)

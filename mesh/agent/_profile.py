@@ -24,6 +24,7 @@ from mesh.base.flood import Rate
 from mesh.errors import ChainError, ConfigurationError
 from mesh.network.services import answering
 from mesh.role.database import LedgerUnusable
+from mesh.role.handover import handovers_to
 from schemas import ProfileKey
 from schemas.cid import is_cid
 from schemas.payloads import plain_value
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from mesh.settings import ProfileSettings
     from schemas.model import ModelDescription
     from schemas.payloads import PayloadType
+    from schemas.profiles import Handover
 
 log = logging.getLogger(__name__)
 
@@ -80,6 +82,7 @@ class OwnProfile:
         self._rules = rules
         self._model = model
         self._picture = ""
+        self._handovers: tuple[Handover, ...] = ()
         self._seconds = float((None if description is None else description.seconds) or 0)
         self._changed = asyncio.Event()
         self._readings: dict[str, tuple[bytes, PayloadType]] = {}
@@ -90,6 +93,7 @@ class OwnProfile:
         Raises `ConfigurationError` (`profile-invalid`, `picture-unusable`).
         """
         settings = self._parts.settings
+        self._handovers = handovers_to(settings.state_directory, self._parts.signer.address)
         for field in ("name", "about", "place"):
             if why := text_fault(field, getattr(settings, field)):
                 raise ConfigurationError(f"the setting {field} can't be used: {why}", code="profile-invalid")
@@ -167,6 +171,7 @@ class OwnProfile:
             queue=queue,
             wait=wait,
             readings={topic: _text(*reading) for topic, reading in [*self._readings.items()]},
+            handovers=self._handovers,
             time=int(time.time()),
         )
         return profile.signed_by(signer)

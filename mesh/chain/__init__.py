@@ -15,6 +15,7 @@ with needs_extra("chain", "the chain"):
         copy_keyfile,
         keyfile_address,
         new_private_key,
+        retire_keyfile,
         write_keyfile,
     )
     from mesh.chain._client import Chain

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import json
 import secrets
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
 
 from mesh.base.extras import needs_extra
-from mesh.base.private_files import write_new
+from mesh.base.private_files import sync_directory, write_new
 from mesh.errors import ConfigurationError, InputError
 from schemas.address import address_bytes, checksum_address, keccak256, parse_address
 from schemas.decoding import InvalidData, decode_json, first_line, text_of
@@ -42,13 +43,17 @@ PBKDF2_WORK: Final = 10_000_000
 DERIVED_SIZES: Final = range(32, 129)
 """Bytes that a keyfile may derive from its password; it uses 32."""
 
+SUCCESSOR: Final = "successor"
+"""The field of a retired keyfile with the address under which its owner goes on."""
+
 
 class KeyfileError(ConfigurationError, code="keyfile-error"):
     """A keyfile or its password file can't be read or written, or is not Web3 secret storage.
 
     Its code says which: `keyfile-exists` (none is ever overwritten), `not-a-keyfile`, `keyfile-too-costly` (opening it
     would take more memory or time than is allowed: a stranger's may ask for any amount), `keyfile-address-wrong` (money
-    sent to the stated address would not reach its owner), `wrong-password`, else `keyfile-error`.
+    sent to the stated address would not reach its owner), `keyfile-retired` (the owner has replaced the key),
+    `wrong-password`, else `keyfile-error`.
     """
 
     def __init__(self, path: object, why: str, *, hint: str = "", code: str = "") -> None:
@@ -88,6 +93,14 @@ class Account:
 
         Takes most of a second, by design of keyfiles. Raises `KeyfileError`.
         """
+        if (successor := _read_keyfile(Path(keyfile)).get(SUCCESSOR)) is not None:
+            raise KeyfileError(
+                keyfile,
+                f"holds a retired key: its work goes on as {str(successor)[:80]}",
+                hint="name the new keyfile; to use the old key all the same, copy it with "
+                "`aira account import NEW-FILE --from-keyfile`",
+                code="keyfile-retired",
+            )
         return cls(_open_keyfile(Path(keyfile), _read_password(Path(password_file)), password_from=password_file))
 
     def sign_transaction(self, fields: Mapping[str, Any]) -> SignedTransaction:
@@ -139,6 +152,17 @@ def copy_keyfile(source: Path | str, path: Path | str, *, opened_by: str, passwo
     """
     key = _open_keyfile(Path(source), opened_by.encode(), password_from=password_from)
     return write_keyfile(path, key, password)
+
+
+def retire_keyfile(keyfile: Path, retired: Path, *, successor: str) -> None:
+    """Write a copy of a keyfile that `Account.from_keyfile` refuses, unless `retired` exists. Raises `KeyfileError`."""
+    content = json.dumps(_read_keyfile(keyfile) | {SUCCESSOR: successor}).encode()
+    try:
+        with suppress(FileExistsError):
+            write_new(retired, content)
+        sync_directory(retired.parent)
+    except OSError as error:
+        raise KeyfileError(retired, f"can't be written: {error.strerror}") from None
 
 
 def keyfile_address(keyfile: Path | str) -> str | None:

@@ -5,19 +5,22 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
+from msgspec import to_builtins
 
 from mesh.amounts import ETH, XRT
 from mesh.cli.chain_client import address_in_keyfile, open_chain, required_address
-from mesh.cli.options import FILE, with_chain_settings, with_json
-from mesh.cli.output import print_result
+from mesh.cli.options import FILE, with_chain_settings, with_json, with_settings, with_timeout
+from mesh.cli.output import plural, print_result
 from mesh.errors import ConfigurationError, InputError
 from mesh.role.running import run_to_end
+from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
 from schemas.decoding import InvalidData, first_line, text_of
 
 if TYPE_CHECKING:
+    from mesh.ops.rotation import Rotated, RotationPlan
     from mesh.settings import Settings
 
 
@@ -112,6 +115,60 @@ def show(settings: Settings, file: Path | None, password_file: Path | None, bala
         run_to_end(lambda: _show_balance(settings, address, as_json))
     else:
         print_account(address, file or Path(settings.keyfile), as_json)
+
+
+@command.command("rotate", short_help="give a robot or a provider a new key")
+@click.option("--dry-run", is_flag=True, help="only show what would be done")
+@with_timeout(None, meaning="seconds to wait until the contracts have ended [no limit]")
+@with_json
+@with_settings(NetworkSettings, "lighthouse_contract", AccountSettings, ChainSettings)
+async def rotate(settings: Settings, dry_run: bool, timeout: float | None, as_json: bool) -> None:
+    """Move the robot or the provider of the settings to a new key, which takes the place of the old one in its keyfile.
+
+    The robot takes no new jobs, its open orders are withdrawn on the chain, and its contracts end: let it run
+    meanwhile. Then the tokens, the coin and the stake at the lighthouse move, and both keys sign that this is the same
+    robot. The old keyfile stays beside the new one, and no role uses it any more. Start the robot or the provider again
+    after that; a provider must be stopped before.
+
+    If it is interrupted, repeat the command: it goes on where it stopped.
+    """
+    from mesh.ops.rotation import Rotation
+
+    rotation = Rotation(settings, report=lambda line: click.echo(line, err=True))
+    if dry_run:
+        plan = await rotation.plan()
+        names = {token: await _shown(settings, token, amount) for token, amount in plan.tokens.items()}
+        facts = {
+            "old address": plan.old,
+            "withdraws": plural(plan.orders, "open order"),
+            "waits for": plural(plan.contracts, "contract"),
+            "moves the stake": XRT.show(plan.stake) if plan.stake else None,
+            "moves": ", ".join([*names.values(), f"{ETH.show(plan.coin)}, less the price of its transactions"]),
+        }
+        print_result(_in_texts(plan), facts, as_json=as_json)
+        return
+    done = await rotation.run(timeout=timeout)
+    facts = {
+        "old address": done.old,
+        "new address": done.new,
+        "keyfile": done.keyfile,
+        "old keyfile": done.retired,
+        "left behind": ETH.show(done.left) if done.left else None,
+        "now": "start the robot or the provider again",
+    }
+    print_result(_in_texts(done), facts, as_json=as_json)
+
+
+def _in_texts(rotation: Rotated | RotationPlan) -> dict[str, Any]:
+    """For JSON: amounts are text, in the smallest units."""
+    facts: dict[str, Any] = to_builtins(rotation)
+    facts["tokens"] = {token: str(amount) for token, amount in rotation.tokens.items()}
+    return facts | {name: str(facts[name]) for name in ("stake", "coin", "left") if name in facts}
+
+
+async def _shown(settings: Settings, token: str, amount: int) -> str:
+    async with open_chain(settings) as chain:
+        return (await chain.tokens.unit(token)).show(amount)
 
 
 def _check_address(settings: Settings, keyfile: Path, password_file: Path | None) -> None:

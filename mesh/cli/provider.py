@@ -83,7 +83,9 @@ async def _open_provider(
     from mesh.market.provider import ProviderProcess, check_account, provider_of
     from mesh.network import Network
     from mesh.role.composition import chain_of, endpoints_of
+    from mesh.role.handover import check_not_retired
 
+    check_not_retired(settings.state_directory, account.address)
     async with chain_of(settings, account) as chain:
         await check_account(chain, settings.lighthouse_contract)
         async with (

@@ -19,6 +19,7 @@ from mesh.content import Exchange, Store
 from mesh.errors import NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network, Services
 from mesh.role.database import RoleLedger
+from mesh.role.handover import adopt_content, check_not_retired
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -84,11 +85,13 @@ async def open_parts(
     from mesh.role.following import ChainHead, first_position
 
     enter = stack.enter_async_context
+    check_not_retired(settings.state_directory, account.address)
     directory = await state_folder(settings, chain, account.address)
     opened = ledger(directory)
     await enter(opened)
     head = await ChainHead.at(chain, await first_position(opened, chain, lookback=lookback))
     network, channel = await enter(connected(settings, chain, head, drops))
+    adopt_content(settings.state_directory, account.address)
     store = await open_store(stack, settings, directory.parent / "content", limit=settings.objective_expanded_limit)
     return RoleParts(
         settings=settings,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import Counter
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
@@ -81,6 +82,8 @@ class Robot(msgspec.Struct, frozen=True, kw_only=True):
     """What it reads just now: the latest text that it has published on each topic outside of jobs, four at most."""
     time: int
     """When it said this, by its clock: Unix seconds."""
+    formerly: tuple[str, ...] = ()
+    """Its earlier addresses, latest first, whose keys have signed that it goes on under this one."""
     paid: int | None = None
     """Contracts that paid it, of the 500 latest on the chain of a week; None if this side did not count them."""
     refunded: int | None = None
@@ -93,7 +96,8 @@ class Robot(msgspec.Struct, frozen=True, kw_only=True):
 def robot_of(profile: Profile) -> Robot:
     """The robot that a profile presents."""
     facts = msgspec.structs.asdict(profile)
-    return Robot(address=facts.pop("agent"), **{name: facts[name] for name in facts if name != "signature"})
+    shown = {name: facts[name] for name in facts if name not in ("agent", "handovers", "signature")}
+    return Robot(address=profile.agent, formerly=profile.predecessors, **shown)
 
 
 def labelled(address: str, name: str) -> str:
@@ -131,15 +135,19 @@ class RobotDirectory:
     async def count(self, chain: Chain, robots: Iterable[Robot]) -> list[Robot]:
         """The same robots, with how the chain's latest contracts ended; what the chain says is kept for a minute.
 
+        Those of earlier addresses count, too, unless another one of `robots` is or was at that address.
         Raises `ChainError`.
         """
         outcomes, until = self._outcomes
         if time.monotonic() >= until:
             outcomes = await chain.liabilities.outcomes(blocks=COUNTED_BLOCKS, most=COUNTED)
             self._outcomes = outcomes, time.monotonic() + KEPT
-        counted = []
-        for robot in robots:
-            paid, refunded = outcomes.get(robot.address, (0, 0))
+        known, counted = list(robots), []
+        claims = Counter(address for robot in known for address in (robot.address, *robot.formerly))
+        for robot in known:
+            own = [robot.address, *(address for address in robot.formerly if claims[address] == 1)]
+            ends = [outcomes.get(address, (0, 0)) for address in own]
+            paid, refunded = (sum(numbers) for numbers in zip(*ends, strict=True))
             counted.append(msgspec.structs.replace(robot, paid=paid, refunded=refunded))
         return counted
 

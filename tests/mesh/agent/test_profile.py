@@ -15,8 +15,8 @@ from mesh.agent._profile import INTERVAL
 from mesh.agent.handlers import Job, JobFailed
 from mesh.network import Endpoints, Network
 from mesh.watching.robots import Robot, RobotDirectory
-from schemas import Empty, ProfileKey, cid_of_bytes
-from schemas.profiles import LARGEST_PICTURE, Profile
+from schemas import Empty, ProfileKey, Signer, cid_of_bytes
+from schemas.profiles import LARGEST_PICTURE, Handover, Profile
 from tests.mesh.agent.test_own_model import DRIVE, Move, driving
 from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import objective
@@ -244,5 +244,42 @@ async def test_an_agent_without_an_account_lists_robots_without_records(place: P
 
 
 def test_a_robot_has_all_that_its_profile_says() -> None:
-    names = {"agent", "signature"} ^ {field.name for field in msgspec.structs.fields(Profile)}
-    assert names | {"address", "paid", "refunded"} == {field.name for field in msgspec.structs.fields(Robot)}
+    names = {"agent", "signature", "handovers"} ^ {field.name for field in msgspec.structs.fields(Profile)}
+    assert names | {"address", "formerly", "paid", "refunded"} == {
+        field.name for field in msgspec.structs.fields(Robot)
+    }
+
+
+def test_only_keys_that_have_signed_it_are_earlier_ones_of_a_robot() -> None:
+    first, second, now, stranger = (Signer(bytes([number]) * 32) for number in range(1, 5))
+    handed = Handover(agent=first.address, successor=second.address, time=1).signed_by(first)
+    again = Handover(agent=second.address, successor=now.address, time=2).signed_by(second)
+    profile = Profile(agent=now.address, handovers=(handed, again), time=3).signed_by(now)
+    assert Profile.decode(profile.encode()).predecessors == (second.address, first.address)
+    forged = Handover(agent=first.address, successor=now.address, time=1).signed_by(stranger)
+    for wrong in ((handed,), (again, handed), (forged,)):
+        assert Profile(agent=now.address, handovers=wrong, time=3).predecessors == ()
+    assert Profile(agent=now.address, handovers=(forged, again), time=3).predecessors == (second.address,)
+
+
+async def test_the_record_of_an_earlier_key_counts_for_one_robot_only(place: Place) -> None:
+    class Counted:
+        class liabilities:  # noqa: N801
+            @staticmethod
+            async def outcomes(**limits: int) -> dict[str, tuple[int, int]]:
+                return {"old": (3, 1), "new": (2, 0)}
+
+    async with place.agent("person") as person:
+        directory = RobotDirectory(person.network.session, person.channel)
+        moved, stranger = robot_seen("new", "old"), robot_seen("stranger", "old")
+        (counted,) = await directory.count(Counted(), [moved])  # type: ignore[arg-type]
+        assert (counted.paid, counted.refunded) == (5, 1)
+        both = await directory.count(Counted(), [moved, stranger])  # type: ignore[arg-type]
+        assert [(one.paid, one.refunded) for one in both] == [(2, 0), (0, 0)]
+        still = await directory.count(Counted(), [moved, robot_seen("old")])  # type: ignore[arg-type]
+        assert [(one.paid, one.refunded) for one in still] == [(2, 0), (3, 1)]
+
+
+def robot_seen(address: str, *formerly: str) -> Robot:
+    texts: Any = dict.fromkeys(("model", "name", "about", "picture", "place", "price"), "")
+    return Robot(address=address, formerly=formerly, state="idle", queue=0, wait=0, readings={}, time=0, **texts)

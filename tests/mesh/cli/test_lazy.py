@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import click
 
 GROUPS = {
-    "account": ("new", "import", "show"),
+    "account": ("new", "import", "show", "rotate"),
     "chain": ("up", "deploy", "status", "cost"),
     "liability": ("show", "list", "watch", "cancel", "claim", "stop", "hand-back"),
     "lighthouse": ("create", "list", "info", "join", "leave"),
