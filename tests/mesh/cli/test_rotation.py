@@ -168,8 +168,8 @@ async def the_old_key_is_refused(site: Site, retired: str, old: str, new: str) -
     variables = site.variables("robot")
     with raises_with(KeyfileError, code="keyfile-retired"):
         Account.from_keyfile(retired, variables["AIRA_KEYFILE_PASSWORD_FILE"])
-    agent = await asyncio.to_thread(aira, "agent", "--keyfile", retired, **variables)
-    refused(agent, "keyfile-retired", new)
+    command = await asyncio.to_thread(aira, "order", "withdraw", "--all", "--keyfile", retired, **variables)
+    refused(command, "keyfile-retired", new)
     with raises_with(ConfigurationError, code="key-retired"):
         async with site.agent("robot"):
             pass
