@@ -63,7 +63,8 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
     costs, as in a description of a model; both may be empty. `queue` jobs wait, and a new one would begin in about
     `wait` seconds. `stopped` says that somebody stopped the robot, `closed` that it takes no jobs now. `readings` are
     the latest ones that the robot has published outside of jobs, as plain text by their topics. `handovers` are those
-    by which it got its key, oldest first. `time` is the robot's time of day in Unix seconds. Trust it only if it `is_signed`, and is on the agent's key.
+    by which it got its key, oldest first. `time` is the robot's time of day in Unix seconds. Trust it only if it
+    `is_signed`, and is on the agent's key.
     """
 
     domain: ClassVar = b"aira profile\0"
