@@ -91,7 +91,8 @@ class Amount(Answer, frozen=True, kw_only=True):
 
 
 class FindRobots(Request, frozen=True, kw_only=True):
-    """The robots that are present: of a model (CID or name), or those whose name or sentence contains `text`."""
+    """The robots that are present: of a model (CID or name), or those whose name or sentence contains
+    `text`, or whose address it is."""
 
     model: Name = ""
     text: Name = ""
@@ -502,6 +503,13 @@ class Deny(Request, frozen=True, kw_only=True):
     id: ConsentId
 
 
+class AnswerConsent(Request, frozen=True, kw_only=True):
+    """The person's answer that a program brings, whose client asked them: taken if the policy has `by_client`."""
+
+    id: ConsentId
+    allow: bool
+
+
 class ReadLog(Request, frozen=True, kw_only=True):
     """Entries of the log, from number `first` on; by default the latest."""
 
@@ -573,6 +581,7 @@ DOOR: Final[Mapping[str, Operation]] = MappingProxyType(
         "verify": Operation(VerifyJob, Verification),
         "balance": Operation(ReadBalance, Balance),
         "statement": Operation(ReadStatement, AccountStatement),
+        "answer_consent": Operation(AnswerConsent, Job),
     }
 )
 """What programs may ask for, on `DOOR_SOCKET`."""

@@ -283,7 +283,7 @@ class Signer(Lifecycle):
         robots = [
             robot
             for robot in await self.agent.robots(asked.model)
-            if wanted in robot.name.casefold() or wanted in robot.about.casefold()
+            if wanted in robot.name.casefold() or wanted in robot.about.casefold() or wanted == robot.address.casefold()
         ]
         found = []
         for robot in robots[: asked.limit]:
@@ -873,6 +873,15 @@ class Signer(Lifecycle):
         await self.budget.sync()
         return await self._shown(job)
 
+    async def _do_answer_consent(self, asked: protocol.AnswerConsent) -> Job:
+        if not self.policy.consent_by_client:
+            hint = "the owner answers with `aira mcp approve`, or on the page"
+            raise SignerError("the policy takes no consents from programs", hint=hint, code="consent-not-by-client")
+        self.log.add("answered-by-client", consent=asked.id, allow=asked.allow)
+        if asked.allow:
+            return await self._do_approve(protocol.Approve(id=asked.id))
+        return await self._do_deny(protocol.Deny(id=asked.id))
+
     def _open_consent(self, consent_id: str) -> ConsentRecord:
         """A consent that can be answered now. Raises `SignerError`."""
         consent = self.budget.consent(consent_id)
@@ -956,7 +965,13 @@ class Signer(Lifecycle):
         needed = None
         if consent is not None:
             expires, command = time_text(consent.expires), f"aira mcp approve {consent.id}"
-            needed = protocol.NeededConsent(id=consent.id, why=consent.why, expires=expires, command=command)
+            needed = protocol.NeededConsent(
+                id=consent.id,
+                why=consent.why,
+                expires=expires,
+                command=command,
+                by_client=self.policy.consent_by_client,
+            )
         on_stop: Any = job.on_stop
         return Job(
             job_id=job.id,
