@@ -56,7 +56,7 @@ from mesh.recording import GENEROUS, Played, described_line, messages_in, open_o
 from mesh.role.database import LedgerUnusable
 from mesh.role.program import RESEND
 from mesh.signer import protocol
-from mesh.signer.answers import (
+from mesh.signer._answers import (
     amount,
     checked_messages,
     described_model,
@@ -67,8 +67,8 @@ from mesh.signer.answers import (
     strangers,
     value_text,
 )
-from mesh.signer.budget import Budget, ConsentRecord, Hold, JobRecord
-from mesh.signer.log import SignerLog, log_files, time_text, verify_log
+from mesh.signer._budget import Budget, ConsentRecord, Hold, JobRecord
+from mesh.signer._log import SignerLog, log_files, time_text, verify_log
 from mesh.signer.policy import Decision, Verdict, parse_policy, read_policy_file
 from mesh.signer.protocol import DOOR, OWNER, Failure, Job, SignerError
 from mesh.validator.verification import Claim, JobFiles, check_end, verify

@@ -40,7 +40,7 @@ def on(topic: str, value: Any = None) -> dict[str, Any]:
     return {"messages": [(topic, value)]}
 
 
-VALUES: Final = (
+VALUES: Final[tuple[tuple[str, dict[str, Any], str], ...]] = (
     ("a value above its range", driving(radius=2.01), "value-not-allowed"),
     ("a value below its range", driving(radius=0.19), "value-not-allowed"),
     ("a negative value", driving(radius=-1), "value-not-allowed"),
@@ -89,7 +89,7 @@ VALUES: Final = (
     ("a topic with a Cyrillic letter", on("/dr\u0456ve", {"radius": 1}), "topic-not-allowed"),
     ("a topic with an invisible character", on("/drive\u200b", {"radius": 1}), "topic-not-allowed"),
 )
-ORDERS: Final = (
+ORDERS: Final[tuple[tuple[str, dict[str, Any], str], ...]] = (
     ("another model", {"model": OTHER_MODEL}, "model-not-allowed"),
     ("no model", {"model": ""}, "invalid-cid"),
     ("a model that is a path", {"model": "../../etc/passwd"}, "invalid-cid"),

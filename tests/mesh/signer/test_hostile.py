@@ -51,7 +51,7 @@ async def test_an_objective_by_cid_is_judged_by_what_is_in_it(person: Person, dr
     }
     order: dict[str, Any] = {"model": driver.model, "cost": "1 XRT"}
     async with person.at_work() as (door, _, _):
-        codes = {}
+        codes: dict[str, str] = {}
         for name, text in lines.items():
             path = person.folder / "objective.mcap"
             pack(messages_in(text), path)

@@ -7,7 +7,7 @@ import json
 import sys
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
 
@@ -83,7 +83,7 @@ def known_keys(person: Person, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.sample("step")
 async def test_an_order_of_a_killed_signer_is_one_contract(person: Person, driver: Driver, step: str) -> None:
     person.allow(driver.model)
-    order = {"model": driver.model, "messages": [GOOD], "cost": "1 XRT", "idempotency_key": "k"}
+    order: dict[str, Any] = {"model": driver.model, "messages": [GOOD], "cost": "1 XRT", "idempotency_key": "k"}
     async with JsonRpcServer(person.market.chain.line) as server:
         async with process(person, server.url, step) as (door, killed):
             with suppress(SignerUnavailable):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -46,7 +46,7 @@ async def test_a_job_is_found_priced_ordered_watched_and_verified(person: Person
 
 async def test_one_key_is_one_contract_also_at_once_and_after_a_restart(person: Person, driver: Driver) -> None:
     person.allow(driver.model)
-    order = {"model": driver.model, "messages": [GOOD], "cost": "1 XRT", "idempotency_key": "k"}
+    order: dict[str, Any] = {"model": driver.model, "messages": [GOOD], "cost": "1 XRT", "idempotency_key": "k"}
     async with person.at_work() as (door, _, _):
         jobs = await asyncio.gather(*(door.order(**order) for _ in range(5)))
         assert len({job.job_id for job in jobs}) == 1
@@ -63,7 +63,7 @@ async def test_one_key_is_one_contract_also_at_once_and_after_a_restart(person: 
 
 async def test_a_consent_is_for_one_order_is_used_once_and_not_given_by_a_door(person: Person, driver: Driver) -> None:
     person.allow(driver.model)
-    order = {"model": driver.model, "messages": [GOOD], "cost": "4 XRT"}
+    order: dict[str, Any] = {"model": driver.model, "messages": [GOOD], "cost": "4 XRT"}
     async with person.at_work() as (door, owner, _):
         job = await door.order(**order, idempotency_key="dear")
         assert job.state == "needs-consent"
@@ -100,7 +100,7 @@ async def test_a_race_for_the_last_of_a_budget_has_one_winner(person: Person, dr
     limits = '[budget]\nper_job = "1 XRT"\nper_hour = "3 XRT"\nper_day = "3 XRT"\njobs_at_a_time = 10\n'
     person.allow(driver.model, limits=limits)
     async with person.at_work() as (door, _, _):
-        order = {"model": driver.model, "messages": [GOOD], "cost": "1 XRT"}
+        order: dict[str, Any] = {"model": driver.model, "messages": [GOOD], "cost": "1 XRT"}
         found = await asyncio.gather(
             *(door.order(**order, idempotency_key=f"k{number}") for number in range(8)), return_exceptions=True
         )

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.signer.budget import Budget
-from mesh.signer.log import LogUnusable, SignerLog, log_files, verify_log
+from mesh.signer._budget import Budget
+from mesh.signer._log import LogUnusable, SignerLog, log_files, verify_log
 from schemas import Signer, keccak256
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def lines_of(folder: Path) -> list[bytes]:
 def signed_by_another(lines: list[bytes]) -> list[bytes]:
     import msgspec
 
-    from mesh.signer.log import Entry
+    from mesh.signer._log import Entry
     from schemas.decoding import decode_json
 
     entry = msgspec.structs.replace(decode_json(lines[2], Entry), facts={"cost": 0}, signature="")

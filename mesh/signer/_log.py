@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from mesh.signer.budget import Budget
+    from mesh.signer._budget import Budget
     from schemas import Signer
 
 FILE_BYTES: Final = 4 << 20

@@ -9,7 +9,7 @@ import msgspec
 
 from mesh.recording import shown_value
 from mesh.signer import protocol
-from mesh.signer.log import time_text
+from mesh.signer._log import time_text
 from mesh.signer.protocol import StrangersText
 from schemas.decoding import decode_json_once
 from schemas.model import json_value

@@ -15,7 +15,7 @@ import msgspec
 
 from mesh.base.database import SyncedDatabase
 from mesh.errors import ConfigurationError
-from mesh.signer.log import Head
+from mesh.signer._log import Head
 from mesh.signer.policy import DAY, HOUR, Spending
 from mesh.signer.protocol import OVER, Failure, JobState, OrderJob
 from schemas.decoding import decode_json
