@@ -19,7 +19,10 @@ ROOT: Final = Path(__file__).parents[1]
 REFERENCE: Final = ROOT / "docs" / "reference"
 PACKAGES: Final = ("schemas", "mesh", "bridges")
 SHARED: Final = {
+    "Job": "what a robot works on, and what a program has ordered of a signer",
     "Log": "the name that Ethereum gives an entry of a receipt, and Foxglove a line of a log",
+    "Policy": "how a validator judges results, and what programs may order",
+    "Signer": "what signs with a key, and the process that does so for programs",
     "Market": "what a test trades on, and what the page knows of the market that it shows",
     "Robot": "what is present on a market, and what a program that speaks ROS 2 gives its node to",
 }

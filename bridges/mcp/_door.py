@@ -39,7 +39,7 @@ from mcp_types.version import MODERN_PROTOCOL_VERSIONS
 from bridges.mcp._tools import INSTRUCTIONS, TOOLS
 from mesh import __version__
 from mesh.errors import AiraError, public_text
-from mesh.signer.protocol import Answer, Failure, FoundRobots, Job, Jobs, SignerError
+from mesh.signer.protocol import FoundRobots, Job, Jobs, SignerAnswer, SignerError, SignerFailure
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class McpDoor:
             structured_content=msgspec.to_builtins(answer),
         )
 
-    async def _ask(self, operation: str, fields: Mapping[str, Any]) -> Answer:
+    async def _ask(self, operation: str, fields: Mapping[str, Any]) -> SignerAnswer:
         """Raises `AiraError` only."""
         if self._calls >= MOST_CALLS:
             raise AiraError(
@@ -214,7 +214,7 @@ class McpDoor:
         text = msgspec.json.encode(found).decode()
         return ReadResourceResult(contents=[TextResourceContents(uri=params.uri, mime_type=JSON, text=text)])
 
-    async def _resource(self, uri: str) -> Answer:
+    async def _resource(self, uri: str) -> SignerAnswer:
         """What a URI names. Raises `AiraError`."""
         if uri == "aira://market":
             return await self._ask("find_robots", {"limit": 50})
@@ -277,9 +277,11 @@ def _question(job: Job, arguments: dict[str, Any]) -> str:
     return f"Allow this order? It pays at most {job.cost.text} to {robot} for model {job.model}: {shown}"
 
 
-def _failure_of(error: AiraError) -> Failure:
+def _failure_of(error: AiraError) -> SignerFailure:
     strangers = error.from_strangers if isinstance(error, SignerError) else None
-    return Failure(code=error.code, message=public_text(error), next=public_text(error.hint), from_strangers=strangers)
+    return SignerFailure(
+        code=error.code, message=public_text(error), next=public_text(error.hint), from_strangers=strangers
+    )
 
 
 def _failed(error: AiraError) -> CallToolResult:

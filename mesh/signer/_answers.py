@@ -64,7 +64,7 @@ def found_robot(robot: Robot, model: ModelDescription | None, *, is_allowed: boo
     author = f"robot {robot.address}"
     record = None
     if robot.paid is not None and robot.refunded is not None:
-        record = protocol.Record(jobs=robot.paid + robot.refunded, paid=robot.paid, refunded=robot.refunded)
+        record = protocol.RobotRecord(jobs=robot.paid + robot.refunded, paid=robot.paid, refunded=robot.refunded)
     title = None if model is None else strangers(model.title, f"model {robot.model}")
     return protocol.FoundRobot(
         address=robot.address,

@@ -17,7 +17,7 @@ from mesh.base.database import SyncedDatabase
 from mesh.errors import ConfigurationError
 from mesh.signer._log import Head
 from mesh.signer.policy import DAY, HOUR, Spending
-from mesh.signer.protocol import OVER, Failure, JobState, OrderJob
+from mesh.signer.protocol import OVER, JobState, OrderJob, SignerFailure
 from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ KEPT: Final = 100_000
 """Jobs that are remembered: of those that are over, the oldest are forgotten."""
 
 
-class Hold(StrEnum):
+class BudgetHold(StrEnum):
     """What a job does to the budget."""
 
     NONE = ""
@@ -66,7 +66,7 @@ class Hold(StrEnum):
     """It is a contract; it counts for the hour and the day of that."""
 
 
-class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
+class KeptJob(msgspec.Struct, frozen=True, kw_only=True):
     """A job as the file has it. Times are Unix times; `cost` is in the smallest unit, and the most that is paid."""
 
     id: str
@@ -78,7 +78,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
     model: str
     """Its CID."""
     cost: int
-    hold: Hold = Hold.NONE
+    hold: BudgetHold = BudgetHold.NONE
     robot: str = ""
     robots: tuple[str, ...] | None = None
     """Those that the policy allows it for; None for any."""
@@ -94,7 +94,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
     consent: str = ""
     has_consent: bool = False
     stopped_why: str | None = None
-    error: Failure | None = None
+    error: SignerFailure | None = None
     created: float
     changed: float
     revision: int = 0
@@ -178,29 +178,29 @@ class Budget:
             (besides, now - DAY),
         )
         day = sum(int(cost) for cost, _, _ in rows)
-        hour = sum(int(cost) for cost, hold, counted in rows if hold == Hold.OPEN or counted > now - HOUR)
+        hour = sum(int(cost) for cost, hold, counted in rows if hold == BudgetHold.OPEN or counted > now - HOUR)
         open_jobs = self._database.rows(
             "SELECT COUNT(*) FROM jobs WHERE id != ? AND hold != '' AND NOT is_over", (besides,)
         )
         return Spending(hour, day, open_jobs[0][0])
 
-    def job(self, job_id: str) -> JobRecord | None:
+    def job(self, job_id: str) -> KeptJob | None:
         """The job of an id."""
         return self._one("SELECT record FROM jobs WHERE id = ?", job_id)
 
-    def job_of_key(self, key: str) -> JobRecord | None:
+    def job_of_key(self, key: str) -> KeptJob | None:
         """The job that was ordered with an idempotency key."""
         return self._one("SELECT record FROM jobs WHERE key = ?", key)
 
-    def jobs(self, limit: int) -> list[JobRecord]:
+    def jobs(self, limit: int) -> list[KeptJob]:
         """The latest jobs, the newest first."""
         return self._jobs("SELECT record FROM jobs ORDER BY rowid DESC LIMIT ?", limit)
 
-    def open_jobs(self) -> list[JobRecord]:
+    def open_jobs(self) -> list[KeptJob]:
         """The jobs that are not over, the oldest first; and those that hold a budget although they are."""
-        return self._jobs("SELECT record FROM jobs WHERE NOT is_over OR hold = ? ORDER BY rowid", Hold.OPEN)
+        return self._jobs("SELECT record FROM jobs WHERE NOT is_over OR hold = ? ORDER BY rowid", BudgetHold.OPEN)
 
-    def put(self, job: JobRecord, *consents: ConsentRecord) -> JobRecord:
+    def put(self, job: KeptJob, *consents: ConsentRecord) -> KeptJob:
         """Keep a job as it is now, with the next revision, and consents: all or nothing."""
         now = self.now()
         job = msgspec.structs.replace(job, revision=job.revision + 1, changed=now)
@@ -250,15 +250,15 @@ class Budget:
         self.keep_fact("log", msgspec.json.encode(tuple(head)).decode())
         self._head = head
 
-    def _one(self, statement: str, value: str) -> JobRecord | None:
+    def _one(self, statement: str, value: str) -> KeptJob | None:
         return next(iter(self._jobs(statement, value)), None)
 
-    def _jobs(self, statement: str, value: Any) -> list[JobRecord]:
+    def _jobs(self, statement: str, value: Any) -> list[KeptJob]:
         rows = self._database.rows(statement, (value,))
-        return [decode_json(row[0], JobRecord) for row in rows]
+        return [decode_json(row[0], KeptJob) for row in rows]
 
 
-def encoded(job: JobRecord) -> bytes:
+def encoded(job: KeptJob) -> bytes:
     """The bytes of a job in the file."""
     return msgspec.json.encode(job)
 

@@ -39,7 +39,7 @@ _NAME: Final = re.compile(r"log-(\d{12})\.jsonl")
 _LONGEST_LINE: Final = 1 << 16
 
 
-class Entry(msgspec.Struct, frozen=True, kw_only=True):
+class SignedEntry(msgspec.Struct, frozen=True, kw_only=True):
     """An entry: `time` is Unix time, `previous` the hash of the entry before. The `signature` is over `hash`."""
 
     number: int
@@ -119,13 +119,13 @@ class SignerLog:
             hint="`aira mcp log --verify` says where; keep the folder for inquiry, and begin with another --data-dir",
         )
 
-    def add(self, event: str, **facts: Any) -> Entry:
+    def add(self, event: str, **facts: Any) -> SignedEntry:
         """Add an entry. It survives a crash of the program at once, and one of the machine after `Budget.sync`.
 
         Raises `OSError`, `sqlite3.Error`.
         """
         head = self._budget.log_head()
-        entry = Entry(number=head.last + 1, time=self._budget.now(), event=event, facts=facts, previous=head.hash)
+        entry = SignedEntry(number=head.last + 1, time=self._budget.now(), event=event, facts=facts, previous=head.hash)
         entry = msgspec.structs.replace(entry, signature=self._signer.sign_hash(entry.digest).hex())
         line = msgspec.json.encode(entry)
         if len(line) > _LONGEST_LINE:
@@ -136,11 +136,11 @@ class SignerLog:
             file.write(line + b"\n")
         return entry
 
-    def entries(self, first: int | None = None, limit: int = 100) -> list[Entry]:
+    def entries(self, first: int | None = None, limit: int = 100) -> list[SignedEntry]:
         """Up to `limit` entries from a number on, or the latest. Blocks on the disk. Raises `LogUnusable`."""
         head = self._budget.log_head()
         start = max(head.first, head.last - limit + 1 if first is None else first)
-        found: list[Entry] = []
+        found: list[SignedEntry] = []
         paths = self._paths()
         for path, following in zip(paths, [*paths[1:], None], strict=True):
             if following is not None and _first_of(following) <= start:
@@ -184,7 +184,9 @@ def log_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if _NAME.fullmatch(path.name)) if folder.is_dir() else []
 
 
-def verify_log(folder: Path, signer: str, head: Head, *, on_entry: Callable[[Entry], object] = lambda _: None) -> str:
+def verify_log(
+    folder: Path, signer: str, head: Head, *, on_entry: Callable[[SignedEntry], object] = lambda _: None
+) -> str:
     """What is wrong with the log of an account (address) whose head is known; an empty text if nothing is.
 
     Blocks on the disk, and takes about a tenth of a millisecond an entry.
@@ -223,10 +225,10 @@ def _lines(path: Path) -> Iterator[bytes]:
             yield line.removesuffix(b"\n")
 
 
-def _decoded(line: bytes) -> Entry | None:
+def _decoded(line: bytes) -> SignedEntry | None:
     """The entry in a line; None for what is none, or written in another way than it is."""
     try:
-        entry = decode_json(line, Entry)
+        entry = decode_json(line, SignedEntry)
     except InvalidData:
         return None
     return entry if msgspec.json.encode(entry) == line else None

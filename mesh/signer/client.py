@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-A = TypeVar("A", bound=protocol.Answer)
+A = TypeVar("A", bound=protocol.SignerAnswer)
 
 CONNECT_SECONDS: Final = 5.0
 ANSWER_SECONDS: Final = 180.0
@@ -124,9 +124,9 @@ class SignerClient:
         """See `VerifyJob`."""
         return await self._call(protocol.Verification, "verify", job_id=job_id)
 
-    async def balance(self) -> protocol.Balance:
+    async def balance(self) -> protocol.AccountFunds:
         """See `Balance`."""
-        return await self._call(protocol.Balance, "balance")
+        return await self._call(protocol.AccountFunds, "balance")
 
     async def statement(self, *, first: str = "", last: str = "", limit: int = 100) -> protocol.AccountStatement:
         """See `ReadStatement`."""
@@ -160,7 +160,7 @@ class SignerClient:
         """See `UsePolicy`."""
         return await self._call(protocol.PolicyInUse, "use_policy")
 
-    async def ask(self, operation: str, fields: Mapping[str, Any]) -> protocol.Answer:
+    async def ask(self, operation: str, fields: Mapping[str, Any]) -> protocol.SignerAnswer:
         """Any operation by its name in `DOOR` or `OWNER`, with the fields of its request."""
         known = DOOR.get(operation) or OWNER[operation]
         try:

@@ -53,7 +53,7 @@ class InvalidPolicy(ConfigurationError, code="invalid-policy"):
         self.faults = faults
 
 
-class Verdict(StrEnum):
+class PolicyVerdict(StrEnum):
     """What a policy says to an order."""
 
     ALLOWED = "allowed"
@@ -64,7 +64,7 @@ class Verdict(StrEnum):
 class Decision(NamedTuple):
     """A verdict. A refusal has a `code` of `protocol.REFUSALS`; `why` is a line for people, `next` what to do."""
 
-    verdict: Verdict
+    verdict: PolicyVerdict
     code: str = ""
     why: str = ""
     next: str = ""
@@ -171,10 +171,10 @@ class Policy:
                 why = f"{shown(cost)} is more than is left of the budget of the last {period}, {left}"
                 return _refused(code, why, f"order for less, or later; {owner}")
         if has_consent or self.consent_above is None or cost <= self.consent_above:
-            return Decision(Verdict.ALLOWED)
+            return Decision(PolicyVerdict.ALLOWED)
         above = self.consent_above
         why = "each order needs a person's yes" if above < 0 else f"orders above {shown(above)} need a person's yes"
-        return Decision(Verdict.NEEDS_CONSENT, "", why, "")
+        return Decision(PolicyVerdict.NEEDS_CONSENT, "", why, "")
 
     def words(self) -> tuple[str, ...]:
         """What it allows, in plain words, a line each."""
@@ -459,7 +459,7 @@ class _Reader:
 
 
 def _refused(code: str, why: str, hint: str) -> Decision:
-    return Decision(Verdict.REFUSED, code, why, hint)
+    return Decision(PolicyVerdict.REFUSED, code, why, hint)
 
 
 def _telling(before: ValueFault | None, found: ValueFault) -> ValueFault:

@@ -67,10 +67,10 @@ from mesh.signer._answers import (
     strangers,
     value_text,
 )
-from mesh.signer._budget import Budget, ConsentRecord, Hold, JobRecord
+from mesh.signer._budget import Budget, BudgetHold, ConsentRecord, KeptJob
 from mesh.signer._log import SignerLog, log_files, time_text, verify_log
-from mesh.signer.policy import Decision, Verdict, parse_policy, read_policy_file
-from mesh.signer.protocol import DOOR, OWNER, Failure, Job, SignerError
+from mesh.signer.policy import Decision, PolicyVerdict, parse_policy, read_policy_file
+from mesh.signer.protocol import DOOR, OWNER, Job, SignerError, SignerFailure
 from mesh.validator.verification import Claim, JobFiles, check_end, verify
 from schemas import parse_address, parse_cid, parse_key
 from schemas.address import keccak256
@@ -116,7 +116,7 @@ LATEST_TOPICS: Final = 16
 LARGEST_VALUE: Final = 65_536
 """Bytes of a value that is shown while a job runs."""
 CHOICES: Final = ("cheapest", "first")
-ORDER_EXPIRED: Final = Failure(code="order-expired", message="no contract was made in time", next="order again")
+ORDER_EXPIRED: Final = SignerFailure(code="order-expired", message="no contract was made in time", next="order again")
 
 
 def signer_folder(settings: Settings) -> Path:
@@ -261,12 +261,12 @@ class Signer(Lifecycle):
             raise
         except Exception:
             log.exception("a request failed", extra=log_event("signer-request-failed", path=request.path))
-            said = Failure(code="error", message="the signer failed; see its log")
+            said = SignerFailure(code="error", message="the signer failed; see its log")
             return _answered(protocol.ErrorAnswer(error=said), status=500)
         return _answered(found)
 
-    async def _work_on(self, name: str, asked: Any) -> protocol.Answer:
-        method: Callable[[Any], Awaitable[protocol.Answer]] = getattr(self, f"_do_{name}")
+    async def _work_on(self, name: str, asked: Any) -> protocol.SignerAnswer:
+        method: Callable[[Any], Awaitable[protocol.SignerAnswer]] = getattr(self, f"_do_{name}")
         if name == "job":
             if self._waiting >= WAITING:
                 raise SignerError("too many requests wait for jobs", hint="wait a moment", code="too-many-requests")
@@ -313,7 +313,7 @@ class Signer(Lifecycle):
             decision = self.policy.decide(quote.cost, spending, now)
             if allowed is not None and quote.agent not in allowed:
                 why = "the policy does not allow this robot"
-                decision = Decision(Verdict.REFUSED, "robot-not-allowed", why)
+                decision = Decision(PolicyVerdict.REFUSED, "robot-not-allowed", why)
             quotes.append(
                 protocol.FoundQuote(
                     robot=quote.agent,
@@ -367,7 +367,7 @@ class Signer(Lifecycle):
         now = self.budget.now()
         decision = policy.decide(cost, self.budget.spending(), now)
         _require(decision)
-        job = JobRecord(
+        job = KeptJob(
             id=f"job-{secrets.token_hex(8)}",
             request=asked,
             digest=digest,
@@ -383,7 +383,7 @@ class Signer(Lifecycle):
             changed=now,
         )
         facts = {"model": model, "objective": objective, "robot": robot, "cost": cost, "policy": policy.hash}
-        if decision.verdict is Verdict.NEEDS_CONSENT:
+        if decision.verdict is PolicyVerdict.NEEDS_CONSENT:
             if len(self.budget.consents()) >= CONSENTS:
                 raise SignerError(
                     f"{CONSENTS} orders wait for a person's yes already",
@@ -406,7 +406,7 @@ class Signer(Lifecycle):
             self._expire_later(consent)
         else:
             self.log.add("allowed", job=job.id, key=_key(asked), note=asked.note, **facts)
-            job = self.budget.put(msgspec.structs.replace(job, hold=Hold.OPEN))
+            job = self.budget.put(msgspec.structs.replace(job, hold=BudgetHold.OPEN))
             await self.budget.sync()
             self._start(job)
         return await self._shown(job)
@@ -460,18 +460,18 @@ class Signer(Lifecycle):
         named = [rule.robots for rule in found]
         return None if None in named else frozenset[str]().union(*(one for one in named if one is not None))
 
-    def _resume(self, job: JobRecord) -> None:
+    def _resume(self, job: KeptJob) -> None:
         """Go on with a job of an earlier run."""
         if job.state != "needs-consent":
             self._start(job)
 
-    def _start(self, job: JobRecord) -> None:
+    def _start(self, job: KeptJob) -> None:
         self._tasks.start(self._see_through(job.id), f"signer: {job.id}")
 
     async def _see_through(self, job_id: str) -> None:
         """See a job to its end, whatever fails meanwhile."""
         backoff = Backoff()
-        while (job := self.budget.job(job_id)) is not None and (not job.is_over or job.hold is Hold.OPEN):
+        while (job := self.budget.job(job_id)) is not None and (not job.is_over or job.hold is BudgetHold.OPEN):
             try:
                 if job.contract:
                     await self._follow(job)
@@ -490,9 +490,9 @@ class Signer(Lifecycle):
                     log.warning("job %s: %s", job_id, error, extra=log_event("job-waits", job=job_id, code=error.code))
                     await backoff.wait()
                 else:
-                    await self._end(job, "failed", hold=Hold.NONE, error=failure_of(error))
+                    await self._end(job, "failed", hold=BudgetHold.NONE, error=failure_of(error))
 
-    async def _place(self, job: JobRecord) -> None:
+    async def _place(self, job: KeptJob) -> None:
         """Sign the order for the robot that is chosen, and post it. Nothing of it has been signed, or left here."""
         declined: list[tuple[str, str, str]] = []
         for robot, cost in await self._candidates(job, declined):
@@ -515,17 +515,19 @@ class Signer(Lifecycle):
                 declined.append((robot, "silent", "it does not answer"))
             except InsufficientTokens as error:
                 job = self._put(self._current(job), order="")  # it was not posted
-                said = Failure(code=error.code, message="the account lacks the money", next="put more into the account")
-                await self._end(job, "failed", hold=Hold.NONE, error=said)
+                said = SignerFailure(
+                    code=error.code, message="the account lacks the money", next="put more into the account"
+                )
+                await self._end(job, "failed", hold=BudgetHold.NONE, error=said)
                 return
             else:
                 job = self._put(self._current(job), state="waiting")
                 self.log.add("ordered", job=job.id, robot=robot, cost=cost, order=order.hash)
                 await self._wait(job, order)
                 return
-        await self._end(job, "failed", hold=Hold.NONE, error=no_robot(declined))
+        await self._end(job, "failed", hold=BudgetHold.NONE, error=no_robot(declined))
 
-    async def _candidates(self, job: JobRecord, declined: list[tuple[str, str, str]]) -> list[tuple[str, int]]:
+    async def _candidates(self, job: KeptJob, declined: list[tuple[str, str, str]]) -> list[tuple[str, int]]:
         """The robots that may get a job, the best first, with what each is paid."""
         chosen, most = job.request.robot, self._unit.parse(job.request.cost)
         quotes = await self.agent.quotes(job.model, job.objective)
@@ -554,15 +556,15 @@ class Signer(Lifecycle):
         self._put(job, order=lasting_hash(demand), deadline=demand.deadline)
         await self.budget.sync()
 
-    async def _wait(self, job: JobRecord, order: Order) -> None:
+    async def _wait(self, job: KeptJob, order: Order) -> None:
         """Wait until an order is a contract, or can't become one any more."""
         try:
             contract = await order.contract(on_progress=partial(self._heard, job.id))
         except OrderExpired:
-            said = Failure(
+            said = SignerFailure(
                 code="order-expired", message="no contract was made in time", next="order again, or for more"
             )
-            await self._end(self._current(job), "expired", hold=Hold.NONE, error=said)
+            await self._end(self._current(job), "expired", hold=BudgetHold.NONE, error=said)
         except OrderClosed as error:
             if error.liability:
                 await self._accepted(job, await self.agent.contract(error.liability))
@@ -573,7 +575,7 @@ class Signer(Lifecycle):
         else:
             await self._accepted(job, contract)
 
-    async def _outlast(self, job: JobRecord) -> None:
+    async def _outlast(self, job: KeptJob) -> None:
         """Wait until an order that was withdrawn can't become a contract any more: then it binds no money."""
         if job.state != "withdrawn":
             self.log.add("withdrawn", job=job.id)
@@ -587,9 +589,9 @@ class Signer(Lifecycle):
         if found := await self._contract_of(job):
             await self._accepted(job, await self.agent.contract(found))
         else:
-            await self._end(job, "withdrawn", hold=Hold.NONE)
+            await self._end(job, "withdrawn", hold=BudgetHold.NONE)
 
-    async def _find_again(self, job: JobRecord) -> None:
+    async def _find_again(self, job: KeptJob) -> None:
         """Find the order of a job that an earlier run has signed, and go on with it.
 
         If it is neither here nor on the chain, it never left: orders are kept before they are sent.
@@ -608,11 +610,11 @@ class Signer(Lifecycle):
         elif job.state in ("ordering",) and parts.chain_head.contract_block < job.deadline:
             await self._place(self._put(job, order="", deadline=0))
         elif parts.chain_head.contract_block >= job.deadline:
-            await self._end(job, "expired", hold=Hold.NONE, error=ORDER_EXPIRED)
+            await self._end(job, "expired", hold=BudgetHold.NONE, error=ORDER_EXPIRED)
         else:
             await asyncio.sleep(max(0.5, self.settings.poll_interval))
 
-    async def _contract_of(self, job: JobRecord) -> str:
+    async def _contract_of(self, job: KeptJob) -> str:
         """The contract (address) that the order of a job has become; empty if there is none."""
         from schemas import decode
 
@@ -622,27 +624,27 @@ class Signer(Lifecycle):
                 return liability
         return ""
 
-    async def _accepted(self, job: JobRecord, contract: Contract) -> None:
+    async def _accepted(self, job: KeptJob, contract: Contract) -> None:
         job, liability = self._current(job), contract.liability
         facts: dict[str, Any] = {"robot": liability.promisor, "cost": int(liability.cost)}
         self.log.add("contract", job=job.id, contract=contract.address, **facts)
-        job = self._put(job, state="accepted", hold=Hold.SPENT, contract=contract.address, **facts)
+        job = self._put(job, state="accepted", hold=BudgetHold.SPENT, contract=contract.address, **facts)
         await self.budget.sync()
         await self._follow(job, contract)
 
-    async def _follow(self, job: JobRecord, contract: Contract | None = None) -> None:
+    async def _follow(self, job: KeptJob, contract: Contract | None = None) -> None:
         contract = await self.agent.contract(job.contract) if contract is None else contract
         async with self._latest_values(job):
             try:
                 outcome = await contract.outcome(on_progress=partial(self._heard, job.id))
             except LiabilityReverted as error:
-                await self._end(self._current(job), "failed", hold=Hold.NONE, error=failure_of(error))
+                await self._end(self._current(job), "failed", hold=BudgetHold.NONE, error=failure_of(error))
                 return
         job = self._current(job)
         if outcome.success:
             await self._end(job, "done", result=outcome.result)
             return
-        said = Failure(
+        said = SignerFailure(
             code=_word(outcome.code) or "failed",
             message="the job failed, and its cost came back",
             next="see the recording" if outcome.result else "order it again, perhaps from another robot",
@@ -651,18 +653,18 @@ class Signer(Lifecycle):
         is_stopped = job.stopped_why is not None or outcome.code == STOPPED
         await self._end(job, "stopped" if is_stopped else "refunded", result=outcome.result, error=said)
 
-    async def _end(self, job: JobRecord, state: protocol.JobState, **changes: Any) -> None:
-        error: Failure | None = changes.get("error")
+    async def _end(self, job: KeptJob, state: protocol.JobState, **changes: Any) -> None:
+        error: SignerFailure | None = changes.get("error")
         self.log.add("ended", job=job.id, state=state, code="" if error is None else error.code)
         self._put(job, state=state, **changes)
         self._progress.pop(job.id, None)
         await self.budget.sync()
 
-    def _current(self, job: JobRecord) -> JobRecord:
+    def _current(self, job: KeptJob) -> KeptJob:
         """A job as it is kept now."""
         return self.budget.job(job.id) or job
 
-    def _put(self, job: JobRecord, *consents: ConsentRecord, **changes: Any) -> JobRecord:
+    def _put(self, job: KeptJob, *consents: ConsentRecord, **changes: Any) -> KeptJob:
         kept = self.budget.put(msgspec.structs.replace(job, **changes), *consents)
         self._tell(job.id)
         return kept
@@ -685,7 +687,7 @@ class Signer(Lifecycle):
         self._ticks[job_id] = self._ticks.get(job_id, 0) + 1
         self._tell(job_id)
 
-    def _latest_values(self, job: JobRecord) -> _Latest:
+    def _latest_values(self, job: KeptJob) -> _Latest:
         def keep(message: Played) -> None:
             kept = self._latest.setdefault(job.id, {})
             if message.topic in kept or len(kept) < LATEST_TOPICS:
@@ -768,17 +770,18 @@ class Signer(Lifecycle):
         return protocol.Verification(
             holds=all(finding.holds is not False for finding in findings),
             checks=tuple(
-                protocol.Check(name=one.name, holds=one.holds, detail=strangers(one.detail, author)) for one in findings
+                protocol.JobCheck(name=one.name, holds=one.holds, detail=strangers(one.detail, author))
+                for one in findings
             ),
         )
 
-    async def _do_balance(self, asked: protocol.ReadBalance) -> protocol.Balance:
+    async def _do_balance(self, asked: protocol.ReadBalance) -> protocol.AccountFunds:
         tokens, policy, now = self.agent.chain.tokens, self.policy, self.budget.now()
         coin, token = await asyncio.gather(
             tokens.eth_balance(self.agent.address), tokens.balance(self.agent.address, token=self._token)
         )
         spending = self.budget.spending()
-        return protocol.Balance(
+        return protocol.AccountFunds(
             account=self.agent.address,
             coin=amount(ETH, coin),
             token=amount(self._unit, token),
@@ -844,7 +847,7 @@ class Signer(Lifecycle):
             expires=time_text(consent.expires),
         )
 
-    async def _do_approve(self, asked: protocol.Approve) -> Job:
+    async def _do_approve(self, asked: protocol.ApproveOrder) -> Job:
         consent = self._open_consent(asked.id)
         job = self._known(consent.job)
         if job.state != "needs-consent" or self._consent_digest(job, consent.id) != consent.digest:
@@ -856,7 +859,7 @@ class Signer(Lifecycle):
             job,
             msgspec.structs.replace(consent, answer="yes"),
             state="ordering",
-            hold=Hold.OPEN,
+            hold=BudgetHold.OPEN,
             has_consent=True,
             until=now + job.request.deadline_seconds,
         )
@@ -864,11 +867,13 @@ class Signer(Lifecycle):
         self._start(job)
         return await self._shown(job)
 
-    async def _do_deny(self, asked: protocol.Deny) -> Job:
+    async def _do_deny(self, asked: protocol.DenyOrder) -> Job:
         consent = self._open_consent(asked.id)
         job = self._known(consent.job)
         self.log.add("denied", job=job.id, consent=consent.id)
-        said = Failure(code="consent-denied", message="the owner did not allow the order", next="don't order it again")
+        said = SignerFailure(
+            code="consent-denied", message="the owner did not allow the order", next="don't order it again"
+        )
         job = self._put(job, msgspec.structs.replace(consent, answer="no"), state="denied", error=said)
         await self.budget.sync()
         return await self._shown(job)
@@ -879,8 +884,8 @@ class Signer(Lifecycle):
             raise SignerError("the policy takes no consents from programs", hint=hint, code="consent-not-by-client")
         self.log.add("answered-by-client", consent=asked.id, allow=asked.allow)
         if asked.allow:
-            return await self._do_approve(protocol.Approve(id=asked.id))
-        return await self._do_deny(protocol.Deny(id=asked.id))
+            return await self._do_approve(protocol.ApproveOrder(id=asked.id))
+        return await self._do_deny(protocol.DenyOrder(id=asked.id))
 
     def _open_consent(self, consent_id: str) -> ConsentRecord:
         """A consent that can be answered now. Raises `SignerError`."""
@@ -905,10 +910,10 @@ class Signer(Lifecycle):
                 continue
             job = self._known(consent.job)
             self.log.add("consent-expired", job=job.id, consent=consent.id)
-            said = Failure(code="consent-expired", message="nobody allowed the order in time", next="order again")
+            said = SignerFailure(code="consent-expired", message="nobody allowed the order in time", next="order again")
             self._put(job, msgspec.structs.replace(consent, answer="void"), state="expired", error=said)
 
-    def _consent_digest(self, job: JobRecord, consent: str) -> str:
+    def _consent_digest(self, job: KeptJob, consent: str) -> str:
         """The hash of all that a person says yes to."""
         named = (consent, job.id, job.digest, job.model, job.objective, job.robot, job.robots, job.cost)
         return keccak256(b"aira consent\0" + msgspec.json.encode((*named, self.policy.hash))).hex()
@@ -944,22 +949,22 @@ class Signer(Lifecycle):
         self.budget.trust_clock()
         self.since = self.budget.now()
         self.log.add("policy-used", policy=self.policy.hash)
-        said = Failure(code="policy-changed", message="the owner changed the policy", next="order again")
+        said = SignerFailure(code="policy-changed", message="the owner changed the policy", next="order again")
         for consent in self.budget.consents():
             job = self._known(consent.job)
             self._put(job, msgspec.structs.replace(consent, answer="void"), state="denied", error=said)
         await self.budget.sync()
         return await self._do_policy(protocol.ReadPolicy())
 
-    def _known(self, job_id: str) -> JobRecord:
+    def _known(self, job_id: str) -> KeptJob:
         if (job := self.budget.job(job_id)) is None:
             raise SignerError("there is no such job", hint="`jobs` lists them", code="unknown-job")
         return job
 
-    def _revision(self, job: JobRecord) -> int:
+    def _revision(self, job: KeptJob) -> int:
         return job.revision + self._ticks.get(job.id, 0)
 
-    async def _shown(self, job: JobRecord) -> Job:
+    async def _shown(self, job: KeptJob) -> Job:
         consent = self.budget.consent(job.consent) if job.state == "needs-consent" else None
         name = self.agent.parts.robots.name(job.robot) if job.robot else ""
         needed = None
@@ -1020,7 +1025,7 @@ class Signer(Lifecycle):
 class _Latest:
     """Calls `keep` with what the robot publishes in a job, until it is left."""
 
-    def __init__(self, agent: Agent, job: JobRecord, keep: Callable[[Played], None]) -> None:
+    def __init__(self, agent: Agent, job: KeptJob, keep: Callable[[Played], None]) -> None:
         self._limiter = RateLimiter(per_sender=Rate(per_second=20.0, burst=40))
         self._keep = keep
         self._tasks = Background()
@@ -1067,11 +1072,11 @@ def request_digest(asked: protocol.OrderJob) -> str:
     return keccak256(msgspec.json.encode(plain_order, order="deterministic")).hex()
 
 
-def no_robot(declined: list[tuple[str, str, str]]) -> Failure:
+def no_robot(declined: list[tuple[str, str, str]]) -> SignerFailure:
     """Why no robot got a job: who declined it, with which codes."""
     codes = "; ".join(f"{robot}: {_word(code)}" for robot, code, _ in declined[:5])
     said = next((strangers(detail, f"robot {robot}") for robot, _, detail in declined if detail), None)
-    return Failure(
+    return SignerFailure(
         code="no-robot-fits",
         message=f"no robot takes the job ({codes or 'none of this model answers'})",
         next="see quote; order for more, or from another robot",
@@ -1079,14 +1084,14 @@ def no_robot(declined: list[tuple[str, str, str]]) -> Failure:
     )
 
 
-def failure_of(error: AiraError) -> Failure:
+def failure_of(error: AiraError) -> SignerFailure:
     """An error as programs get it: what a stranger may have written in it is marked."""
     if isinstance(error, SignerError):
         said = error.from_strangers
-        return Failure(code=error.code, message=plain(str(error), 500), next=error.hint, from_strangers=said)
+        return SignerFailure(code=error.code, message=plain(str(error), 500), next=error.hint, from_strangers=said)
     text = plain(public_text(error), 500)
     if isinstance(error, InputError) and error.code != "objective-unfit":
-        return Failure(code=error.code, message=text, next=plain(public_text(error.hint)))
+        return SignerFailure(code=error.code, message=text, next=plain(public_text(error.hint)))
     kinds = (
         (ChainError, "the chain refused, or did not answer"),
         (ContentError, "a file is not available"),
@@ -1094,7 +1099,9 @@ def failure_of(error: AiraError) -> Failure:
         (RemoteError, "the other side failed, or did not answer"),
     )
     message = next((words for kind, words in kinds if isinstance(error, kind)), "the signer can't do that")
-    return Failure(code=error.code, message=message, from_strangers=protocol.StrangersText(text=text, author="others"))
+    return SignerFailure(
+        code=error.code, message=message, from_strangers=protocol.StrangersText(text=text, author="others")
+    )
 
 
 def _check_peer(request: web.Request) -> None:
@@ -1111,7 +1118,7 @@ def _check_peer(request: web.Request) -> None:
 
 
 def _require(decision: Decision | None) -> None:
-    if decision is not None and decision.verdict is Verdict.REFUSED:
+    if decision is not None and decision.verdict is PolicyVerdict.REFUSED:
         raise _refusal(decision)
 
 
@@ -1119,7 +1126,7 @@ def _refusal(decision: Decision) -> SignerError:
     return SignerError(decision.why, hint=decision.next, code=decision.code)
 
 
-def _answered(answer: protocol.Answer, *, status: int = 200) -> web.Response:
+def _answered(answer: protocol.SignerAnswer, *, status: int = 200) -> web.Response:
     return web.Response(body=msgspec.json.encode(answer), status=status, content_type="application/json")
 
 

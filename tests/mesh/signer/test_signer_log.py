@@ -46,10 +46,10 @@ def lines_of(folder: Path) -> list[bytes]:
 def signed_by_another(lines: list[bytes]) -> list[bytes]:
     import msgspec
 
-    from mesh.signer._log import Entry
+    from mesh.signer._log import SignedEntry
     from schemas.decoding import decode_json
 
-    entry = msgspec.structs.replace(decode_json(lines[2], Entry), facts={"cost": 0}, signature="")
+    entry = msgspec.structs.replace(decode_json(lines[2], SignedEntry), facts={"cost": 0}, signature="")
     entry = msgspec.structs.replace(entry, signature=OTHER.sign_hash(entry.digest).hex())
     return [*lines[:2], msgspec.json.encode(entry), *lines[3:]]
 
