@@ -277,11 +277,13 @@ def _question(job: Job, arguments: dict[str, Any]) -> str:
     return f"Allow this order? It pays at most {job.cost.text} to {robot} for model {job.model}: {shown}"
 
 
+_LOOK: Final = "see the tool's description and the schema of its arguments"
+
+
 def _failure_of(error: AiraError) -> SignerFailure:
     strangers = error.from_strangers if isinstance(error, SignerError) else None
-    return SignerFailure(
-        code=error.code, message=public_text(error), next=public_text(error.hint), from_strangers=strangers
-    )
+    said = public_text(error.hint or _LOOK)
+    return SignerFailure(code=error.code, message=public_text(error), next=said, from_strangers=strangers)
 
 
 def _failed(error: AiraError) -> CallToolResult:

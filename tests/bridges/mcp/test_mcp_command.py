@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,8 +13,9 @@ from mesh.errors import ConfigurationError
 from tests.support.commands import invoke, refused
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Iterator
 
+GUIDE = Path(__file__).parents[3] / "docs" / "guides" / "mcp.md"
 POLICY = """\
 [budget]
 per_job = "5 XRT"
@@ -82,3 +85,24 @@ def test_whether_a_program_may_bring_the_yes_is_explained(policy: Path) -> None:
     assert words in invoke("mcp", "policy", "explain", policy).stdout
     policy.write_text(POLICY + '\n[consent]\nabove = "1 XRT"\nby_client = "yes"\n')
     assert "by_client is true or false" in invoke("mcp", "policy", "check", policy).stderr
+
+
+def blocks(language: str) -> Iterator[str]:
+    yield from re.findall(rf"^```{language}\n(.*?)^```", GUIDE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def test_the_policy_of_the_guide_is_one(policy: Path) -> None:
+    (text,) = blocks("toml")
+    policy.write_text(text)
+    done = invoke("mcp", "policy", "explain", policy)
+    assert done.returncode == 0, done.stderr
+    assert "An order above 2 XRT needs a person's yes, within" in done.stdout
+
+
+def test_the_clients_of_the_guide_start_the_door() -> None:
+    servers = [one for text in blocks("json") for one in (json.loads(text).popitem()[1])["aira"].items()]
+    assert {value for name, value in servers if name == "command"} == {"aira"}
+    started = [value for name, value in servers if name == "args"]
+    assert len(started) == 2
+    for arguments in started:
+        assert invoke(*arguments, "--help").returncode == 0
