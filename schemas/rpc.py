@@ -17,7 +17,7 @@ import msgspec
 
 from schemas.address import keccak256, parse_address
 from schemas.errors import InvalidAddress, InvalidMessage, InvalidRecord
-from schemas.messages import Demand, Offer, Result, equal_terms
+from schemas.messages import Demand, Offer, Permit, Result, equal_terms
 from schemas.records import (
     MAX_UINT256,
     ControlRobot,
@@ -121,6 +121,27 @@ class SendResult(SignResult, frozen=True, kw_only=True):
     signature: str
 
 
+class SendPermit(_MessageRequest, frozen=True, kw_only=True):
+    """A signed Permit beside a demand."""
+
+    kind: ClassVar[type[Any]] = Permit
+    owner: str
+    spender: str
+    token: str
+    value: UInt256
+    nonce: UInt256
+    deadline: UInt256
+    domain: str
+    signature: str
+
+    @classmethod
+    def of(cls, message: SignedMessage) -> Self:
+        return cls(**msgspec.structs.asdict(message))
+
+    def message(self) -> Any:
+        return self.unsigned()
+
+
 class AcceptDemand(SignedRecord, frozen=True, kw_only=True):
     """Ask a robot for its offer for a demand that is for it alone; nothing of it is published.
 
@@ -143,7 +164,7 @@ class Accepted(Record, frozen=True, kw_only=True, omit_defaults=True):
     decline: Decline | None = None
 
 
-class OrderPair(SignedRecord, frozen=True, kw_only=True):
+class OrderPair(SignedRecord, frozen=True, kw_only=True, omit_defaults=True):
     """Ask a provider to create the contract of a demand and an offer, and to match neither with anything else.
 
     The demand's `maker` (EIP-55) signs this, too: so nobody else can bind a demand to an offer.
@@ -155,6 +176,8 @@ class OrderPair(SignedRecord, frozen=True, kw_only=True):
     demand: SendDemand
     offer: SendOffer
     maker: str
+    permit: SendPermit | None = None
+    """The maker's, by which it pays what the demand costs."""
 
     def check(self, demand: Verified[Demand], offer: Verified[Offer]) -> None:
         """Raise `InvalidMessage` unless its maker has signed its demand, and that agrees with its offer.

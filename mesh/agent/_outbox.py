@@ -16,7 +16,7 @@ from mesh.base.flood import Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff
 from mesh.role.program import RESEND
-from schemas import Demand, Offer, Result, SignedMessage, Withdrawal, decode, encode, message_hash
+from schemas import Demand, Offer, Permit, Result, SignedMessage, Withdrawal, decode, encode, message_hash
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator
@@ -115,6 +115,8 @@ class Outbox:
         """Messages that were never sent, in this run or an earlier one."""
         self._limiter = RateLimiter(per_sender=rate)
         self.send_alone: Callable[[Demand, str], object] = lambda _demand, _robot: None
+        self.permit_for: Callable[[Demand], Permit | None] = lambda _demand: None
+        """Returns the permit that travels before a demand."""
         self._changed = asyncio.Event()
 
     async def post(self, message: SignedMessage, *, robot: str = "") -> None:
@@ -184,6 +186,8 @@ class Outbox:
             if identity in self._fresh or self._limiter.allow(""):
                 self._fresh.discard(identity)
                 if not one.robot:
+                    if isinstance(one.message, Demand) and (permit := self.permit_for(one.message)) is not None:
+                        self._channel.publish(permit)
                     self._channel.publish(one.message)
                 elif isinstance(one.message, Demand):
                     self.send_alone(one.message, one.robot)

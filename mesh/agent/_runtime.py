@@ -53,7 +53,17 @@ from mesh.network.services import answering, declared
 from mesh.role.following import follow_chain
 from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, LocalRequest, listening, stop_folder
 from mesh.telemetry.logs import LogService
-from schemas import ZERO_ADDRESS, Demand, Result, Withdrawal, decode, event_selector, message_hash, parse_address
+from schemas import (
+    ZERO_ADDRESS,
+    Demand,
+    Permit,
+    Result,
+    Withdrawal,
+    decode,
+    event_selector,
+    message_hash,
+    parse_address,
+)
 from schemas.cid import is_cid
 from schemas.keys import EthEventKey, EventKey, LiabilityEvent, ProgressKey, market_selector
 from schemas.rpc import ApprovalEvent, TransferEvent
@@ -219,6 +229,10 @@ class LateResults:
             self._late_from[address] = NEVER
             facts = log_event("late-result-finalized", success=result.success, gas=settled.gas_used)
             log.warning("finalized without a provider, because none did in time", extra=facts)
+
+
+PERMIT_PAUSE: Final = 60.0
+"""Seconds for which copies of a permit that brings nothing new are dropped unread."""
 
 
 class AgentRuntime(Lifecycle):
@@ -502,12 +516,24 @@ class AgentRuntime(Lifecycle):
         await self.executor.owe_result(address, success=success, result=job.result, note=job.note)
         await self.parts.outbox.send_new()
 
+    async def _note_permits(self, permits: Subscription[Permit]) -> None:
+        """Remember the permits beside demands: whose maker can pay goes by them, too."""
+        await permits.recall()
+        async for permit in permits:
+            if not self.parts.chain.funds.note(permit.message):
+                permits.forget(permit, after=PERMIT_PAUSE)
+
     async def handle_demands(self, subscription: Subscription[Demand], handlers: Sequence[Handler]) -> None:
         """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
         parts, tokens = self.parts, self.parts.chain.tokens
         token = await parts.chain.retrying(partial(tokens.address, parts.settings.erc20_token), outages=parts.outages)
         dispatcher = DemandDispatcher(subscription, handlers, parts, self.trader, self.rules, token=token)
-        async with parts.channel.subscribe(Withdrawal) as withdrawals, asyncio.TaskGroup() as tasks:
+        async with (
+            parts.channel.subscribe(Withdrawal) as withdrawals,
+            parts.channel.subscribe(Permit) as permits,
+            asyncio.TaskGroup() as tasks,
+        ):
+            tasks.create_task(self._note_permits(permits), name="permits")
             tasks.create_task(dispatcher.run(), name="demands")
             with self._hearing_of_contracts():
                 async for withdrawal in withdrawals:

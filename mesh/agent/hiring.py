@@ -19,7 +19,7 @@ from mesh.errors import AiraError, RemoteError
 from mesh.network.services import call
 from schemas import message_hash, verify_message
 from schemas.messages import equal_terms
-from schemas.rpc import AcceptDemand, Accepted, OrderPair, SendDemand, SendOffer
+from schemas.rpc import AcceptDemand, Accepted, OrderPair, SendDemand, SendOffer, SendPermit
 from schemas.signing import Decline, Rejection
 
 if TYPE_CHECKING:
@@ -113,8 +113,13 @@ class Hiring:
             lighthouse = await self._parts.chain.lighthouses.get(self._parts.settings.lighthouse_contract)
             providers = [*lighthouse.stakes][:PROVIDERS]
             signer, session = self._parts.signer, self._parts.network.session
-            pair = OrderPair(demand=SendDemand.of(demand), offer=SendOffer.of(offer), maker=signer.address)
-            pair = pair.signed_by(signer)
+            permit = self._parts.chain.permits.of(demand.token, signer.address)
+            pair = OrderPair(
+                demand=SendDemand.of(demand),
+                offer=SendOffer.of(offer),
+                maker=signer.address,
+                permit=None if permit is None else SendPermit.of(permit),
+            ).signed_by(signer)
             for rejection in await asyncio.gather(*(send_pair(session, provider, pair) for provider in providers)):
                 if rejection is not None:
                     self._rejected(rejection)

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from mesh.agent.contracts import ContractReports, JobAttempts, OnProgress
     from mesh.agent.ledger import StoredOrder
     from mesh.agent.orders import Terms
-    from schemas import Liability, Verified
+    from schemas import Liability, Permit, Verified
 
 
 log = logging.getLogger(__name__)
@@ -220,7 +220,7 @@ class Trader(Lifecycle):
         self._parts = parts
         self._chain = parts.chain
         self._address = parts.signer.address
-        self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address)
+        self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address, parts.chain.permits)
         self._orders: dict[str, TradedOrder] = {}
         self.writer = TermsWriter(parts, self._orders)
         self.answers = OpenOffers()
@@ -273,7 +273,7 @@ class Trader(Lifecycle):
         await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
         self._tasks = await stack.enter_async_context(Background())
         self.hiring = Hiring(self._parts, self._tasks, rejected=self._pair_rejected, declined=self._pair_declined)
-        self._parts.outbox.send_alone = self.hiring.send
+        self._parts.outbox.send_alone, self._parts.outbox.permit_for = self.hiring.send, self._permit_for
         self._send_covered(resumed)
         stack.push_async_callback(self._withdraw_at_end)
 
@@ -358,7 +358,7 @@ class Trader(Lifecycle):
         if kind is Demand and self._hear_declines is not None:
             self._hear_declines()
         try:
-            await self._allowances.ensure(order, self._chain.funds.cost_of(order.signed))
+            await self._ensure(order)
         except BaseException:
             self._forget(order)
             raise
@@ -454,11 +454,18 @@ class Trader(Lifecycle):
         for order in costly:
             self._tasks.start(self._cover_and_send(order), f"resume {order.identity}")
 
+    async def _ensure(self, order: TradedOrder) -> None:
+        """Make sure that the factory may take what an order costs, for a demand by a permit if the token has such."""
+        permit = order.signed.token if isinstance(order.signed, Demand) else ""
+        await self._allowances.ensure(order, self._chain.funds.cost_of(order.signed), permit=permit)
+
+    def _permit_for(self, demand: Demand) -> Permit | None:
+        return self._chain.permits.of(demand.token, self._address)
+
     async def _cover_and_send(self, order: TradedOrder) -> None:
         chain = self._chain
-        ensure = partial(self._allowances.ensure, order, chain.funds.cost_of(order.signed))
         try:
-            await chain.retrying(ensure, outages=self._parts.outages)
+            await chain.retrying(partial(self._ensure, order), outages=self._parts.outages)
         except AiraError as error:
             facts = log_event("order-not-covered", order=order.identity, code=error.code)
             log.warning("the %s is open, but no provider can use it now: %s", order, error, extra=facts)
@@ -723,6 +730,8 @@ class Trader(Lifecycle):
             facts = log_event("order-rejected", order=rejection.order, provider=rejection.provider)
             why = rejection.reason, rejection.detail
             log.warning("%s can't use the %s now (%s: %s)", rejection.provider, order, *why, extra=facts)
+            if rejection.reason == "ERC20InsufficientAllowance":  # another order has used the permit
+                self._send_covered([order])
 
     def _pair_declined(self, decline: Decline) -> None:
         """The robot that an order is for has agreed before, and does not any more."""
@@ -761,7 +770,7 @@ class Trader(Lifecycle):
         """Replace an order by one with the same terms and a fresh nonce."""
         async with self._changing:
             signed = await self.writer.sign_again(order.signed)
-            await self._allowances.ensure(order, self._chain.funds.cost_of(order.signed))
+            await self._ensure(order)
             identity = order.identity
             if not order.is_open or self._orders.pop(identity, None) is None:
                 return

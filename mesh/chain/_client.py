@@ -12,6 +12,7 @@ from mesh.chain._contracts import Contracts, contract_version
 from mesh.chain._lighthouses import Lighthouses
 from mesh.chain._names import Names, find_registry
 from mesh.chain._node import Node
+from mesh.chain._permits import Permits
 from mesh.chain._tokens import Funds, Tokens
 from mesh.chain._validators import Validators
 from mesh.chain.errors import NoContracts, UnknownName
@@ -104,7 +105,8 @@ class Chain:
                 await stack.enter_async_context(self.node)
             self._contracts = await self._find_contracts()
             self._validators = Validators(self._contracts, listed=self._known_validators)
-            self._funds, self._tokens = Funds(self._contracts), Tokens(self._contracts)
+            self._permits = Permits(self._contracts)
+            self._funds, self._tokens = Funds(self._contracts, self._permits), Tokens(self._contracts)
             self._stack = stack.pop_all()
         return self
 
@@ -148,6 +150,12 @@ class Chain:
         """What accounts have and let the factory take; what orders cost, and whether it can be paid."""
         self._opened()
         return self._funds
+
+    @property
+    def permits(self) -> Permits:
+        """Approvals by signature (EIP-2612): the account's own, and those of others that were noted."""
+        self._opened()
+        return self._permits
 
     @property
     def lighthouses(self) -> Lighthouses:

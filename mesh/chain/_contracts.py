@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import compress
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, NamedTuple
 
 from mesh.base.flood import BoundedDict
 from mesh.chain.answers import InvalidAnswer
@@ -128,6 +128,9 @@ class ContractVersion:
         self._factory = node.contract("Factory", factory)
         self._liabilities: BoundedDict[str, None] = BoundedDict(RECOGNISED_LIABILITIES)
 
+    takes_permits: ClassVar[bool] = True
+    """Whether a contract can be created with a permit (EIP-2612)."""
+
     def ours(self, function: str) -> ContractFunctions:
         """The factory, for a function that only ours have. Raises `NotOffered`."""
         return self._factory
@@ -231,6 +234,8 @@ class OriginalContracts(ContractVersion):
     They give no reasons when they refuse, pay nobody back, and don't say whose liability a contract is: a liability is
     recognised by an event of the factory that names it, or by the gas that the factory has counted for it.
     """
+
+    takes_permits = False
 
     def ours(self, function: str) -> ContractFunctions:
         raise NotOffered(function, self.generation)

@@ -21,7 +21,7 @@ from mesh.chain.errors import InsufficientTokens, NoContracts, RequestRefused, R
 from mesh.chain.following import Approval, decode_log, topics_of
 from mesh.errors import ChainError, InputError
 from mesh.settings.chains import profile_of
-from schemas.address import is_ens_name, shortened
+from schemas.address import ZERO_ADDRESS, is_ens_name, shortened
 from schemas.messages import Offer
 
 if TYPE_CHECKING:
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from mesh.chain._abi import ContractCall, ContractFunctions
     from mesh.chain._contracts import Contracts
     from mesh.chain._node import Call, Node
-    from schemas import Liability, Verified
+    from mesh.chain._permits import Permits
+    from schemas import Liability, Permit, Verified
     from schemas.messages import Order
 
 
@@ -50,7 +51,10 @@ SHORT_POLLS: Final = 0.25
 KEPT: Final = 8192
 """Answers that are remembered."""
 
-_BALANCE, _ALLOWANCE = (bytes.fromhex(selector) + bytes(12) for selector in ("70a08231", "dd62ed3e"))
+_BALANCE, _ALLOWANCE, _NONCES = (
+    bytes.fromhex(selector) + bytes(12) for selector in ("70a08231", "dd62ed3e", "7ecebe00")
+)
+_DOMAIN: Final = bytes.fromhex("3644e515")
 _WORD: Final = 32
 
 
@@ -85,8 +89,11 @@ class Funds:
     Used in one event loop.
     """
 
-    def __init__(self, contracts: Contracts, *, clock: Clock = SYSTEM_CLOCK, kept: int = KEPT) -> None:
+    def __init__(
+        self, contracts: Contracts, permits: Permits, *, clock: Clock = SYSTEM_CLOCK, kept: int = KEPT
+    ) -> None:
         self._contracts = contracts
+        self._permits = permits
         self._clock = clock
         self._known: BoundedDict[Holding, _KnownFunding] = BoundedDict(kept)
         self._places = asyncio.Semaphore(AT_ONCE)
@@ -129,8 +136,16 @@ class Funds:
         if isinstance(order, Offer):
             return {self._contracts.xrt: order.lighthouse_fee}
         costs = {order.token: order.cost}
-        costs[self._contracts.xrt] = costs.get(self._contracts.xrt, 0) + order.validator_fee
+        charged = order.token if order.validator == ZERO_ADDRESS else self._contracts.xrt
+        costs[charged] = costs.get(charged, 0) + order.validator_fee
         return costs
+
+    def note(self, permit: Permit) -> bool:
+        """Remember a signed permit, which counts as an allowance from now on; whether it is a better one."""
+        is_better = self._permits.note(permit)
+        if is_better:
+            self._known.pop(Holding(permit.token, permit.owner), None)
+        return is_better
 
     async def shortages(self, orders: Sequence[Verified[Order]], *, fresh: bool = False) -> list[str]:
         """What each order's maker lacks to pay what the order costs it, as the contracts call it; empty if nothing.
@@ -164,13 +179,15 @@ class Funds:
 
     async def _read(self, batch: Sequence[Holding]) -> list[Funding | None]:
         spender = bytes.fromhex(self._contracts.factory[2:])
-        calls = []
-        for token, holder in batch:
+        calls, permits = [], [self._permits.of(*holding) for holding in batch]
+        for (token, holder), permit in zip(batch, permits, strict=True):
             account = bytes.fromhex(holder[2:])
-            calls.append([(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)])
+            asked = [(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)]
+            calls.append(asked if permit is None else [*asked, (token, _NONCES + account), (token, _DOMAIN)])
         self.requests += 1
         answers = await asked_together(self._contracts.node, calls, most=_WORD)
-        return [None if one is None else _funding(*one) for one in answers]
+        pairs = zip(answers, permits, strict=True)
+        return [None if one is None else _permitted(_funding(*one[:2]), permit, *one[2:]) for one, permit in pairs]
 
 
 async def asked_together(
@@ -201,6 +218,15 @@ def _funding(balance: bytes | None, allowance: bytes | None) -> Funding:
     return Funding(int.from_bytes(balance), int.from_bytes(allowance))
 
 
+def _permitted(funding: Funding, permit: Permit | None, *told: bytes | None) -> Funding:
+    """Funding with a permit as the allowance, if the token takes it by what it told of nonce and domain."""
+    if permit is None or funding == NO_TOKEN:
+        return funding
+    if told != (permit.nonce.to_bytes(_WORD, "big"), bytes.fromhex(permit.domain)):
+        return funding
+    return funding._replace(allowance=max(funding.allowance, permit.value))
+
+
 TOKEN_UNREADABLE: Final = "TokenUnreadable"
 """The reason of a rejection when a contract does not tell balances and allowances, so that it can't be paid with."""
 LEAST_AHEAD: Final = 4
@@ -220,8 +246,9 @@ def _lacks(funding: Funding | None, amount: int) -> str:
 class Allowances:
     """The allowance of the factory: what the orders of `account` may cost, by order and token (smallest unit)."""
 
-    def __init__(self, tokens: Tokens, factory: str, account: str) -> None:
+    def __init__(self, tokens: Tokens, factory: str, account: str, permits: Permits | None = None) -> None:
         self._tokens = tokens
+        self._permits = permits
         self._factory = factory
         self._account = account
         self._open: dict[Hashable, Mapping[str, int]] = {}
@@ -231,8 +258,11 @@ class Allowances:
         self._ahead: dict[str, int] = {}
         self._approving = asyncio.Lock()
 
-    async def ensure(self, order: Hashable, amounts: Mapping[str, int]) -> None:
+    async def ensure(self, order: Hashable, amounts: Mapping[str, int], *, permit: str = "") -> None:
         """Make sure that the factory may take `amounts` (by token) for `order` and what the other orders may cost.
+
+        What lacks of the token `permit` (an address) is approved by a signature, which `permits` has then, if the token
+        takes such; else, and of other tokens, by a transaction.
 
         The account must own what its open orders cost; withdrawn ones only need the allowance. Raises
         `InsufficientTokens`; a new order is then not counted.
@@ -243,7 +273,7 @@ class Allowances:
                     others = (costs for key, costs in self._open.items() if key != order)
                     funds = amount + _sum(others, token)
                     needed = funds + _sum(self._withdrawn.values(), token)
-                    await self._ensure(token, funds=funds, needed=needed)
+                    await self._ensure(token, funds=funds, needed=needed, is_permitted=token == permit)
             if order not in self._withdrawn:
                 self._open[order] = amounts
 
@@ -261,11 +291,16 @@ class Allowances:
         self._open.pop(order, None)
         self._withdrawn.pop(order, None)
 
-    async def _ensure(self, token: str, *, funds: int, needed: int) -> None:
+    async def _ensure(self, token: str, *, funds: int, needed: int, is_permitted: bool) -> None:
         factory, tokens = self._factory, self._tokens
         balance, allowed = await tokens.balance_and_allowance(self._account, factory, token=token)
         if balance < funds:
             raise InsufficientTokens(self._account, token, balance=balance, needed=funds)
+        permits = self._permits if is_permitted else None
+        if allowed < needed and permits is not None and await permits.sign(token, needed) is not None:
+            facts = log_event("permit-signed", token=token, amount=needed)
+            log.info("signed a permit for %d of token %s, so no transaction is needed", needed, token, extra=facts)
+            return
         while allowed < needed:
             allowance = max(needed, min(self._times(token, allowed) * needed, balance))
             facts = log_event("allowance-approved", token=token, amount=allowance)

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from mesh.chain._contracts import result_arguments
 from mesh.chain._node import getters
+from mesh.chain._permits import permit_arguments
 from mesh.chain.answers import LIABILITY_GETTERS, liability_record
 from mesh.chain.errors import NoContracts, NodeUnreachable, NotALiability, OrderAlreadyUsed, RequestRefused, Reverted
 from mesh.chain.following import (
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from mesh.chain._contracts import Contracts
     from mesh.chain._node import Node
     from mesh.chain.transactions import Receipt
-    from schemas.messages import Demand, Offer, Order, Result
+    from schemas.messages import Demand, Offer, Order, Permit, Result
     from schemas.records import Liability
 
 OUTCOME_GETTERS: Final = ("promisor", "isFinalized", "isSuccess")
@@ -303,15 +304,22 @@ class Liabilities:
                 return record
             await asyncio.sleep(self._node.timing.poll_interval)
 
-    async def create(self, lighthouse: str, demand: Demand, offer: Offer) -> Created:
-        """Create a liability from two signed orders, as a provider of the lighthouse.
+    async def create(self, lighthouse: str, demand: Demand, offer: Offer, *, permit: Permit | None = None) -> Created:
+        """Create a liability from two signed orders, as a provider of the lighthouse; perhaps with the maker's permit.
+
+        Without a validator, the provider earns the demand's fee with the permit, in the demand's token.
 
         Raises `InvalidMessage` for an unsigned order or one with a name that is not resolved.
         """
         for order in (demand, offer):
             self._version.check_order(order)
         functions = await self._contracts.lighthouse_contract(lighthouse)
-        receipt = await self._contracts.send(functions.createLiability(order_abi(demand), order_abi(offer)))
+        orders = order_abi(demand), order_abi(offer)
+        receipt = await self._contracts.send(
+            functions.createLiability(*orders)
+            if permit is None
+            else functions.createLiabilityWithPermit(*orders, *permit_arguments(permit))
+        )
         made = first_event(receipt.logs, NewLiability, emitter=self._contracts.factory)
         self._version.recognise(made.liability)
         return Created(made.liability, receipt.tx, receipt.nonce, receipt.gas_used, receipt.wei)

@@ -209,10 +209,11 @@ class FreeContracts:
         """How many may be created now for strangers."""
         return int(self._refilled(self._clock.time()))
 
-    def lacking(self, match: Match, *, data_gas: int = 0) -> int:
+    def lacking(self, match: Match, *, data_gas: int = 0, carried: int = 0) -> int:
         """The wn that a contract lacks to cover the provider's gas; 0 if it covers it.
 
-        `data_gas` is what its data costs besides, as gas; nothing is minted for that.
+        `data_gas` is what its data costs besides, as gas; nothing is minted for that. `carried` is the fee for carrying
+        the demand's permit, wn.
         """
         demand, offer = match.demand.message, match.offer.message
         cost, fee = demand.cost, offer.lighthouse_fee
@@ -220,7 +221,7 @@ class FreeContracts:
         strangers = len({match.demand.signer, match.offer.signer, self._account}) == 3
         is_minted = demand.token == self._xrt and strangers
         minted = gas if self._always_minted else min(cost, gas) if is_minted else 0
-        return max(gas + data_gas - fee - minted, 0)
+        return max(gas + data_gas - fee - minted - carried, 0)
 
     async def take(self, match: Match) -> bool:
         """Whether to create a contract that does not cover its gas; what it uses up is on disk when this returns."""

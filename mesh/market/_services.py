@@ -26,7 +26,7 @@ from schemas.signing import Refusal
 from schemas.status import ALIVE, MarketStatus, Status
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Collection, Iterable, Sequence
     from concurrent.futures import Future
 
     from mesh.base.flood import Drops
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mesh.market.book import Order, OrderBook
     from mesh.market.withdrawals import Withdrawals
     from mesh.network import Subscription
-    from schemas import Withdrawal
+    from schemas import Permit, Withdrawal
     from schemas.rpc import Nothing, OrderPair
 
 THREADS: Final = 2
@@ -48,10 +48,11 @@ PENDING: Final = 64
 
 
 class OrderBookService:
-    """Answers queries for open orders and withdrawals, which a client sends after it has subscribed.
+    """Answers queries for open orders, withdrawals and permits, which a client sends after it has subscribed.
 
-    Inside `async with` it answers on the keys of `lighthouse` (ENS name) from `book` and `withdrawals`. At most `limit`
-    queries are pending at a time, and at most `replies` orders are sent. Leaving `async with` aborts the answers.
+    Inside `async with` it answers on the keys of `lighthouse` (ENS name) from `book`, `withdrawals` and `permits`. At
+    most `limit` queries are pending at a time, and at most `replies` orders are sent. Leaving `async with` aborts the
+    answers.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class OrderBookService:
         book: OrderBook,
         withdrawals: Withdrawals,
         *,
+        permits: Collection[Permit] = (),
         limit: int = PENDING,
         replies: Rate = REPLIES,
         drops: Drops | None = None,
@@ -70,6 +72,7 @@ class OrderBookService:
         self._lighthouse = lighthouse
         self._book = book
         self._withdrawals = withdrawals
+        self._permits = permits
         self._limit = limit
         self._drops = drops
         self._most = replies.burst
@@ -93,7 +96,9 @@ class OrderBookService:
     def _received(self, loop: asyncio.AbstractEventLoop, query: zenoh.Query) -> None:
         """Refuse what is too much on Zenoh's thread, so that the event loop is not kept busy."""
         order = query.parameters.get(ORDER)
-        replies = len(self._withdrawals.of(order)) if order else len(self._withdrawals) + len(self._book)
+        replies = (
+            len(self._withdrawals.of(order)) if order else len(self._withdrawals) + len(self._permits) + len(self._book)
+        )
         if len(self._answers) < self._limit and self._rate.allow("", min(replies + 1, self._most)):
             call_in_loop(loop, self.answer, query)
             return
@@ -116,13 +121,14 @@ class OrderBookService:
         else:
             query.drop()  # type: ignore[no-untyped-call]
 
-    def _answer(self, order: str | None) -> list[Order | Withdrawal]:
+    def _answer(self, order: str | None) -> list[Order | Withdrawal | Permit]:
         """The withdrawals of an order, if its hash is given; else all that is open."""
         if order:
             return [withdrawal.message for withdrawal in self._withdrawals.of(order)]
-        return [*(withdrawal.message for withdrawal in self._withdrawals), *self._book.messages()]
+        withdrawals = (withdrawal.message for withdrawal in self._withdrawals)
+        return [*withdrawals, *self._permits, *self._book.messages()]
 
-    def _reply(self, query: zenoh.Query, messages: Sequence[Order | Withdrawal]) -> None:
+    def _reply(self, query: zenoh.Query, messages: Sequence[Order | Withdrawal | Permit]) -> None:
         with query:  # leaving it ends the answer
             for message in messages:
                 key = message_key(self._lighthouse, message)
@@ -147,6 +153,8 @@ class PairService:
             demand = await self._parts.channel.verified(request.demand.message())
             offer = await self._parts.channel.verified(request.offer.message())
             request.check(demand, offer)
+            if request.permit is not None:
+                self._settlement.note_permit(await self._parts.channel.verified(request.permit.message()))
         except InvalidMessage as error:
             return PairTaken(error.reason, public_text(error))
         if not self._parts.queue.has_room_for(self._parts.chain.funds.worth(demand.message)):

@@ -36,6 +36,7 @@ from mesh.chain import (
     RequestRefused,
     Reverted,
     TransactionTimeout,
+    fee_for_carrying,
 )
 from mesh.errors import AiraError, ChainError, InputError, public_text
 from mesh.market._earnings import why
@@ -62,7 +63,7 @@ if TYPE_CHECKING:
     from mesh.market.withdrawals import Withdrawals
     from mesh.network import Channel
     from mesh.role.following import ChainHead, Created
-    from schemas import Liability, Verified, Withdrawal
+    from schemas import Liability, Permit, Verified, Withdrawal
 
 log = logging.getLogger(__name__)
 
@@ -682,7 +683,9 @@ class Settlement:
         data_gas = await parts.chain.retrying(
             partial(parts.chain.liabilities.data_gas, demand.message, offer.message), outages=parts.lookups
         )
-        if parts.free.lacking(match, data_gas=data_gas) and not await parts.free.take(match):
+        permit = await self._permit(match)
+        carried = 0 if permit is None or permit.token != parts.chain.xrt else fee_for_carrying(demand.message)
+        if parts.free.lacking(match, data_gas=data_gas, carried=carried) and not await parts.free.take(match):
             self._decline(match, data_gas)
             return
         try:
@@ -716,6 +719,17 @@ class Settlement:
         finally:
             self._versions.ended(match, parts.head.head)
 
+    async def _permit(self, match: Match) -> Permit | None:
+        """The permit with which a match's liability would be created now."""
+        ask = partial(self._parts.chain.permits.needed_for, match.demand)
+        return await self._parts.chain.retrying(ask, outages=self._parts.lookups)
+
+    def note_permit(self, permit: Verified[Permit]) -> None:
+        """Remember a permit beside a demand: its maker can pay by it."""
+        if permit.signer in self.blocked or not self._parts.chain.funds.note(permit.message):
+            self._parts.drops.count("permits", permit.signer)
+            self._parts.forget(permit, after=self._pause)
+
     def _stakes(self, match: Match) -> Stakes:
         """What creating a match's liability takes: what its orders cost, and the nonces of generation 5 in turn."""
         amounts: Counter[Holding] = Counter()
@@ -746,7 +760,9 @@ class Settlement:
                 raise MatchWithdrawn("an order was withdrawn or replaced before its contract was created")
             await parts.store.keep_sent(parts.orders.sending(*match))
             try:
-                return await parts.chain.liabilities.create(parts.lighthouse, demand.message, offer.message)
+                permit = await parts.chain.permits.needed_for(demand)
+                create = partial(parts.chain.liabilities.create, parts.lighthouse, demand.message, offer.message)
+                return await create(permit=permit)
             except (NodeUnreachable, TransactionTimeout):
                 may_be_sent = True
                 raise

@@ -35,7 +35,7 @@ from mesh.role.composition import state_folder
 from mesh.role.following import ChainHead
 from mesh.settings.groups import DEADLINE_LIMIT
 from mesh.telemetry.logs import LogService
-from schemas import Demand, Offer, Result, Withdrawal
+from schemas import Demand, Offer, Permit, Result, Withdrawal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -270,6 +270,7 @@ class Provider(Role):
         self._demands = await stack.enter_async_context(self.channel.subscribe(Demand))
         self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
         self._withdrawn = await stack.enter_async_context(self.channel.subscribe(Withdrawal))
+        self._permits = await stack.enter_async_context(self.channel.subscribe(Permit))
         self.results = await stack.enter_async_context(self.channel.subscribe(Result))
         parts = SettlementParts(
             chain=self._chain,
@@ -288,9 +289,16 @@ class Provider(Role):
         )
         self.settlement = Settlement(parts, matched=self._matched, open_limit=options.open_liabilities)
         await stack.enter_async_context(
-            OrderBookService(self._session, self._lighthouse, self.book, self.withdrawals, drops=self.drops)
+            OrderBookService(
+                self._session,
+                self._lighthouse,
+                self.book,
+                self.withdrawals,
+                permits=self._chain.permits,
+                drops=self.drops,
+            )
         )
-        subscriptions = (self._demands, self._offers, self._withdrawn, self.results)
+        subscriptions = (self._demands, self._offers, self._withdrawn, self._permits, self.results)
         self.status = ProviderStatus(self._session, parts, subscriptions=subscriptions)
         services = await stack.enter_async_context(Services(self._session, self.address, drops=self.drops))
         self._services, self._pairs = services, PairService(parts, self.settlement)
@@ -322,6 +330,8 @@ class Provider(Role):
                 # Before the orders that they concern; one that comes later still stops what was not sent.
                 await self._withdrawn.recall()
                 tasks.create_task(self._take_withdrawals(), name="provider withdrawals")
+                await self._permits.recall()
+                tasks.create_task(self._take_permits(), name="provider permits")
                 arrivals = Arrivals(
                     self.settlement,
                     self.queue,
@@ -341,7 +351,7 @@ class Provider(Role):
 
     def _forget(self, verified: Verified[Any], *, after: float = 0.0) -> None:
         """Let the next copy of a message through: it is not handled, or its effect was not confirmed."""
-        for subscription in (self._demands, self._offers, self._withdrawn, self.results):
+        for subscription in (self._demands, self._offers, self._withdrawn, self._permits, self.results):
             if subscription.kind == verified.message.kind:
                 subscription.forget(verified, after=after)
 
@@ -349,6 +359,10 @@ class Provider(Role):
         while True:
             self.settlement.block(await asyncio.to_thread(lambda: blocked.entries))
             await asyncio.sleep(CHECK_INTERVAL)
+
+    async def _take_permits(self) -> None:
+        async for permit in self._permits:
+            self.settlement.note_permit(permit)
 
     async def _take_withdrawals(self) -> None:
         async for withdrawal in self._withdrawn:

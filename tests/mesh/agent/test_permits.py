@@ -1,0 +1,71 @@
+"""People without ether: they order by a signature, and never send a transaction."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh import Agent
+from mesh.chain import Account
+from mesh.chain.deploy import XRT
+from tests.mesh.agent.trades import job, working
+from tests.support.market import MODEL, QUICK_RESEND, Place
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+GENERATIONS = pytest.mark.parametrize("generation", [3, 5])
+FUNDS = 100 * XRT
+FEE = 30_000
+
+
+@asynccontextmanager
+async def penniless(place: Place, generation: int) -> AsyncIterator[Agent]:
+    """A person with XRT and without ether, which it must not have or need at any time."""
+    account = Account(secrets.token_bytes(32))
+    await place.chains["provider"].tokens.transfer(account.address, FUNDS)
+    async with place.chain_of(account, generation) as chain:
+        settings = place.settings("penniless", generation=generation)
+        async with Agent(MODEL, settings=settings, account=account, chain=chain, resend=QUICK_RESEND) as person:
+            yield person
+        assert await chain.tokens.eth_balance() == 0
+        assert await chain.node.transaction_count(account.address, block="pending") == 0
+
+
+@pytest.mark.sample("generation")
+@GENERATIONS
+@pytest.mark.parametrize("is_alone", [False, True])
+async def test_a_person_without_ether_gets_a_job_done(place: Place, generation: int, is_alone: bool) -> None:
+    async with (
+        place.provider() as provider,
+        working(place.agent("robot")) as robot,
+        penniless(place, generation) as person,
+        asyncio.timeout(60),
+    ):
+        named = {"robot": robot.address} if is_alone else {}
+        for cost in (21, 300 * 1000):
+            contract = await person.demand(job(place), cost=cost, **named)
+            assert (await contract.outcome()).success
+        tokens = person.chain.tokens
+        assert await tokens.balance() == FUNDS - 21 - 300 * 1000
+        assert await tokens.allowance(person.address, person.chain.factory) == 0
+        assert provider.earnings().created == 2
+
+
+@pytest.mark.sample("generation")
+@GENERATIONS
+async def test_orders_at_once_share_a_permit(place: Place, generation: int) -> None:
+    async with (
+        place.provider(),
+        working(place.agent("robot")),
+        penniless(place, generation) as person,
+        asyncio.timeout(90),
+    ):
+        costs = (10, 200, 3000)
+        contracts = await asyncio.gather(*(person.demand(job(place), cost=cost) for cost in costs))
+        assert all([(await contract.outcome()).success for contract in contracts])
+        assert await person.chain.tokens.balance() == FUNDS - sum(costs)
