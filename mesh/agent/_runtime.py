@@ -21,7 +21,6 @@ from mesh.agent._outbox import result_identity
 from mesh.agent._owner_rules import OwnerRules
 from mesh.agent._profile import OwnProfile
 from mesh.agent._quotes import Quoting
-from mesh.agent._refunds import DueRefunds
 from mesh.agent._services import offer_services
 from mesh.agent._status import AgentStatus
 from mesh.agent.contracts import ContractReports, Outcome
@@ -52,6 +51,7 @@ from mesh.errors import AiraError, ChainError, ConfigurationError
 from mesh.network.services import answering, declared
 from mesh.role.following import follow_chain
 from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, LocalRequest, listening, stop_folder
+from mesh.role.refunds import DueRefunds
 from mesh.telemetry.logs import LogService
 from schemas import (
     ZERO_ADDRESS,
@@ -274,7 +274,7 @@ class AgentRuntime(Lifecycle):
         self.trader.full = self.rules.full
         self.notifier = Notifier(parts.settings, parts.signer.address)
         self.trader.on_offer = self._on_offer
-        self.refunds = DueRefunds(parts)
+        self.refunds = DueRefunds(parts.chain, parts.chain_head, parts.outages, self._earlier_contracts)
         self.token_events = TokenEvents(parts.channel.put, parts.signer.address)
         self.status = AgentStatus(parts, self.executor, model=model)
         self.profile = OwnProfile(parts, self.executor, self.rules, description, model=model)
@@ -515,6 +515,9 @@ class AgentRuntime(Lifecycle):
         address, success = job.liability.address, bool(job.success)
         await self.executor.owe_result(address, success=success, result=job.result, note=job.note)
         await self.parts.outbox.send_new()
+
+    async def _earlier_contracts(self) -> list[str]:
+        return [address for _, address in await self.parts.ledger.contracts("demand")]
 
     async def _note_permits(self, permits: Subscription[Permit]) -> None:
         """Remember the permits beside demands: whose maker can pay goes by them, too."""

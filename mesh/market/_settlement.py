@@ -44,6 +44,7 @@ from mesh.market.book import RETRIED, Added, Match, OrderStage, order_id
 from mesh.market.transactions import Stakes
 from mesh.market.withdrawals import withdrawn_id
 from mesh.role.following import follow_chain
+from mesh.role.refunds import DueRefunds
 from schemas import ZERO_ADDRESS, CreatedKey, Demand, Offer, RejectKey, Result, address_bytes
 from schemas.signing import Refusal, Rejection
 
@@ -207,6 +208,8 @@ class LiabilityEvents:
         """When the latest block may be asked for again because of results, on the event loop's clock."""
         self._reverted: list[ChainEvent] = []
         self._again: list[Verified[Any]] = []
+        self.refunds: Final = DueRefunds(parts.chain, parts.head, parts.outages, self._permitted)
+        """Of the contracts that it has created with a permit: their promisees may lack the ether to ask for it."""
 
     async def follow(self, settle_again: Callable[[Verified[Any]], None]) -> None:
         """Read until cancelled, through outages of the node.
@@ -225,6 +228,8 @@ class LiabilityEvents:
         elif isinstance(event, Finalized):
             self.open.pop(event.liability, None)
             self._parts.orders.finalized(event.liability, block)
+            if self.refunds.ended(event.liability):
+                self._parts.store.forget_permitted(event.liability)
 
     async def on_revert(self, event: ChainEvent) -> None:
         """Wait for the others: the orders' versions come first."""
@@ -239,10 +244,12 @@ class LiabilityEvents:
             if isinstance(event, NewLiability):
                 self._parts.earnings.creation_reverted(event.liability, event.tx)
                 self.open.pop(event.liability, None)
+                self.refunds.ended(event.liability)
                 self._parts.orders.versions.free(event.liability, before)
                 self._again += self._parts.orders.reverted(event.liability, Demand, Offer)
             elif isinstance(event, Finalized):
                 self._parts.earnings.reverted(event.tx)
+                self.refunds.end_reverted(event.liability)
                 self._again += self._parts.orders.reverted(event.liability, Result)
 
     async def on_head(self, block: int) -> None:
@@ -259,6 +266,14 @@ class LiabilityEvents:
             facts = {"order": order.hash.hex(), "signer": order.signer}
             log.info("expired order %(order)s of %(signer)s", facts, extra=log_event("order-expired", **facts))
         await self._count_transactions(block)
+
+    def created_with_permit(self, liability: str) -> None:
+        """A contract was created with a permit: it is refunded in time, also after a restart."""
+        self._parts.store.keep_permitted(liability)
+        self.refunds.watch(liability)
+
+    async def _permitted(self) -> list[str]:
+        return self._parts.store.permitted()
 
     async def is_confirmed(self, messages: Sequence[Verified[Any]], tx: str) -> bool:
         """Wait until the event that used the messages counts; False if their transaction vanished."""
@@ -555,6 +570,7 @@ class Settlement:
         self.results.start(tasks)
         tasks.create_task(self.events.follow(self._settle_again), name="provider chain")
         tasks.create_task(self._look_at_unfunded(), name="provider unfunded orders")
+        tasks.create_task(self.events.refunds.run(), name="provider refunds")
 
     def add(self, order: Verified[Order]) -> Refusal | None:
         """Add an order to the book, and settle the match that it completes.
@@ -709,6 +725,8 @@ class Settlement:
             key = CreatedKey(parts.channel.lighthouse, demand.message.model)
             parts.channel.put(str(key), created.liability.encode())
             parts.earnings.created(created, fee=offer.message.lighthouse_fee)
+            if permit is not None:
+                self.events.created_with_permit(created.liability)
             facts = {"gas": created.gas_used, "demand": demand.hash.hex(), "offer": offer.hash.hex()}
             with liability_context(created.liability):
                 log.info("created, gas %(gas)d", facts, extra=log_event("contract-created", **facts))

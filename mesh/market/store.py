@@ -1,7 +1,8 @@
 """The one file of a provider in a market: what must outlive a crash, in SQLite. A bridge keeps withdrawals in one.
 
 It has the withdrawals that are known, the orders of transactions that may still be mined, those that became
-contracts (whose other versions may be valid until their deadline), and how many free contracts are left.
+contracts (whose other versions may be valid until their deadline), how many free contracts are left, and which open
+contracts it has created with a permit.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ _SCHEMA: Final = """
     CREATE TABLE IF NOT EXISTS free_contracts (
         row INTEGER PRIMARY KEY CHECK (row = 0), "left" REAL NOT NULL, at REAL NOT NULL
     );
+    CREATE TABLE IF NOT EXISTS permitted (liability TEXT PRIMARY KEY) WITHOUT ROWID;
 """
 _LATEST: Final = 2**63 - 1
 """The latest deadline that SQLite can keep."""
@@ -98,6 +100,20 @@ class MarketStore(SyncedDatabase):
         with self._needed():
             self.write(("INSERT OR REPLACE INTO free_contracts VALUES (0, ?, ?)", [(left, at)]))
             await self.sync()
+
+    def permitted(self) -> list[str]:
+        """The contracts (addresses) that were created with a permit, and had not ended when that was noted last."""
+        return [address for (address,) in self.rows("SELECT liability FROM permitted")]
+
+    def keep_permitted(self, liability: str) -> None:
+        """Note that a contract was created with a permit. A power failure may take this back."""
+        with self._needed():
+            self.write(("INSERT OR REPLACE INTO permitted VALUES (?)", [(liability,)]))
+
+    def forget_permitted(self, liability: str) -> None:
+        """Forget such a contract, which has ended."""
+        with self._needed():
+            self.write(("DELETE FROM permitted WHERE liability = ?", [(liability,)]))
 
     @contextmanager
     def _needed(self) -> Iterator[None]:

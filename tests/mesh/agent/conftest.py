@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import TransactionSender
+from mesh.chain._contracts import ContractVersion
 from mesh.network import Endpoints, Network, ServiceFailed, call
 from schemas.rpc import Nothing
 from tests.support.market import founded, place
@@ -60,3 +61,9 @@ async def opened(place: Place) -> AsyncIterator[Asker]:
     """The robot with services that are open to all."""
     async with asking(place, place.agent("robot", open_services=True)) as asker:
         yield asker
+
+
+@pytest.fixture
+def without_permits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with contracts, or tokens, that know no permits: agents approve what their orders may cost."""
+    monkeypatch.setattr(ContractVersion, "takes_permits", False)

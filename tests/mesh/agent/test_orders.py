@@ -38,6 +38,7 @@ async def withdrawals(agent: Agent) -> list[Withdrawal]:
     return [message for message in found if isinstance(message, Withdrawal)]
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_open_orders_are_taken_up_again_with_their_allowance(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -61,6 +62,7 @@ async def test_open_orders_are_taken_up_again_with_their_allowance(
             await order.withdraw()
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_resumed_orders_are_not_sent_before_their_allowance_is_ensured(place: Place) -> None:
     chain = place.chains["person"]
     async with place.agent("person") as person:
@@ -76,6 +78,7 @@ async def test_resumed_orders_are_not_sent_before_their_allowance_is_ensured(pla
     assert resumed.hash == order.hash
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_an_allowance_that_a_provider_misses_is_ensured_again(place: Place) -> None:
     chain = place.chains["person"]
 
@@ -176,6 +179,7 @@ async def test_a_provider_confirms_that_it_honours_a_withdrawal(place: Place) ->
         assert withdrawn.state is OrderState.WITHDRAWN
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_the_allowance_of_a_withdrawn_order_is_kept_and_its_tokens_are_free(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
@@ -196,6 +200,7 @@ async def created(place: Place, demand: Demand | Offer) -> str:
     return (await place.chains["provider"].liabilities.create(demand.lighthouse, demand, offer)).liability
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_a_withdrawn_order_may_become_a_contract_all_the_same(place: Place) -> None:
     """A provider had the match already. The person's agent knows, and pays once."""
     async with place.agent("person") as person:
@@ -319,6 +324,7 @@ async def test_orders_are_valid_for_minutes(times: Any, blocks: float) -> None:
     assert await lifetime_of(chain) == pytest.approx(blocks, rel=0.02)
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_an_order_that_became_a_contract_and_expired_while_its_program_was_away_is_not_forgotten(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:

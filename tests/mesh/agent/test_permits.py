@@ -10,17 +10,23 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh import Agent
-from mesh.chain import Account
+from mesh.chain import Account, DeploymentPlan
 from mesh.chain.deploy import XRT
+from mesh.dev import EmbeddedChain
+from mesh.dev.development import deploy_market
+from tests.mesh.agent.restarts import COST, speaking, words
 from tests.mesh.agent.trades import job, working
-from tests.support.market import MODEL, QUICK_RESEND, Place
+from tests.support.market import MODEL, QUICK_RESEND, Founded, Place, offering
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from tests.support.routers import EmbeddedRouter
 
 GENERATIONS = pytest.mark.parametrize("generation", [3, 5])
 FUNDS = 100 * XRT
-FEE = 30_000
 
 
 @asynccontextmanager
@@ -69,3 +75,40 @@ async def test_orders_at_once_share_a_permit(place: Place, generation: int) -> N
         contracts = await asyncio.gather(*(person.demand(job(place), cost=cost) for cost in costs))
         assert all([(await contract.outcome()).success for contract in contracts])
         assert await person.chain.tokens.balance() == FUNDS - sum(costs)
+
+
+REFUND_DELAY = 40
+
+
+@pytest.fixture
+async def impatient(router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
+    """A market whose contracts can be refunded soon."""
+    plan = DeploymentPlan(timeout_blocks=10, refund_delay=REFUND_DELAY)
+    async with EmbeddedChain() as node:
+        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
+        async with Place(Founded(node, market), router.endpoint, tmp_path) as place:
+            yield place
+
+
+@pytest.mark.parametrize("is_restarted", [False, True])
+async def test_the_provider_takes_back_what_nobody_earned(impatient: Place, tmp_path: Path, is_restarted: bool) -> None:
+    place, said = impatient, list[str]()
+    async with speaking(offering(place.agent("robot")), said, stuck_at="3"), penniless(place, 3) as person:
+        tokens = person.chain.tokens
+        async with place.provider(store=tmp_path / "provider.sqlite"):
+            contract = await person.demand(words(place), cost=COST)
+            await until(lambda: len(said) == 3)
+            assert await tokens.balance() == FUNDS - COST
+            if not is_restarted:
+                await place.node.mine(REFUND_DELAY)
+                await until_found(lambda: is_back(place, person), what="the cost")
+        if is_restarted:
+            await place.node.mine(REFUND_DELAY)
+            async with place.provider(store=tmp_path / "provider.sqlite"):
+                await until_found(lambda: is_back(place, person), what="the cost")
+        assert (await contract.outcome()).code == "no-result"
+
+
+async def is_back(place: Place, person: Agent) -> bool:
+    await place.node.mine(1)
+    return await person.chain.tokens.balance() == FUNDS

@@ -131,6 +131,7 @@ async def test_a_contract_may_end_while_it_is_read(place: Place, monkeypatch: py
         assert (await (await other.contract(contract.address)).outcome()).success
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_the_allowance_of_the_factory_covers_all_open_demands(place: Place) -> None:
     async with place.agent("person") as person:
         demands = [asyncio.create_task(person.demand(OBJECTIVE, cost=cost)) for cost in (7000, 500)]

@@ -1,4 +1,4 @@
-"""Takes back what the account's contracts cost when nobody has ended them in time."""
+"""Takes back what contracts cost when nobody has ended them in time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from mesh.errors import ChainError
 from schemas import ZERO_ADDRESS
 
 if TYPE_CHECKING:
-    from mesh.agent.components import AgentComponents
+    from collections.abc import Awaitable, Callable, Iterable
+
+    from mesh.base.outage_log import OutageLog
+    from mesh.chain import Chain
+    from mesh.role.following import ChainHead
     from schemas import Liability
 
 log = logging.getLogger(__name__)
@@ -29,14 +33,16 @@ TOO_EARLY: Final = "RefundTooEarly"
 
 
 class DueRefunds:
-    """Refunds the contracts of which the account is the promisee, as soon as that is possible.
+    """Refunds contracts as soon as that is possible: a promisee its own, a provider those whose permits it has carried.
 
-    Not those that have cost it nothing. The original contracts offer no refund; there it does nothing. Blocks are as
-    contracts count them.
+    Not those that have cost nothing. The original contracts offer no refund; there it does nothing. Blocks are as
+    contracts count them. `earlier` returns the contracts (addresses) of earlier runs.
     """
 
-    def __init__(self, parts: AgentComponents) -> None:
-        self._parts = parts
+    def __init__(
+        self, chain: Chain, head: ChainHead, outages: OutageLog, earlier: Callable[[], Awaitable[Iterable[str]]]
+    ) -> None:
+        self._chain, self._head, self._outages, self._earlier = chain, head, outages, earlier
         self._look_at: dict[str, int] = {}
         """By contract: the first block for whose transactions it is looked at."""
         self._ended: BoundedDict[str, None] = BoundedDict(256)
@@ -45,38 +51,41 @@ class DueRefunds:
     def created(self, liability: Liability) -> None:
         """A contract of the account exists, perhaps again."""
         if _has_cost(liability):
-            self._wait(liability.address)
+            self.watch(liability.address)
 
-    def ended(self, address: str) -> None:
-        """A contract has ended, or was reverted."""
-        if self._look_at.pop(address, None) is not None:
-            self._ended[address] = None
+    def ended(self, address: str) -> bool:
+        """A contract has ended, or was reverted; whether it was watched."""
+        if self._look_at.pop(address, None) is None:
+            return False
+        self._ended[address] = None
+        return True
 
     def end_reverted(self, address: str) -> None:
         """A reorganisation reverted the end of a contract."""
         if address in self._ended:
-            self._wait(address)
+            self.watch(address)
 
     async def run(self) -> None:
         """Look after each block, until cancelled."""
-        head = self._parts.chain_head
+        head = self._head
         await self._take_up_earlier()
         while True:
             due = [address for address, block in self._look_at.items() if head.contract_block + 1 >= block]
             await asyncio.gather(*map(self._look, due))
             await head.reached(head.head + 1)
 
-    def _wait(self, address: str) -> None:
-        self._look_at[address] = self._parts.chain_head.contract_block + self._blocks_in(FIRST_LOOK)
+    def watch(self, address: str) -> None:
+        """Look at a contract from its time on."""
+        self._look_at[address] = self._head.contract_block + self._blocks_in(FIRST_LOOK)
 
     def _blocks_in(self, seconds: float) -> int:
-        return self._parts.chain.node.profile.blocks_in(seconds)
+        return self._chain.node.profile.blocks_in(seconds)
 
     async def _take_up_earlier(self) -> None:
         """Look at the contracts of earlier runs that are still open."""
-        addresses = [address for _, address in await self._parts.ledger.contracts("demand")]
-        read = partial(self._parts.chain.liabilities.find_open, addresses)
-        found = await self._parts.chain.retrying(read, outages=self._parts.outages, errors=READ_ERRORS)
+        addresses = list(await self._earlier())
+        read = partial(self._chain.liabilities.find_open, addresses)
+        found = await self._chain.retrying(read, outages=self._outages, errors=READ_ERRORS)
         for address in addresses:
             if address not in found:
                 self._ended[address] = None
@@ -95,7 +104,7 @@ class DueRefunds:
 
     async def _refund_if_due(self, address: str) -> int | None:
         """Refund a contract if that is possible now. Returns when to look again; None if never."""
-        liabilities, following = self._parts.chain.liabilities, self._parts.chain_head.contract_block + 2
+        liabilities, following = self._chain.liabilities, self._head.contract_block + 2
         try:
             state = await liabilities.refund_state(address)
             if state.is_finalized:
