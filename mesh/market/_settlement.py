@@ -190,6 +190,8 @@ CHECKS: Final = 256
 """Unfunded orders that are looked at in one round, at most."""
 OPEN_LIABILITIES: Final = 65_536
 """Records of liabilities that are kept until they are finalized; others are read when their result arrives."""
+REFUND_PATIENCE: Final = 2
+"""Blocks for which a provider leaves a refund to the promisee, who may have ether after all."""
 MISSING_CHECKS: Final = 3
 """Checks in a row that find no trace of a mined transaction before it is sent again: one node may be behind another."""
 
@@ -208,7 +210,9 @@ class LiabilityEvents:
         """When the latest block may be asked for again because of results, on the event loop's clock."""
         self._reverted: list[ChainEvent] = []
         self._again: list[Verified[Any]] = []
-        self.refunds: Final = DueRefunds(parts.chain, parts.head, parts.outages, self._permitted)
+        self.refunds: Final = DueRefunds(
+            parts.chain, parts.head, parts.outages, self._permitted, patience=REFUND_PATIENCE
+        )
         """Of the contracts that it has created with a permit: their promisees may lack the ether to ask for it."""
 
     async def follow(self, settle_again: Callable[[Verified[Any]], None]) -> None:

@@ -36,12 +36,20 @@ class DueRefunds:
     """Refunds contracts as soon as that is possible: a promisee its own, a provider those whose permits it has carried.
 
     Not those that have cost nothing. The original contracts offer no refund; there it does nothing. Blocks are as
-    contracts count them. `earlier` returns the contracts (addresses) of earlier runs.
+    contracts count them. `earlier` returns the contracts (addresses) of earlier runs; with
+    `patience` it lets others go first for so many blocks.
     """
 
     def __init__(
-        self, chain: Chain, head: ChainHead, outages: OutageLog, earlier: Callable[[], Awaitable[Iterable[str]]]
+        self,
+        chain: Chain,
+        head: ChainHead,
+        outages: OutageLog,
+        earlier: Callable[[], Awaitable[Iterable[str]]],
+        *,
+        patience: int = 0,
     ) -> None:
+        self._patience = patience
         self._chain, self._head, self._outages, self._earlier = chain, head, outages, earlier
         self._look_at: dict[str, int] = {}
         """By contract: the first block for whose transactions it is looked at."""
@@ -110,7 +118,7 @@ class DueRefunds:
             if state.is_finalized:
                 return None
             if not state.is_refundable:
-                return state.refundable_from
+                return state.refundable_from + self._patience
             settled = await liabilities.refund(address)
         except (NodeUnreachable, RequestRefused) as error:
             log.debug("looking at the refund again after the next block: %s", error)

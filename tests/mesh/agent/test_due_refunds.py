@@ -96,6 +96,7 @@ async def test_it_also_comes_back_when_the_persons_agent_was_away_at_that_time(p
         await until_found(is_back, what="the cost")
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_a_refund_that_can_not_be_paid_for_is_tried_again(
     place: Place, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -122,6 +123,7 @@ async def test_a_refund_that_can_not_be_paid_for_is_tried_again(
     assert attempts == [contract.address] * 2
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_a_contract_that_cost_nothing_is_left_alone(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     refund, refunded = Liabilities.refund, list[str]()
 
@@ -141,6 +143,7 @@ async def test_a_contract_that_cost_nothing_is_left_alone(place: Place, monkeypa
     assert refunded == [contract.address]
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_a_contract_that_refuses_the_refund_is_asked_again_after_minutes(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,57 @@
+"""A person without ether at a command line: every part is a process, and the chain is anvil."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.mesh.cli.site import MODEL, Site
+from tests.support.commands import Serving, aira
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.support.nodes import Anvil
+    from tests.support.routers import EmbeddedRouter
+
+COST = 500_000
+ROBOT = f"""
+from mesh import Agent
+agent = Agent("{MODEL}")
+@agent.on_demand
+async def offer(demand):
+    await agent.offer(demand)
+@agent.on("/say")
+async def say(job, message):
+    job.publish("/said", message)
+agent.run()
+"""
+
+
+@pytest.mark.parametrize("generation", ["3", "5"])
+async def test_a_person_needs_no_ether(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, generation: str) -> None:
+    site = await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+    (tmp_path / "robot.py").write_text(ROBOT)
+    person = site.address("person")
+    async with site.chain("person") as chain:
+        await chain.tokens.approve(chain.factory, 0)
+        await chain.node.request("anvil_setBalance", person, "0x0")
+        first, had = await chain.block_number(), await chain.tokens.balance()
+        sent = await chain.node.transaction_count(person, block="latest")
+        robot = Serving(sys.executable, tmp_path / "robot.py", says="account 0x", variables=site.variables("robot"))
+        words = ("demand", "--model", MODEL, "--objective", str(site.job("work")), "--cost", f"{COST}wn", "--json")
+        variables = site.variables("person", generation=generation)
+        async with site.provider() as provider, robot:
+            for _ in range(2):
+                ordered = await asyncio.to_thread(aira, *words, **variables)
+                assert ordered.returncode == 0, (ordered.stderr, provider.log(), robot.log())
+                assert json.loads(ordered.stdout.splitlines()[-1])["success"] is True
+        last = await chain.block_number()
+        for block in range(first, last + 1):
+            assert await chain.node.request("eth_getBalance", person, hex(block)) == "0x0"
+        assert await chain.node.transaction_count(person, block="pending") == sent
+        assert await chain.tokens.balance() == had - 2 * COST
