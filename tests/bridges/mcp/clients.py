@@ -14,6 +14,7 @@ from tests.support.commands import AIRA
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+    from pathlib import Path
 
 
 def _mode(version: str) -> str:
@@ -31,9 +32,13 @@ async def http_client(url: str, token: str, version: str, **options: Any) -> Asy
 
 
 @asynccontextmanager
-async def stdio_client(*arguments: str, version: str, **options: Any) -> AsyncIterator[Client]:
-    """A client that starts `aira mcp` as assistants do."""
-    program, *before = AIRA
-    process = StdioServerParameters(command=str(program), args=[*map(str, before), "mcp", *arguments])
+async def stdio_client(
+    *arguments: str, version: str, pid_file: Path | None = None, **options: Any
+) -> AsyncIterator[Client]:
+    """A client that starts `aira mcp` as assistants do; the process id is written to `pid_file`."""
+    command = [*map(str, AIRA), "mcp", *arguments]
+    if pid_file is not None:
+        command = ["sh", "-c", 'echo $$ > "$0" && exec "$@"', str(pid_file), *command]
+    process = StdioServerParameters(command=command[0], args=command[1:])
     async with Client(process, mode=_mode(version), **options) as client:
         yield client

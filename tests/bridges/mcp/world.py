@@ -107,6 +107,8 @@ class World:
         self.cid = cid_of_file(self.model)
         self.robot = place.address("robot")
         self.policy = folder / "policy.toml"
+        self.pid_file = folder / "door.pid"
+        """With the process id of the door that was started last."""
         self.write_policy()
 
     def write_policy(
@@ -177,7 +179,7 @@ class World:
     async def door(self, version: str, **options: Any) -> AsyncIterator[Client]:
         """The client of a door of its own, `aira mcp` over stdio, as hosts of models start it."""
         arguments = ("--socket", str(self.signer.door), "--data-dir", str(self.folder / "door"))
-        async with stdio_client(*arguments, version=version, **options) as client:
+        async with stdio_client(*arguments, version=version, pid_file=self.pid_file, **options) as client:
             yield client
 
     async def money(self) -> int:
