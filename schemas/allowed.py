@@ -37,6 +37,8 @@ Path: TypeAlias = tuple[str | int, ...]
 """Where something stands in a TOML file: keys, and numbers in lists."""
 
 ANY_TOPIC: Final = "*"
+MOST_VALUES: Final = 1_000_000
+"""Values of an order's messages that are checked."""
 _RULE_KEYS: Final = frozenset({"min", "max", "one_of", "any", "optional"})
 _DEEPEST: Final = 16
 """Fields in fields."""
@@ -215,12 +217,12 @@ class AllowedTopics(msgspec.Struct, frozen=True):
 def read_topics(table: Mapping[str, Any], *, line: Callable[[Path], str] = lambda path: "") -> AllowedTopics:
     """What a file with `[topics."/…"]` allows, and nothing else. Raises `InputError` with its mistakes."""
     faults = [TomlFault((key,), f"unknown: {_shown(key)}") for key in table if key != "topics"]
-    allowed = AllowedTopics.read(table.get("topics"), ("topics",), faults)
+    allowed = AllowedTopics.read(table.get("topics", {}), ("topics",), faults)
     if not faults and not allowed.topics:
         faults.append(TomlFault(("topics",), "no topic is allowed"))
     if faults:
         said = "; ".join(f"{line(fault.path)}{fault.why}" for fault in faults[:5])
-        raise InputError(said, hint='write [topics."/drive"] and what its fields may be', code="invalid-policy")
+        raise InputError(said, hint='write [topics."/drive"] and what its fields may be', code="invalid-option")
     return allowed
 
 

@@ -1,4 +1,4 @@
-"""What a robot works for, by the settings of its owner: `queue_limit`, `least_price`, `accept`, `refuse`, `hours`.
+"""What a robot works for, by its owner's settings: `queue_limit`, `least_price`, `accept…`, `refuse`, `hours`.
 
 Some of them, its price, and whether it is paused, the owner may change while it runs; that is kept in the ledger.
 Demands are checked before the handlers see them, and a demand that is refused is declined, like one that a handler
@@ -11,6 +11,7 @@ import asyncio
 import re
 import time
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
@@ -22,6 +23,8 @@ from mesh.base.hours import Hours
 from mesh.errors import ConfigurationError, InputError
 from mesh.settings import MEANING
 from schemas import parse_address
+from schemas.allowed import read_topics
+from schemas.decoding import decode_toml, text_of
 from schemas.model import PRICE
 from schemas.records import ControlRobot, RobotControl
 
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
 
     from mesh.agent.components import AgentComponents
     from mesh.role.local_stop import Hold
+    from schemas.allowed import AllowedTopics
 
 PAUSED: Final = "paused"
 QUEUE_FULL: Final = "queue-full"
@@ -166,6 +170,19 @@ class OwnerRules:
         if not re.fullmatch(PRICE, price):
             raise InvalidAmount(f"{text[:40]!r} is more than a price can be", hint=unit.hint())
         return price
+
+
+def accepted_values(setting: str) -> AllowedTopics | None:
+    """What the file of the setting `accept_values` allows; None without a file. Raises `ConfigurationError`."""
+    if not setting:
+        return None
+    path = Path(setting).expanduser()
+    try:
+        return read_topics(decode_toml(text_of(path.read_bytes())))
+    except OSError as error:
+        raise _invalid("accept_values", setting, error.strerror or str(error)) from None
+    except InputError as error:
+        raise _invalid("accept_values", setting, str(error)) from None
 
 
 def _hours(text: str) -> Hours:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mesh.agent._profile import OwnProfile
     from mesh.agent.components import AgentComponents
     from mesh.agent.handlers import QuoteHandler
+    from mesh.agent.objectives import Objectives
     from schemas.model import ModelDescription
     from schemas.rpc import QuoteRequest
 
@@ -51,6 +52,7 @@ class Quoting:
         parts: AgentComponents,
         profile: OwnProfile,
         rules: OwnerRules,
+        objectives: Objectives,
         handlers: Sequence[QuoteHandler],
         description: ModelDescription | None,
         *,
@@ -59,6 +61,7 @@ class Quoting:
         self._parts = parts
         self._profile = profile
         self._rules = rules
+        self._objectives = objectives
         self._handlers = handlers
         self._seconds = float((None if description is None else description.seconds) or 0)
         self._model = model
@@ -91,7 +94,9 @@ class Quoting:
         if is_cid(self._model) and request.model != self._model:
             raise Declined("other-model", f"it works for the model {self._model}")
         price: int | str | None = self._rules.price or None
-        HANDLED_FOR.set(Buyer(request.asker, pays=False))
+        HANDLED_FOR.set(buyer := Buyer(request.asker, pays=False))
+        if (excluded := await self._objectives.refusal(request.objective, buyer)) is not None:
+            raise excluded
         for handler in self._handlers:
             price = await call_handler(handler, request)
         if price is None:

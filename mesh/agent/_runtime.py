@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from mesh.agent._notifications import Notifier, OwnerWatch
 from mesh.agent._outbox import result_identity
-from mesh.agent._owner_rules import OwnerRules
+from mesh.agent._owner_rules import OwnerRules, accepted_values
 from mesh.agent._profile import OwnProfile
 from mesh.agent._quotes import Quoting
 from mesh.agent._services import offer_services
@@ -257,7 +257,8 @@ class AgentRuntime(Lifecycle):
         self.validators = ValidatorDirectory(parts.network.session, parts.channel, parts.chain)
         self.reports = ContractReports(parts, self._on_report if handlers.reports else None)
         self.trader = Trader(parts, self.reports)
-        self.objectives = Objectives(parts.store, parts.exchange, parts.settings, topics, description)
+        allowed = accepted_values(parts.settings.accept_values)
+        self.objectives = Objectives(parts.store, parts.exchange, parts.settings, topics, description, allowed)
         self.executor = Executor(
             parts,
             objectives=self.objectives,
@@ -302,10 +303,17 @@ class AgentRuntime(Lifecycle):
         offer_services(self.parts, self.executor, self.stop, self.control, has_handlers=has_handlers)
         if decide := self._handlers.market.get(Demand):
             quoting = Quoting(
-                self.parts, self.profile, self.rules, self._handlers.quotes, self._description, model=self._model
+                self.parts,
+                self.profile,
+                self.rules,
+                self.objectives,
+                self._handlers.quotes,
+                self._description,
+                model=self._model,
             )
             services.offer("quote", quoting.quote)
-            services.offer("accept", Acceptance(self.parts, self.trader, self.rules, decide, model=self._model).accept)
+            acceptance = Acceptance(self.parts, self.trader, self.rules, self.objectives, decide, model=self._model)
+            services.offer("accept", acceptance.accept)
         if self.parts.settings.enable_executor:
             ask = partial(self._ask_from_thread, asyncio.get_running_loop())
             folder = stop_folder(self.parts.settings)
@@ -530,7 +538,9 @@ class AgentRuntime(Lifecycle):
         """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
         parts, tokens = self.parts, self.parts.chain.tokens
         token = await parts.chain.retrying(partial(tokens.address, parts.settings.erc20_token), outages=parts.outages)
-        dispatcher = DemandDispatcher(subscription, handlers, parts, self.trader, self.rules, token=token)
+        dispatcher = DemandDispatcher(
+            subscription, handlers, parts, self.trader, self.rules, self.objectives, token=token
+        )
         async with (
             parts.channel.subscribe(Withdrawal) as withdrawals,
             parts.channel.subscribe(Permit) as permits,

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from mesh.agent._owner_rules import OwnerRules
     from mesh.agent.components import AgentComponents
     from mesh.agent.handlers import Handler
+    from mesh.agent.objectives import Objectives
     from mesh.agent.trade import Trader
     from mesh.base.flood import Drops
     from mesh.network import Channel, Subscription
@@ -140,6 +141,7 @@ class DemandDispatcher:
         parts: AgentComponents,
         trader: Trader,
         rules: OwnerRules,
+        objectives: Objectives,
         *,
         token: str,
     ) -> None:
@@ -149,6 +151,7 @@ class DemandDispatcher:
         self._token = token
         self._trader = trader
         self._rules = rules
+        self._objectives = objectives
         trader.ask_again = self._ask_again
         self._pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
         self._outages = parts.outages
@@ -255,10 +258,14 @@ class DemandDispatcher:
         answered.is_declined = False
         message = demand.message
         refused = await self._rules.refusal(demand.signer, cost=message.cost, token=message.token)
+        errors: list[AiraError | None] = []
         if refused is not None:
             grounds.append(Grounds(refused.reason, refused.detail))
-        for handler in self._handlers if refused is None else ():
-            error = await call(handler, demand, logged=self._is_logged)
+        elif (excluded := await self._objectives.refusal(message.objective, Buyer(demand.signer, pays))) is not None:
+            errors.append(excluded)
+        else:
+            errors += [await call(handler, demand, logged=self._is_logged) for handler in self._handlers]
+        for error in errors:
             if isinstance(error, ObjectiveNotFetched):
                 self._drop(demand, f"objective-{error.reason}")
             elif isinstance(error, ContentUnavailable):
@@ -303,11 +310,19 @@ class Acceptance:
     """
 
     def __init__(
-        self, parts: AgentComponents, trader: Trader, rules: OwnerRules, handlers: Sequence[Handler], *, model: str
+        self,
+        parts: AgentComponents,
+        trader: Trader,
+        rules: OwnerRules,
+        objectives: Objectives,
+        handlers: Sequence[Handler],
+        *,
+        model: str,
     ) -> None:
         self._parts = parts
         self._trader = trader
         self._rules = rules
+        self._objectives = objectives
         self._handlers = handlers
         self._model = model
         self._limiter = RateLimiter(per_sender=PER_MAKER, total=TOTAL)
@@ -362,8 +377,11 @@ class Acceptance:
                 return Grounds("unfunded", "its maker lacks the money")
             async with self._places:
                 ALONE.set(answered)
-                HANDLED_FOR.set(Buyer(demand.signer, pays=demand.message.cost > 0))
-                errors = [await call(handler, demand, logged=self._is_logged) for handler in self._handlers]
+                HANDLED_FOR.set(buyer := Buyer(demand.signer, pays=demand.message.cost > 0))
+                if (excluded := await self._objectives.refusal(terms.objective, buyer)) is not None:
+                    errors: list[AiraError | None] = [excluded]
+                else:
+                    errors = [await call(handler, demand, logged=self._is_logged) for handler in self._handlers]
             if answered.offer is None or not answered.offer.is_open:
                 self._trader.answered.forget(answered)
                 found = [grounds for error in errors if error is not None and (grounds := grounds_of(error))]

@@ -15,10 +15,13 @@ from weakref import WeakValueDictionary
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import Rate, RateLimiter
 from mesh.content import ContentUnavailable
-from mesh.errors import ContentError, InputError
-from mesh.recording import Limits, preflight
+from mesh.errors import AiraError, ContentError, InputError
+from mesh.recording import Limits, json_messages, preflight
 from mesh.role.models import PATIENCE, Absences
 from mesh.settings import LONGEST
+from schemas.allowed import MOST_VALUES
+from schemas.decoding import InvalidData
+from schemas.model import Effort
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
     from mesh.content import Exchange, Store
     from mesh.recording import Objective
     from mesh.settings import ContentSettings
+    from schemas.allowed import AllowedTopics
     from schemas.model import ModelDescription
 
 
@@ -70,7 +74,9 @@ class Buyer(NamedTuple):
 
 
 class Objectives:
-    """The objectives of jobs and of demands. They must fit the `handlers`, and the description of the `model`."""
+    """The objectives of jobs and of demands. They must fit the `handlers`, and the description of the `model`; and what
+    the owner of a robot has `allowed`.
+    """
 
     def __init__(
         self,
@@ -79,12 +85,14 @@ class Objectives:
         settings: ContentSettings,
         handlers: TopicHandlers | None = None,
         model: ModelDescription | None = None,
+        allowed: AllowedTopics | None = None,
     ) -> None:
         self._store = store
         self._exchange = exchange
         self._settings = settings
         self._handlers = handlers
         self._model = model
+        self._allowed = allowed
         self._budget = FetchBudget()
         self._fetching = asyncio.Semaphore(32)  # one that nobody has must not delay the others
         self._checking = asyncio.Semaphore(1)  # a check uses one core, and up to 256 MiB of memory for a malicious file
@@ -99,7 +107,23 @@ class Objectives:
         if path is None:
             async with self._fetching if buyer is None else self._budget.spend(cid, buyer):
                 path = await self._fetch(cid, patience)
-        return await self._check(cid, path, self._handlers, self._model)
+        objective = await self._check(cid, path, self._handlers, self._model)
+        if self._allowed is not None:
+            await asyncio.to_thread(_require_allowed, cid, objective, self._allowed)
+        return objective
+
+    async def refusal(self, cid: str, buyer: Buyer) -> AiraError | None:
+        """Why the owner of this robot does not let a buyer order an objective; None if it may, or if no rules say so.
+
+        It is the error of `examine`, which may also say that the objective is not available.
+        """
+        if self._allowed is None:
+            return None
+        try:
+            await self.examine(cid, patience=10.0, buyer=buyer)
+        except AiraError as error:
+            return error
+        return None
 
     async def require_playable(self, path: Path) -> None:
         """Raise `ObjectiveUnfit` for a file that no robot can play."""
@@ -133,6 +157,21 @@ class Objectives:
         if outcome.objective is None or not outcome.ok:
             raise ObjectiveUnfit(cid, outcome.reason, outcome.detail)
         return outcome.objective
+
+
+def _require_allowed(cid: str, objective: Objective, allowed: AllowedTopics) -> None:
+    """Raise `ObjectiveUnfit` unless all messages of an objective are allowed. Blocks on the disk."""
+    effort = Effort(MOST_VALUES)
+    try:
+        for topic, value in json_messages(objective):
+            if (fault := allowed.fault(topic, value, effort)) is not None:
+                raise ObjectiveUnfit(cid, fault.code, fault.why)
+    except InvalidData as error:
+        raise ObjectiveUnfit(cid, "field-not-allowed", str(error)) from None
+    except InputError as error:
+        if isinstance(error, ObjectiveUnfit):
+            raise
+        raise ObjectiveUnfit(cid, "value-not-allowed", str(error)) from None
 
 
 class FetchBudget:

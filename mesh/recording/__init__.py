@@ -42,6 +42,7 @@ from mesh.recording.objective import (
     Objective,
     Played,
     TopicRates,
+    json_messages,
     numbers_of,
     open_objective,
     preflight,

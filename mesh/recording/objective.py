@@ -20,9 +20,10 @@ from mesh.recording._mcap_reader import open_mcap
 from mesh.recording._source import Limits, NotARecording, RecordingError, about
 from mesh.recording._sqlite_reader import SQLITE_MAGIC, ZSTD_MAGIC, open_sqlite
 from mesh.recording.ros import ros_value
+from schemas.decoding import decode_json_once
 from schemas.errors import InvalidPayload
 from schemas.keys import topic_chunks
-from schemas.model import Effort
+from schemas.model import Effort, json_value
 from schemas.payloads import PayloadType, String, decode_value, plain_value
 
 if TYPE_CHECKING:
@@ -196,6 +197,16 @@ def _played(channel: RecordingChannel, payload: bytes, log_time: int, publish_ti
 
 LONGEST_LIST: Final = 12
 """Members of a list whose numbers are read."""
+
+
+def json_messages(objective: Objective) -> Iterator[tuple[str, Any]]:
+    """The topics and values of an objective, as rules of values judge them. Blocks on the disk.
+
+    Raises `InvalidData` for JSON that names a field twice, which robots may read in another way.
+    """
+    for message in objective.messages():
+        is_json = message.type.encoding == "json"
+        yield message.topic, decode_json_once(message.payload) if is_json else json_value(message.value)
 
 
 LONGEST_SHOWN: Final = 4096

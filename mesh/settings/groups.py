@@ -291,6 +291,11 @@ class AcceptanceSettings:
     )
     accept: tuple[str, ...] = option((), "addresses of the only customers that an agent works for (empty: all)")
     refuse: tuple[str, ...] = option((), "addresses of customers that an agent never works for (banned)")
+    accept_values: str = option(
+        "",
+        "file (TOML) with the topics, and the values of their fields, that an agent takes in orders of anybody, as"
+        " [topics] in a signer's policy (empty: all that its model has)",
+    )
     hours: tuple[str, ...] = option(
         (), "when an agent takes jobs, as in 'Mon-Fri 08:00-18:00 Europe/Berlin' (empty: always)"
     )

@@ -11,8 +11,6 @@ from mesh.recording import shown_value
 from mesh.signer import protocol
 from mesh.signer._log import time_text
 from mesh.signer.protocol import StrangersText
-from schemas.decoding import decode_json_once
-from schemas.model import json_value
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -47,16 +45,6 @@ def strangers(text: str, author: str, longest: int = LONGEST_TEXT) -> StrangersT
 def amount(unit: Unit, units: int) -> protocol.Amount:
     """An amount of the smallest unit."""
     return protocol.Amount(text=unit.show(units), units=int(units))
-
-
-def checked_messages(objective: Objective) -> Iterator[tuple[str, Any]]:
-    """The topics and values of an objective, as a policy judges them. Blocks on the disk.
-
-    Raises `InvalidData` for JSON that names a field twice, which robots may read in another way.
-    """
-    for message in objective.messages():
-        is_json = message.type.encoding == "json"
-        yield message.topic, decode_json_once(message.payload) if is_json else json_value(message.value)
 
 
 def found_robot(robot: Robot, model: ModelDescription | None, *, is_allowed: bool) -> protocol.FoundRobot:

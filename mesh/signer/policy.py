@@ -19,7 +19,7 @@ from mesh.base.hours import Hours
 from mesh.base.suggestions import nearest
 from mesh.errors import ConfigurationError, InputError
 from schemas import parse_address
-from schemas.allowed import AllowedTopics, TomlFault, ValueFault
+from schemas.allowed import MOST_VALUES, AllowedTopics, TomlFault, ValueFault
 from schemas.cid import is_cid
 from schemas.decoding import InvalidData, decode_toml, text_of
 from schemas.model import Effort
@@ -33,8 +33,6 @@ LARGEST_POLICY: Final = 1 << 18
 ANY: Final = "*"
 HOUR, DAY = 3600.0, 86_400.0
 """Seconds of the periods that have a budget. They are the last ones, not those of the calendar."""
-MOST_VALUES: Final = 1_000_000
-"""Values of an order's messages that are checked."""
 _SECTIONS: Final = ("budget", "consent", "allow")
 _BUDGET: Final = ("per_job", "per_hour", "per_day", "jobs_at_a_time", "hours")
 _CONSENT: Final = ("above", "always", "valid", "by_client")

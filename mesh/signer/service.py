@@ -52,13 +52,12 @@ from mesh.errors import (
     public_text,
 )
 from mesh.network import Pump, ServiceFailed
-from mesh.recording import GENEROUS, Played, described_line, messages_in, open_objective, pack
+from mesh.recording import GENEROUS, Played, described_line, json_messages, messages_in, open_objective, pack
 from mesh.role.database import LedgerUnusable
 from mesh.role.program import RESEND
 from mesh.signer import protocol
 from mesh.signer._answers import (
     amount,
-    checked_messages,
     described_model,
     found_robot,
     message_lines,
@@ -452,7 +451,7 @@ class Signer(Lifecycle):
             why = f"an order has at most {MOST_MESSAGES:,} messages, not {objective.count:,}"
             raise SignerError(why, hint="order less at a time", code="value-not-allowed")
         try:
-            found = self.policy.rules_allowing(model, checked_messages(objective), robot)
+            found = self.policy.rules_allowing(model, json_messages(objective), robot)
         except InvalidData as error:
             raise SignerError(f"a message can't be judged: {plain(str(error))}", code="field-not-allowed") from None
         if isinstance(found, Decision):
@@ -825,7 +824,7 @@ class Signer(Lifecycle):
         lines, more = [(one.topic, one.value) for one in asked.messages], 0
         if not lines:
             path = await self.agent.fetch(job.objective)
-            shown, more = await asyncio.to_thread(lambda: message_lines(checked_messages(open_objective(path)), author))
+            shown, more = await asyncio.to_thread(lambda: message_lines(json_messages(open_objective(path)), author))
         else:
             shown, more = message_lines(lines, author)
         description = await self._description(job.model)
