@@ -19,7 +19,7 @@ import msgspec
 from mesh.base.private_files import make_private_folder, open_private, sync_directory, sync_file
 from schemas.address import keccak256
 from schemas.decoding import InvalidData, decode_json
-from schemas.errors import AiraError, InputError
+from schemas.errors import AiraError
 from schemas.signing import recover
 
 if TYPE_CHECKING:
@@ -128,8 +128,6 @@ class SignerLog:
         entry = SignedEntry(number=head.last + 1, time=self._budget.now(), event=event, facts=facts, previous=head.hash)
         entry = msgspec.structs.replace(entry, signature=self._signer.sign_hash(entry.digest).hex())
         line = msgspec.json.encode(entry)
-        if len(line) > _LONGEST_LINE:
-            raise InputError(f"an entry of the log has {len(line)} bytes", code="too-large")
         path, first, before = self._place(head)
         self._budget.keep_log_head(Head(first, before, entry.number, entry.hash, line.decode()))
         with open(path, "ab", opener=open_private) as file:
