@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from eth_account import Account
@@ -46,11 +46,17 @@ def holdings(market: Market, token: Contract | None = None) -> tuple[int, int, i
     """What promisee, factory and provider hold."""
     held = (token or market.suite.xrt).functions.balanceOf
     accounts = (market.promisee, market.suite.factory, market.provider)
-    return tuple(held(account.address).call() for account in accounts)  # type: ignore[return-value]
+    promisee, factory, provider = (int(held(account.address).call()) for account in accounts)
+    return promisee, factory, provider
 
 
 def moved(before: tuple[int, ...], after: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(then - now for now, then in zip(before, after, strict=True))
+
+
+def transactions(market: Market) -> int:
+    """How many the promisee has sent."""
+    return int(market.suite.web3.eth.get_transaction_count(market.promisee.address))  # type: ignore[arg-type]
 
 
 def allowance(market: Market, token: Contract | None = None) -> int:
@@ -77,13 +83,13 @@ def foreign(market: Market) -> Contract:
 @pytest.mark.parametrize("is_foreign", [False, True])
 def test_a_signature_pays_for_a_job(market: Market, is_foreign: bool, fee: int) -> None:
     token = foreign(market) if is_foreign else market.suite.xrt
-    before, sent = holdings(market, token), market.suite.web3.eth.get_transaction_count(market.promisee.address)
+    before, sent = holdings(market, token), transactions(market)
 
     liability = create(market, orders(market, fee, token=token.address), market.permit(COST + fee, token=token))
 
     assert moved(before, holdings(market, token)) == (-COST - fee, COST, fee)
     assert allowance(market, token) == 0
-    assert market.suite.web3.eth.get_transaction_count(market.promisee.address) == sent
+    assert transactions(market) == sent
     market.finalize(liability)
     assert token.functions.balanceOf(market.suite.factory.address).call() == before[1]
     assert liability.functions.isSuccess().call()
@@ -270,7 +276,9 @@ def test_a_token_that_calls_back_from_its_permit_pays_for_each_order_once(market
         suite.send(token.functions.act(target.address, data))
     suite.chain.mine(30)  # so that the token may take the turn
     pair, permit = orders(market, FEE, token=token.address), market.permit(COST + FEE, token=token)
-    creation = lighthouse.encode_abi("createLiabilityWithPermit", [*map(order_abi, pair), *permit_arguments(permit)])
+    creation = lighthouse.encode_abi(
+        "createLiabilityWithPermit", [*(order_abi(order) for order in pair), *permit_arguments(permit)]
+    )
     suite.send(token.functions.setHook(lighthouse.address, creation))
     before, provided = holdings(market, token), token.functions.balanceOf(token.address).call()
 
@@ -288,8 +296,8 @@ def test_permits_are_for_one_side_of_a_chain_that_splits() -> None:
     owner, spender = suite.people[1:3]
 
     def bring(domain: bytes) -> str | None:
-        fields = {"owner": owner.address, "spender": spender.address, "token": suite.xrt.address, "value": 1}
-        permit = owner.signer.sign(Permit(**fields, nonce=0, deadline=2**64, domain=domain.hex()))
+        fields: dict[str, Any] = {"owner": owner.address, "spender": spender.address, "token": suite.xrt.address}
+        permit = owner.signer.sign(Permit(**fields, value=1, nonce=0, deadline=2**64, domain=domain.hex()))
         function = "permit(address,address,uint256,uint256,uint8,bytes32,bytes32)"
         arguments = (owner.address, spender.address, *permit_arguments(permit))
         return evm.call(suite.xrt.address, function, *arguments, sender=spender.address).refusal

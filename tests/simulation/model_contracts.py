@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from schemas import keccak256
+from schemas import InvalidMessage, address_bytes, keccak256
+from schemas.signing import ORDER, recover_keys, signer_of
 from tests.simulation.model_abi import ModelRevert, artifact, checked, decode, encode, functions, refused, word
 
 if TYPE_CHECKING:
@@ -18,6 +20,9 @@ NOBODY = bytes(20)
 UNLIMITED = 2**256 - 1
 MOST_XRT = 2**96 - 1
 MOST_JURORS = 7
+HALF_ORDER = ORDER // 2
+PERMIT = keccak256(b"Permit(address owner,address spender,uint256 value,uint256 nonce,uint256 deadline)")
+DOMAIN = keccak256(b"EIP712Domain(string name,string version,uint256 chainId,address verifyingContract)")
 
 
 class ModelContract:
@@ -63,8 +68,22 @@ class ModelContract:
         """The constructor."""
 
 
+def recover_typed(digest: bytes, v: int, r: bytes, s: bytes) -> bytes:
+    """Who signed a hash as EIP-712 has it."""
+    if int.from_bytes(s, "big") <= HALF_ORDER and v in (27, 28):
+        with suppress(InvalidMessage):
+            return address_bytes(signer_of(recover_keys([(digest, r + s + bytes([v]), v - 27)])[0]))
+    raise refused("InvalidSignature")
+
+
+def permit_digest(domain: bytes, owner: bytes, spender: bytes, value: int, nonce: int, deadline: int) -> bytes:
+    """What the owner of tokens signs (EIP-2612)."""
+    fields = keccak256(PERMIT + b"".join(map(word, (owner, spender, value, nonce, deadline))))
+    return keccak256(b"\x19\x01" + domain + fields)
+
+
 class ModelToken(ModelContract):
-    """XRT."""
+    """XRT. Its permits never expire: histories are shorter."""
 
     NAME = "XRT"
 
@@ -92,6 +111,22 @@ class ModelToken(ModelContract):
 
     def allowance(self, owner: bytes, spender: bytes) -> int:
         return int(self.get("allowance", owner, spender))
+
+    def nonces(self, owner: bytes) -> int:
+        return int(self.get("permits", owner))
+
+    def DOMAIN_SEPARATOR(self) -> bytes:
+        names = keccak256(self.name()) + keccak256(b"1")
+        return keccak256(DOMAIN + names + word(self.run.chain_id) + word(self.address))
+
+    def permit(self, owner: bytes, spender: bytes, value: int, deadline: int, v: int, r: bytes, s: bytes) -> None:
+        nonce = self.nonces(owner)
+        signer = recover_typed(permit_digest(self.DOMAIN_SEPARATOR(), owner, spender, value, nonce, deadline), v, r, s)
+        if signer != owner:
+            raise refused("ERC2612InvalidSigner", signer, owner)
+        self.set("permits", owner, nonce + 1)
+        self.set("allowance", owner, spender, value)
+        self.log("Approval", owner, spender, value)
 
     def setMinter(self, account: bytes) -> None:
         if self.sender != self.get("deployer"):

@@ -71,13 +71,15 @@ class ModelEscrow(ModelContract):
         if terms.validator != NOBODY and terms.validator_fee:
             xrt.transfer(fee_to, terms.validator_fee)
 
+    def _take(self, token: bytes, owner: bytes, to: bytes, value: int) -> None:
+        call = encode(("address", "address", "uint256"), (owner, to, value))
+        self._call_token(token, ERC20["transferFrom"] + call)
+
     def _take_exactly(self, token: bytes, owner: bytes, value: int) -> None:
         if not self.run.code(token):
             raise refused("TokenTransferFailed", token)
         before = self._balance(token)
-        self._call_token(
-            token, ERC20["transferFrom"] + encode(("address", "address", "uint256"), (owner, self.address, value))
-        )
+        self._take(token, owner, self.address, value)
         received = max(0, self._balance(token) - before)
         if received != value:
             raise refused("TokenAmountMismatch", token, value, received)

@@ -6,9 +6,16 @@ from __future__ import annotations
 from typing import Final
 
 from schemas import keccak256
-from tests.simulation.model_abi import ModelRevert, artifact, checked, refused, word
-from tests.simulation.model_contracts import NOBODY, ModelContract, ModelNames, ModelToken
-from tests.simulation.model_escrow import ModelEscrow
+from tests.simulation.model_abi import ModelRevert, artifact, checked, decode, refused, word
+from tests.simulation.model_contracts import (
+    NOBODY,
+    ModelContract,
+    ModelNames,
+    ModelToken,
+    permit_digest,
+    recover_typed,
+)
+from tests.simulation.model_escrow import ERC20, ModelEscrow
 from tests.simulation.model_liability import ModelLiability
 from tests.simulation.model_lighthouse import ModelLighthouse
 from tests.simulation.model_orders import (
@@ -113,9 +120,25 @@ class ModelFactory(ModelEscrow):
         return lighthouse
 
     def createLiability(self, demand: bytes, offer: bytes) -> None:
-        if not self.isLighthouse(self.sender):
-            raise refused("NotALighthouse", self.sender)
+        self._make(self._agree(read_order(demand), read_order(offer)))
+
+    def createLiabilityWithPermit(
+        self, demand: bytes, offer: bytes, value: int, deadline: int, v: int, r: bytes, s: bytes
+    ) -> None:
         terms = self._agree(read_order(demand), read_order(offer))
+        owner, spender, signature = word(terms.promisee), word(self.address), word(v) + r + s
+        permit = ERC20["permit"] + owner + spender + word(value) + word(deadline) + signature
+        self.run.attempt(self.address, terms.token, permit)
+        if terms.validator == NOBODY and terms.validator_fee:
+            nonce = decode(["uint256"], self.run.call(self.address, terms.token, ERC20["nonces"] + owner))[0] - 1
+            (domain,) = decode(["bytes32"], self.run.call(self.address, terms.token, ERC20["DOMAIN_SEPARATOR"]))
+            digest = permit_digest(domain, terms.promisee, self.address, value, nonce % 2**256, deadline)
+            if recover_typed(digest, v, r, s) != terms.promisee:
+                raise refused("FeeNotPermitted", terms.promisee)
+            self._take(terms.token, terms.promisee, self.data[-20:], terms.validator_fee)
+        self._make(terms)
+
+    def _make(self, terms: ModelTerms) -> None:
         self._collect(terms, self.data[-20:])
         liability = self._clone(ModelLiability, self.liabilityCode(), word(1), terms.pack(self.xrt()))
         self.set("liability", liability, True)
@@ -184,6 +207,8 @@ class ModelFactory(ModelEscrow):
         return made
 
     def _agree(self, demand: ModelOrder, offer: ModelOrder) -> ModelTerms:
+        if not self.isLighthouse(self.sender):
+            raise refused("NotALighthouse", self.sender)
         require_match(demand, offer)
         lighthouse, validator, generation = demand.address(4), demand.address(5), 5 if demand.is_fifth else 3
         if lighthouse != self.sender:

@@ -217,6 +217,11 @@ class ModelLighthouse(ModelTurns):
         self.run.call(self.address, self.factory(), self.data + self.sender)
         return True
 
+    def createLiabilityWithPermit(
+        self, demand: bytes, offer: bytes, value: int, deadline: int, v: int, r: bytes, s: bytes
+    ) -> bool:
+        return self.createLiability(demand, offer)
+
     def finalizeLiability(self, liability: bytes, result: bytes, success: bool, signature: bytes) -> bool:
         self._use_turn()
         self.run.call(self.address, self.factory(), self.data + self.sender)

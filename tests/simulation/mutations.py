@@ -204,7 +204,7 @@ MUTATIONS: Final = (
     Mutation(
         "open orders lose their allowance in a reorganisation",
         "mesh.agent.trade:Trader._cover_and_send",
-        "await chain.retrying(ensure, outages=self._parts.outages)",
+        "await chain.retrying(partial(self._ensure, order), outages=self._parts.outages)",
         "pass",
         "reorganise_after,forget",
         seeds=60,
