@@ -59,7 +59,7 @@ simulate: $(INSTALLED) ## whole markets in simulated time, with faults; ARGS="--
 simulate-mutants: $(INSTALLED) ## whether the simulator finds the bugs planted by tests/simulation/mutations.py
 	@$(BIN)/python -m tests.simulation --mutants --seed 1 $(ARGS)
 
-compose-test: $(INSTALLED) ## the compose files in real containers (`make peers` installs podman)
+compose-test: $(INSTALLED) ## the compose files in real containers (`make peers` installs Docker)
 	@$(BIN)/pytest -m compose tests/deploy tests/support $(ARGS)
 
 crash-test: $(INSTALLED) ## the crash matrix: each role fails at each point of a job, by each fault (a quarter of an hour)

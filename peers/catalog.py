@@ -40,7 +40,6 @@ GETH = GoRecipe(
     name="geth 1.17.10", program="geth", package="github.com/ethereum/go-ethereum/cmd/geth", version="v1.17.10"
 )
 SLITHER = PipRecipe(name="slither 0.11.6", manifest="slither")
-COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
 ROS2_SDK = PipRecipe(name="zenoh-ros2-sdk 0.1.8", manifest="zenoh-ros2-sdk")
 PAMOJA = PipRecipe(name="pamoja-ros2 0.2.0", manifest="pamoja-ros2")
 ROUTER = CargoRecipe(crate="zenohd", version="1.10.2")
@@ -69,9 +68,7 @@ ROS1 = AptRecipe(
     ),
 )
 UNITS = AptRecipe(name="systemd", packages=("systemd",))
-CONTAINERS = AptRecipe(
-    name="podman", packages=("podman", "runc", "netavark", "aardvark-dns", "iptables", "debootstrap")
-)
+CONTAINERS = AptRecipe(name="Docker", packages=("docker.io", "docker-compose", "iptables", "debootstrap"))
 BASE = DebianRecipe(name="base image", release="bookworm", packages=("python3", "python3-venv", "ca-certificates"))
 
 # In this order they are installed.
@@ -82,7 +79,6 @@ DOWNLOADED: tuple[Recipe, ...] = (
     CLIENT_5,
     IPFS_API,
     KUBO,
-    COMPOSE,
     SLITHER,
     ROS2_SDK,
     PAMOJA,
@@ -253,8 +249,15 @@ _ALL = (
         recipe=AXE,
         search=_within(AXE, "node_modules/axe-core/axe.min.js"),
     ),
-    Peer(name="podman", purpose="real containers", recipe=CONTAINERS, search=_command("podman")),
-    Peer(name="runc", purpose="what podman runs containers with", recipe=CONTAINERS, search=_command("runc")),
+    # Those of Debian, which fit together: another one may be on the path.
+    Peer(name="dockerd", purpose="real containers", recipe=CONTAINERS, search=_file("/usr/sbin/dockerd")),
+    Peer(name="docker", purpose="the command of Docker", recipe=CONTAINERS, search=_file("/usr/bin/docker")),
+    Peer(
+        name="docker-compose",
+        purpose="the compose file with real containers",
+        recipe=CONTAINERS,
+        search=_file("/usr/bin/docker-compose"),
+    ),
     Peer(
         name="debootstrap",
         purpose="makes the base image, since none can be pulled",
@@ -266,12 +269,6 @@ _ALL = (
         purpose="Debian with Python as a tar file: what images are built on",
         recipe=BASE,
         search=_within(BASE, "root.tar"),
-    ),
-    Peer(
-        name="podman-compose",
-        purpose="the compose file with real containers",
-        recipe=COMPOSE,
-        search=_within(COMPOSE, "bin/podman-compose"),
     ),
     Peer(name="rosbag", purpose="reads and plays ROS 1 bags", recipe=ROS1, search=_file("/usr/bin/rosbag")),
     Peer(name="rosmaster", purpose="the master of ROS 1", recipe=ROS1, search=_file("/usr/bin/rosmaster")),

@@ -25,9 +25,11 @@ FOREIGN = {"ipfs"}
 @cache
 def compose(file: Path) -> dict[str, Any]:
     """The contents of a compose file, with its aliases and merges resolved."""
-    python = require("podman-compose").with_name("python")
+    require("docker-compose")  # which is in Python, and so brings a reader of YAML for that of Debian
     read = "import json, sys, yaml; print(json.dumps(yaml.safe_load(open(sys.argv[1]))))"
-    done = subprocess.run([python, "-c", read, file], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        ["/usr/bin/python3", "-c", read, str(file)], capture_output=True, text=True, timeout=60, check=True
+    )
     found: dict[str, Any] = json.loads(done.stdout)
     return found
 

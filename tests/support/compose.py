@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from tests.support.bridges import steady_bridges
 from tests.support.containers import SECONDS
 from tests.support.peers import require
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from tests.support.containers import Engine
 
-BUILD_SECONDS = 600.0
 UP_SECONDS = 300.0
 """For ten containers on a machine that has other things to do."""
 STOP_SECONDS = 5
@@ -42,7 +41,7 @@ class Project:
         environment.write_text("".join(f"{name}={value}\n" for name, value in (variables or {}).items()))
         options = [f"--file={file}" for file in files] + [f"--profile={profile}" for profile in profiles]
         self._compose: list[str | Path] = [
-            require("podman-compose"),
+            require("docker-compose"),
             f"--project-name={self.name}",
             f"--env-file={environment}",
             *options,
@@ -56,27 +55,19 @@ class Project:
         self._sweep()
 
     def compose(self, *words: str, seconds: float = SECONDS) -> str:
-        """Run a command of podman-compose; returns its output."""
+        """Run a command of docker-compose; returns its output."""
         return self.engine.run([*self._compose, *words], seconds=seconds, cwd=self._place)
-
-    def build(self, *services: str) -> None:
-        """Build the images of these services, or all.
-
-        On the host's network: the default one may be another engine's at the same time.
-        """
-        self.compose("--podman-build-args=--network=host", "build", *services, seconds=BUILD_SECONDS)
 
     def up(self, *services: str) -> None:
         """Bring up these services, or all; none is built."""
-        with steady_bridges():
-            self.compose("up", "--detach", "--no-build", *services, seconds=UP_SECONDS)
+        self.compose("up", "--detach", "--no-build", *services, seconds=UP_SECONDS)
 
     def down(self) -> None:
         """Remove all services with their volumes, as a user does. `leftovers` lists what remains."""
         self.compose("down", "--volumes", "--timeout", str(STOP_SECONDS), seconds=UP_SECONDS)
 
     def leftovers(self) -> list[str]:
-        """The resources of this project: containers, pods, volumes, networks."""
+        """The resources of this project: containers, volumes, networks."""
         found = []
         for kind, names in self._mine().items():
             found += [f"{kind} {name}" for name in names]
@@ -97,8 +88,7 @@ class Project:
 
     def start(self, service: str) -> None:
         """Start a service that was killed or stopped, with the state it had."""
-        with steady_bridges():
-            self.engine("start", self.container(service))
+        self.engine("start", self.container(service))
 
     def stop(self, service: str) -> None:
         """Ask the service to end."""
@@ -118,8 +108,7 @@ class Project:
 
     def connect(self, service: str, network: str = "default") -> None:
         """Connect the service again under its name; its address can be another one."""
-        with steady_bridges():
-            self.engine("network", "connect", "--alias", service, f"{self.name}_{network}", self.container(service))
+        self.engine("network", "connect", "--alias", service, f"{self.name}_{network}", self.container(service))
 
     def networks(self, service: str) -> set[str]:
         """The networks that the service is on, by their names in the compose file."""
@@ -137,7 +126,7 @@ class Project:
 
     def facts(self, service: str) -> Any:
         """The engine's description of the service's container."""
-        return self.engine.facts("inspect", "--format", "json", self.container(service))[0]
+        return self.engine.facts("inspect", self.container(service))[0]
 
     def is_running(self, service: str) -> bool:
         """Whether its process runs."""
@@ -150,7 +139,7 @@ class Project:
 
     def log(self, service: str) -> str:
         """The log of the service, stdout and stderr."""
-        return log_text(Path(self.facts(service)["HostConfig"]["LogConfig"]["Path"]))
+        return log_text(Path(self.facts(service)["LogPath"]))
 
     def execute(self, service: str, *words: str, seconds: float = SECONDS) -> str:
         """Run a command inside the service's container; returns its output."""
@@ -161,7 +150,6 @@ class Project:
         named = ["--format", "{{.Name}}", "--filter", f"name={self.name}"]
         return {
             "container": self.containers(),
-            "pod": self.engine("pod", "ls", *named).split(),
             "volume": self.engine("volume", "ls", *named).split(),
             "network": self.engine("network", "ls", *named).split(),
         }
@@ -171,7 +159,7 @@ class Project:
         paused = self.engine(
             "ps",
             "--filter",
-            f"label=io.podman.compose.project={self.name}",
+            f"label=com.docker.compose.project={self.name}",
             "--filter",
             "status=paused",
             "--format",
@@ -183,15 +171,12 @@ class Project:
             if not names:
                 continue
             if kind == "container":
-                self.engine("rm", "--force", "--depend", "--ignore", "--volumes", "--time", "0", *names)
+                self.engine("rm", "--force", "--volumes", *names)
             else:
-                self.engine(kind, "rm", "--force", *names)
+                self.engine(kind, "rm", *names)
 
 
 def log_text(file: Path) -> str:
-    """What a container's log file holds: lines of time, stream, `F` or `P` (a part of a line) and the text."""
-    said = []
-    for line in file.read_text(errors="replace").splitlines() if file.exists() else []:
-        _, _, whole, text = line.split(" ", 3)
-        said.append(text + ("\n" if whole == "F" else ""))
-    return "".join(said)
+    """What a container's log file holds: a line of JSON for each line, or part of one."""
+    lines = file.read_text(errors="replace").splitlines() if file.exists() else []
+    return "".join(json.loads(line)["log"] for line in lines if line.endswith("}"))

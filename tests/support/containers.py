@@ -1,14 +1,14 @@
-"""Real containers for tests: podman with a store and a configuration of its own, kept between runs in the peers' cache.
+"""Real containers for tests: a Docker daemon with a folder of its own, which is started for a run and ended after it.
 
-Nothing of the user's own podman is seen or touched. No image is pulled: what the Dockerfile begins with is made from
-the peers (see `BASE_IMAGE` and `FOUNDRY_IMAGE`), and what is built on them stays as a cache for a day.
+Nothing of the user's own Docker is seen or touched. No image is pulled: what the Dockerfile begins with is made from
+the peers (see `BASE_IMAGE` and `FOUNDRY_IMAGE`).
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import tarfile
@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from peers.recipes import cache_folder
 from tests.support.peers import require
+from tests.support.processes import Server, ServerFailed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -30,32 +30,11 @@ FOUNDRY_IMAGE = "localhost/aira-foundry:latest"
 SECONDS = 60.0
 """Given to one command of the engine on a machine that has other things to do."""
 
-CACHE_AGE = "24h"
 NETWORKS = "10.213.0.0/16"
 SAID_LINES = 30
-
-_CONFIGURATION = """\
-[containers]
-default_ulimits = ["nofile=20000:20000", "nproc=4096:4096"]
-log_driver = "k8s-file"
-
-[engine]
-runtime = "runc"
-cgroup_manager = "cgroupfs"
-events_logger = "file"
-tmp_dir = "{state}/tmp"
-
-[network]
-network_config_dir = "{store}/networks"
-default_subnet_pools = [{{"base" = "{networks}", "size" = 24}}]
-"""
-
-_STORAGE = """\
-[storage]
-driver = "overlay"
-graphroot = "{store}/root"
-runroot = "{state}/run"
-"""
+CHAINS = ("DOCKER", "DOCKER-USER", "DOCKER-ISOLATION-STAGE-1", "DOCKER-ISOLATION-STAGE-2")
+"""What Docker adds to the firewall, and leaves there."""
+FORWARDING = Path("/proc/sys/net/ipv4/ip_forward")
 
 
 class EngineFailed(Exception):
@@ -68,32 +47,57 @@ class EngineFailed(Exception):
         self.said = said
 
 
-class Engine:
-    """Podman. Call it with the words of a command: `engine("ps", "--all")` gives what the command prints.
+class DockerDaemon(Server):
+    """A `dockerd` whose images, containers and networks are in its folder. Needs root."""
 
-    The state of running containers is below /run, which is empty after the machine was switched off; the images are in
-    the peers' cache. Both are this cache folder's own.
-    """
+    name = "docker"
 
     def __init__(self) -> None:
-        self._podman = require("podman")
-        require("runc")
-        if os.geteuid() != 0:
-            _cannot("containers need root here: the base image is made by debootstrap")
-        store = cache_folder() / "containers"
-        state = Path("/run") / f"aira-containers-{hashlib.sha256(str(store).encode()).hexdigest()[:8]}"
-        store.mkdir(parents=True, exist_ok=True)
-        (store / "containers.conf").write_text(_CONFIGURATION.format(store=store, state=state, networks=NETWORKS))
-        (store / "storage.conf").write_text(_STORAGE.format(store=store, state=state))
+        self._program: Path = require("dockerd")
+        super().__init__()
+        self.socket = self.folder / "docker.sock"
+        self._rules, self._forwarding = _rules("filter"), FORWARDING.read_text()
+
+    def command(self) -> Sequence[str | Path]:
+        settings = self.folder / "daemon.json"
+        settings.write_text("{}")
+        options = {
+            "config-file": settings,
+            "data-root": self.folder / "data",
+            "exec-root": self.folder / "exec",
+            "pidfile": self.folder / "pid",
+            "host": f"unix://{self.socket}",
+            "bridge": "none",
+            "default-address-pool": f"base={NETWORKS},size=24",
+        }
+        return [self._program, *(f"--{name}={value}" for name, value in options.items())]
+
+    def is_ready(self) -> bool:
+        return "API listen on" in self.log()
+
+    def close(self) -> None:
+        """End it, and take back what it has changed in the firewall of a machine that has no other Docker."""
+        self.stop()
+        if f":{CHAINS[0]} " not in self._rules:
+            _forget_chains(keeps_policy=":FORWARD DROP" in self._rules)
+            FORWARDING.write_text(self._forwarding)
+        super().close()
+
+
+class Engine:
+    """Docker. Call it with the words of a command: `engine("ps", "--all")` gives what the command prints."""
+
+    def __init__(self, socket: Path) -> None:
+        self._docker = require("docker")
         self.environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith(("AIRA_", "COMPOSE_"))},
-            "CONTAINERS_CONF": str(store / "containers.conf"),
-            "CONTAINERS_STORAGE_CONF": str(store / "storage.conf"),
+            "DOCKER_HOST": f"unix://{socket}",
+            "DOCKER_BUILDKIT": "1",
         }
 
     def __call__(self, *words: str | Path, seconds: float = SECONDS) -> str:
-        """Run a command of podman to its end; give its standard output, or raise `EngineFailed`."""
-        return self.run([self._podman, *words], seconds=seconds)
+        """Run a command of Docker to its end; give its standard output, or raise `EngineFailed`."""
+        return self.run([self._docker, *words], seconds=seconds)
 
     def run(self, command: Sequence[str | Path], *, seconds: float = SECONDS, cwd: Path | None = None) -> str:
         """Run a program that finds this engine; give its standard output, or raise `EngineFailed`.
@@ -134,25 +138,12 @@ class Engine:
         base, anvil = require("base-image"), require("anvil")
         try:
             settings = "ENV PIP_CERT=/etc/ssl/certs/ca-certificates.crt"
-            self._import(BASE_IMAGE, base, "--change", settings)
+            self("import", "--change", settings, base, BASE_IMAGE, seconds=300)
             with _image_of(anvil, "usr/local/bin/anvil") as tar:
-                self._import(FOUNDRY_IMAGE, tar, stands_for=anvil)
+                self("import", tar, FOUNDRY_IMAGE, seconds=300)
             self("run", "--rm", "--network", "none", BASE_IMAGE, "true")
         except EngineFailed as error:
             _cannot(f"no container runs on this machine: {error}")
-
-    def forget_old_images(self) -> None:
-        """Remove the images of runs of earlier days."""
-        self("image", "prune", "--force", "--filter", f"until={CACHE_AGE}")
-
-    def _import(self, image: str, tar: Path, *options: str, stands_for: Path | None = None) -> None:
-        """Import a tar file as an image, unless it has been. The file it stands for is known by its size and time."""
-        source = (stands_for or tar).stat()
-        label = f"{source.st_size}-{source.st_mtime_ns}"
-        if image not in self(
-            "images", "--format", "{{.Repository}}:{{.Tag}}", "--filter", f"label=aira.source={label}"
-        ):
-            self("import", "--change", f"LABEL aira.source={label}", *options, tar, image, seconds=300)
 
 
 def _cannot(reason: str) -> None:
@@ -177,10 +168,34 @@ def _text(file: Any) -> str:
     return str(file.read().decode(errors="replace"))
 
 
+def _rules(table: str) -> str:
+    command = ["iptables-save", "-t", table]
+    return subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=True).stdout
+
+
+def _forget_chains(*, keeps_policy: bool) -> None:
+    """Remove the chains of Docker and the rules that name them, and forward packets as before."""
+    for table in ("filter", "nat"):
+        lines = [line for line in _rules(table).splitlines() if not set(CHAINS) & set(re.split(r"[ :]", line))]
+        text = "\n".join(lines) + "\n"
+        if not keeps_policy:
+            text = text.replace(":FORWARD DROP", ":FORWARD ACCEPT")
+        subprocess.run(["iptables-restore", "-T", table], input=text, text=True, timeout=SECONDS, check=True)
+
+
 @pytest.fixture(scope="session")
 def engine() -> Iterator[Engine]:
     """The engine, with the images that others begin with."""
-    ready = Engine()
-    ready.prepare()
-    yield ready
-    ready.forget_old_images()
+    require("docker")
+    if os.geteuid() != 0:
+        _cannot("containers need root here")
+    try:
+        daemon = DockerDaemon().__enter__()
+    except ServerFailed as error:
+        _cannot(f"Docker does not start on this machine: {error}")
+    try:
+        ready = Engine(daemon.socket)
+        ready.prepare()
+        yield ready
+    finally:
+        daemon.close()

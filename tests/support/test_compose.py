@@ -84,7 +84,7 @@ def test_down_leaves_nothing_and_neither_does_removal_by_force(engine: Engine, t
     with Project(engine, tmp_path, files=[tmp_path / "compose.yml"]) as project:
         project.up()
         kinds = {left.split()[0] for left in project.leftovers()}
-        assert kinds == {"container", "pod", "volume", "network"}
+        assert kinds == {"container", "volume", "network"}
         project.down()
         assert project.leftovers() == []
         project.up()
@@ -97,6 +97,6 @@ def test_a_command_that_takes_too_long_is_killed_with_its_children(engine: Engin
         engine.run(["sh", "-c", "echo first words; sleep 60; true sleep 60"], seconds=0.5)
 
 
-def test_the_error_of_a_failed_command_has_the_output_of_podman(engine: Engine) -> None:
-    with pytest.raises(EngineFailed, match=r"ended with 125\n.*no such container"):
+def test_the_error_of_a_failed_command_has_the_output_of_docker(engine: Engine) -> None:
+    with pytest.raises(EngineFailed, match=r"ended with 1\n.*No such container"):
         engine("logs", "aira-nobody")
