@@ -31,6 +31,7 @@ import zstandard
 from mesh.base.private_files import sync_directory
 from mesh.content.files import raising_store_full
 from mesh.errors import ConfigurationError, InputError
+from mesh.role.handover import HANDOVERS, RETIRED
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ _CID: Final = r"Qm[1-9A-HJ-NP-Za-km-z]{44}"
 _ACCOUNT_FILE: Final = re.compile(
     rf"(?P<part>{_ADDRESS})/(?:{_CHAIN}/(?:(?:ledger|verdicts|{PROVIDER}[^/\0]+)\.sqlite"
     rf"|recordings/{_ADDRESS}\.mcap(?:\.part|\.cut)?)"
-    rf"|content/(?:{_CID}|\.pins/{_CID}/[A-Za-z0-9_-]{{1,64}}))"
+    rf"|content/(?:{_CID}|\.pins/{_CID}/[A-Za-z0-9_-]{{1,64}})|{re.escape(HANDOVERS)}|{re.escape(RETIRED)})"
 )
 _TRANSACTION: Final = re.compile(rf"(?P<part>transactions/{_CHAIN}/{_ADDRESS})/transactions\.sqlite")
 _PART: Final = re.compile(rf"(?:transactions/{_CHAIN}/)?{_ADDRESS}")

@@ -52,6 +52,7 @@ from mesh.ops.state._archive import (
     unusable,
 )
 from mesh.ops.state._inventory import check_ledger, copy_ledger, locked_ledger, read_ledger
+from mesh.role.handover import HANDOVERS, RETIRED
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -129,6 +130,9 @@ class _BackupWriter:
     async def home(self, home: Path) -> None:
         """Add all of an account except its transactions and what its providers keep."""
         wanted: set[str] = set()
+        for path in (home / HANDOVERS, home / RETIRED):
+            with suppress(FileNotFoundError), path.open("rb") as known:
+                self._add(home.parent, path, known)
         for chain in chains_in(home):
             if (chain / VERDICTS).is_file():
                 await asyncio.to_thread(self.add_copy, home.parent, chain / VERDICTS)  # its files are pinned

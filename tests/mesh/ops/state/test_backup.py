@@ -17,7 +17,7 @@ from mesh.agent._outbox import outgoing
 from mesh.agent.ledger import Ledger, Phase
 from mesh.content import Store, StoreFull
 from mesh.errors import ConfigurationError
-from mesh.ops.state import ContentScope, back_up, examine_archive, take_inventory
+from mesh.ops.state import ContentScope, back_up, examine_archive, restore, take_inventory
 from mesh.ops.state import _backup as backup_module
 from mesh.ops.state._archive import ArchiveInfo, new_archive
 from mesh.ops.state._inventory import read_ledger
@@ -56,6 +56,15 @@ async def test_a_backup_has_the_state_and_no_key(folder: Folder, tmp_path: Path)
     assert (done.accounts, done.jobs, done.files) == ((ADDRESS,), 1, 1)
     assert done.size == (tmp_path / "it").stat().st_size
     assert (tmp_path / "it").stat().st_mode & 0o777 == 0o600
+
+
+async def test_it_has_what_is_known_of_replaced_keys(folder: Folder, tmp_path: Path) -> None:
+    for name in ("handovers.json", "retired.json"):
+        (folder.home / name).write_text(name)
+    await back_up(folder.path, tmp_path / "it", content="none")
+    await restore(tmp_path / "it", tmp_path / "new")
+    for name in ("handovers.json", "retired.json"):
+        assert (tmp_path / "new" / ADDRESS / name).read_text() == name
 
 
 @pytest.mark.parametrize(
