@@ -90,7 +90,9 @@ class Driver:
             self.begun.append(job.liability.address)
             self.played.append(message)
             job.publish("/odometry", {"radius": message.radius})
-            await self.released.wait()
+            while not self.released.is_set():  # again: who reads of the contract late has missed the first ones
+                job.publish("/odometry", {"radius": message.radius})
+                await asyncio.sleep(0.05)
             if message.label == "fail":
                 raise JobFailed("the wheel is \u202eloose", code="wheel-loose")
 
