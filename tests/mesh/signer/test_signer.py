@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.agent.hiring import Hiring
 from mesh.errors import ConfigurationError
 from mesh.signer.protocol import SignerError
 from tests.mesh.signer.signers import GOOD, ended, reached
@@ -147,3 +148,41 @@ async def test_a_second_signer_in_one_folder_refuses(person: Person, driver: Dri
         with pytest.raises(ConfigurationError) as caught:
             await person.signer().__aenter__()
         assert caught.value.code == "signer-running"
+
+
+async def test_an_order_that_is_taken_back_binds_its_cost_until_its_deadline(
+    person: Person, driver: Driver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person.allow(driver.model)
+    monkeypatch.setattr(Hiring, "send", lambda *_: None)  # no provider gets it
+    async with person.at_work() as (door, _, signer):
+        job = await door.order(
+            model=driver.model, messages=[GOOD], cost="1 XRT", idempotency_key="k", deadline_seconds=30
+        )
+        job = await reached(door, job, lambda one: one.state == "waiting")
+        with pytest.raises(SignerError) as caught:
+            await door.stop_job(job.job_id)
+        assert caught.value.code == "not-a-contract"
+        assert (await door.withdraw(job.job_id)).state == "withdrawn"
+        balance = await door.balance()
+        assert (balance.hour_left.units, balance.jobs) == (19 * 10**9, 0)
+        record = signer.budget.job(job.job_id)
+        assert record is not None
+        head = await person.chain.node.contract_blocks.last(await person.chain.block_number())
+        await person.market.mine(record.deadline - head + 1)
+        async with asyncio.timeout(30):
+            while (await door.balance()).hour_left.units != 20 * 10**9:
+                await asyncio.sleep(0.1)
+        assert (await door.job(job.job_id)).state == "withdrawn"
+    assert await person.spent() == 0
+
+
+async def test_an_order_that_waits_for_a_yes_can_be_taken_back(person: Person, driver: Driver) -> None:
+    person.allow(driver.model)
+    async with person.at_work() as (door, owner, _):
+        job = await door.order(model=driver.model, messages=[GOOD], cost="4 XRT", idempotency_key="k")
+        assert job.consent is not None
+        assert (await door.withdraw(job.job_id)).state == "withdrawn"
+        with pytest.raises(SignerError) as caught:
+            await owner.approve(job.consent.id)
+        assert caught.value.code == "consent-used"
