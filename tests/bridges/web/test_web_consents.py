@@ -70,7 +70,7 @@ async def test_an_operator_answers_an_order_once(place: Place, serve: Any, tmp_p
         SignerClient(signer.door) as program,
         serve(operator_token=OPERATOR, signer=str(signer.owner)) as browser,
     ):
-        order = {"model": MODEL, "messages": [("/blink", None)], "cost": "1 XRT"}
+        order: dict[str, Any] = {"model": MODEL, "messages": [("/blink", None)], "cost": "1 XRT"}
         jobs = [await program.order(**order, idempotency_key=key) for key in ("one", "two")]
         assert [job.state for job in jobs] == ["needs-consent", "needs-consent"]
         await log_in(browser)
