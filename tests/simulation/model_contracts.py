@@ -78,7 +78,7 @@ def recover_typed(digest: bytes, v: int, r: bytes, s: bytes) -> bytes:
 
 def permit_digest(domain: bytes, owner: bytes, spender: bytes, value: int, nonce: int, deadline: int) -> bytes:
     """What the owner of tokens signs (EIP-2612)."""
-    fields = keccak256(PERMIT + b"".join(map(word, (owner, spender, value, nonce, deadline))))
+    fields = keccak256(PERMIT + b"".join(word(one) for one in (owner, spender, value, nonce, deadline)))
     return keccak256(b"\x19\x01" + domain + fields)
 
 
