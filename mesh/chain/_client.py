@@ -16,7 +16,7 @@ from mesh.chain._permits import Permits
 from mesh.chain._tokens import Funds, Tokens
 from mesh.chain._validators import Validators
 from mesh.chain.errors import NoContracts, UnknownName
-from mesh.chain.following import NODE_ERRORS, EventSources, follow, history_at, read_events, retrying
+from mesh.chain.following import NODE_ERRORS, EventSources, follow, glance, history_at, read_events, retrying
 from mesh.chain.liabilities import Liabilities
 from mesh.chain.metrics import CachedMetrics
 from mesh.chain.transactions import TransactionSender
@@ -234,7 +234,8 @@ class Chain:
             version=contracts.version,
         )
         read = partial(read_events, self.node, sources)
-        return follow(self.node, read, cursor, history=history, outages=outages)
+        look = None if parties is None else partial(glance, self.node, sources)
+        return follow(self.node, read, cursor, look=look, history=history, outages=outages)
 
     async def retrying(
         self,

@@ -645,14 +645,23 @@ class Node:
         return first
 
     async def logs(
-        self, first: int, last: int, *, addresses: Collection[str], topics: Sequence[str], about: str = ""
+        self,
+        first: int,
+        last: int,
+        *,
+        addresses: Collection[str],
+        topics: Sequence[str],
+        about: str = "",
+        place: int = 1,
     ) -> list[Log]:
         """The logs of the blocks from `first` to `last`, both included, whose first topic is one of `topics`.
 
-        Those of all contracts, unless `addresses` are given; with `about`, those whose second topic is this address.
+        Those of all contracts, unless `addresses` are given; with `about`, those whose topic in that `place` is this
+        address.
         """
         query: dict[str, Any] = {"fromBlock": hex(first), "toBlock": hex(last), "topics": [list(topics)]}
         if about:
+            query["topics"] += [None] * (place - 1)
             query["topics"].append("0x" + (bytes(12) + address_bytes(about)).hex())
         if addresses:
             query["address"] = list(addresses)

@@ -38,6 +38,11 @@ for the logs of a hash. This is a proof, at the price of a header for each block
 is none: a range is asked for `ASKED` times at once, and the answer with the most logs is taken. So a log is lost if all
 these answers come from machines that are more than `RECENT` blocks behind: an eighth of the ranges if half of the
 machines are, a thousandth if a tenth are. The node keeps no filters for us: a restart on either side loses nothing.
+
+**Where blocks are quick** (`QUICK`), a header for each would be most of what a node is asked. There a look first
+glances at the logs of the last half minute, in ranges. It reads block by block only if there is a log of a block that
+it has not read that way, or if one that it has yielded is gone. A glance proves nothing, but each block is in many of
+them: a log that shows only later is yielded as after a reorganisation of the blocks from there on.
 """
 
 from __future__ import annotations
@@ -249,6 +254,9 @@ class ReplacedWhileReading(Exception):
 Choose: TypeAlias = "Callable[[Sequence[str], Sequence[str]], Awaitable[Collection[str]]]"
 """Returns, of the liabilities (addresses) that were created and of those that ended, the ones whose events are read."""
 
+Glance: TypeAlias = "Callable[[int, int], Awaitable[Sequence[Log]]]"
+"""The logs of a range that may be events, from one block to another, both included."""
+
 DecodedLog: TypeAlias = "tuple[Log, ChainEvent | None]"
 """A log and its event, if it is one of the contracts'."""
 
@@ -388,6 +396,19 @@ async def read_events(
     return _by_block(await sources.chosen(decoded), last)
 
 
+async def glance(node: Node, sources: EventSources, first: int, last: int) -> list[Log]:
+    """The logs from block `first` to `last` that may be events which are read, with those of their `parties` only.
+
+    Each range is asked for once, so a machine of the node that is behind may leave some out.
+    """
+    asked = [node.logs(first, last, addresses=(), topics=topics_of("Factory", "Liability"))]
+    for party in (sources.parties or ()) if sources.token else ():
+        for place in (1, 2):
+            token = node.logs(first, last, addresses=[sources.token], topics=topics_of("XRT"), about=party, place=place)
+            asked.append(token)
+    return [log for answer in await asyncio.gather(*asked) for log in answer]
+
+
 async def _logs(
     node: Node, first: int, last: int, header: BlockHeader | None, addresses: Collection[str], topics: Sequence[str]
 ) -> list[Log]:
@@ -473,6 +494,12 @@ READ_ERRORS: Final = (*NODE_ERRORS, NoContracts)
 
 TELL_EVERY: Final = 10.0
 """Seconds between two log lines that say how far a long catching up has come."""
+QUICK: Final = 1.0
+"""Seconds between two blocks of a chain, by its profile, below which not each block is read."""
+GLANCE_SECONDS: Final = 30.0
+"""How far each look glances back there."""
+REPLACED_SECONDS: Final = 10.0
+"""How often it looks there for replaced blocks without events; for those with events it does each time."""
 LAGGING: Final = 3
 """Failures one after the other of a node that answers otherwise, before they are an outage: its machines may differ."""
 
@@ -565,13 +592,20 @@ async def history_at(node: Node, block_number: int) -> History:
 
 
 async def follow(
-    node: Node, read: ReadRange, cursor: int, *, history: History | None = None, outages: OutageLog | None = None
+    node: Node,
+    read: ReadRange,
+    cursor: int,
+    *,
+    look: Glance | None = None,
+    history: History | None = None,
+    outages: OutageLog | None = None,
 ) -> AsyncGenerator[BlockEvents, None]:
     """The events from the block `cursor` on, as `read` finds them, without end; see the module.
 
-    Raises `ChainWentBack`. Other failures of the node are retried and logged to `outages`.
+    `look` glances at a range where blocks are quick; without it each block is read there, too. Raises `ChainWentBack`.
+    Other failures of the node are retried and logged to `outages`.
     """
-    follower = _Follower(node, read, cursor, history or History(node.timing.reorg_depth))
+    follower = _Follower(node, read, cursor, history or History(node.timing.reorg_depth), look)
     outages = outages or OutageLog(log, "chain")
     backoff = Backoff(node.timing.outage_retry)
     lagging = 0
@@ -633,14 +667,29 @@ async def retrying(
 class _Follower:
     """The state of one `follow`: its cursor and its history."""
 
-    def __init__(self, node: Node, read: ReadRange, cursor: int, history: History) -> None:
+    def __init__(self, node: Node, read: ReadRange, cursor: int, history: History, look: Glance | None) -> None:
         self.cursor = cursor
         self.must_check_cursor = True
         self._seen = b""
         """The hash of the head that was read last."""
         self._node = node
         self._history = history
-        self._ranges = RangeReader(node, read)
+        self._read, self._look = read, look
+        self._ranges = RangeReader(node, self._read_block)
+        self._first = cursor
+        """The first block that is read here."""
+        pace, depth = node.profile.block_seconds, min(history.depth, RECENT)
+        self._window = min(depth, round(GLANCE_SECONDS / pace)) if look is not None and pace < QUICK else 0
+        """Blocks up to the head that are glanced at; 0 if each is read."""
+        self._proven: dict[int, bytes] = {}
+        """The hashes of blocks among these that were read one by one, by their numbers."""
+        self._check_at = float("-inf")
+
+    async def _read_block(self, first: int, last: int, header: BlockHeader | None) -> list[SeenBlock]:
+        blocks = await self._read(first, last, header)
+        if header is not None and self._window:
+            self._proven[first] = header.hash
+        return blocks
 
     async def read_to_head(self) -> AsyncGenerator[BlockEvents, None]:
         """Wait for a new head, and read to it: first what the chain has replaced, then the new blocks."""
@@ -649,6 +698,17 @@ class _Follower:
         if self.must_check_cursor:
             await self._check_cursor(head)
             self.must_check_cursor = False
+        elif time.monotonic() < self._check_at and 0 <= head.number - self.cursor < self._window:
+            news = await self._first_news(head)
+            if news is None:
+                self._history.remember(SeenBlock(head.number, head.hash, ()))
+                self.cursor = head.number + 1
+                yield BlockEvents(head.number, ())
+                return
+            if news < self.cursor:
+                self.cursor = news
+                yield Reorganisation(news - 1, (), self._history.forget_above(news - 1))
+        self._check_at = time.monotonic() + REPLACED_SECONDS
         replaced = await self._find_replaced(head)
         if replaced is not None:
             self.cursor = min(self.cursor, replaced.block_number + 1)
@@ -671,6 +731,29 @@ class _Follower:
         except ReplacedWhileReading:
             self.must_check_cursor = True  # the next call finds what was replaced
             await asyncio.sleep(self._node.timing.poll_interval)
+
+    async def _first_news(self, head: BlockHeader) -> int | None:
+        """The block from which to read on one by one: the first with a log that was not read so, or the next one.
+
+        None if there is none, and all that was yielded is still there. What shows before the next block was left out
+        by a machine that was behind.
+        """
+        assert self._look is not None
+        first = max(self._first, head.number - self._window + 1)
+        self._proven = {number: found for number, found in self._proven.items() if number >= first}
+        try:
+            logs = await self._look(first, head.number)
+        except RequestRefused as refused:
+            log.debug("blocks are read one by one: %s", refused)
+            self._window = 0
+            return self.cursor
+        there = {(one.block_number, one.block_hash) for one in logs}
+        if any(
+            one.events and one.block_number >= first and (one.block_number, one.block_hash) not in there
+            for one in self._history.blocks
+        ):
+            return self.cursor  # it was replaced, or another machine answers
+        return min((number for number, found in there if self._proven.get(number) != found), default=None)
 
     async def _check_cursor(self, head: BlockHeader) -> None:
         """Raise `ChainWentBack` if the cursor is past the head, unless the node is a few blocks behind another."""

@@ -6,7 +6,7 @@ A role says what events mean to it (`FollowsChain`), and `follow_chain` does the
     for each block    a reorganisation: `on_revert` for each event that it reverts, the newest first; `on_reorganised`
                       the records of new liabilities are read in one call
                       `on_event` for each event, in the order of the chain
-                      the cursor is stored, the head advances, `on_head`
+                      the cursor is stored (without events now and then), the head advances, `on_head`
     a failure         of the node, or a liability that it can't read any more: position again, after a delay
 
 Handling is idempotent. Before the events of a block are handled, the history that has them is stored with the cursor
@@ -24,7 +24,7 @@ import asyncio
 import logging
 import time
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff
@@ -98,6 +98,10 @@ class ChainHead:
         self._advanced = asyncio.Event()
 
 
+SAVE_SECONDS: Final = 5.0
+"""How often a role saves how far it has read, where nothing happens: a restarted one reads these blocks again."""
+
+
 class CursorStore(Protocol):
     """Where a role keeps how far it has handled the chain; `RoleLedger` is one."""
 
@@ -161,6 +165,7 @@ async def follow_chain(
     """
     read = read or chain.liabilities.get_all_with_orders
     kept, backoff = History(chain.node.timing.reorg_depth), Backoff(chain.node.timing.outage_retry)
+    save_at = 0.0
     while True:
         last, history = await _position(chain, head, kept, store)
         try:
@@ -171,6 +176,10 @@ async def follow_chain(
                 async for block in blocks:
                     contract_block = await chain.node.contract_blocks.last(block.block_number)  # first: it may fail
                     await _take_block(role, read, block, history, store)
+                    is_news = bool(block.events) or isinstance(block, Reorganisation)
+                    if store is not None and (is_news or time.monotonic() >= save_at):
+                        await store.set_cursor(block.block_number, history=history.encode())
+                        save_at = time.monotonic() + SAVE_SECONDS
                     head.advance_to(block.block_number, contract_block)
                     await role.on_head(block.block_number)
                     backoff.reset()
@@ -214,5 +223,3 @@ async def _take_block(
         for event in block.events:
             record = created[event.liability] if isinstance(event, NewLiability) else None
             await role.on_event(event, record, block.block_number)
-    if store is not None:
-        await store.set_cursor(block.block_number, history=history.encode())
