@@ -695,21 +695,23 @@ class _Follower:
         """Wait for a new head, and read to it: first what the chain has replaced, then the new blocks."""
         head = await (self._node.heads.look() if self.must_check_cursor else self._node.heads.next(self._seen))
         self._seen = head.hash
+        news: int | None = self.cursor
         if self.must_check_cursor:
             await self._check_cursor(head)
             self.must_check_cursor = False
-        elif time.monotonic() < self._check_at and 0 <= head.number - self.cursor < self._window:
+        elif 0 <= head.number - self.cursor < self._window:
             news = await self._first_news(head)
-            if news is None:
-                self._history.remember(SeenBlock(head.number, head.hash, ()))
-                self.cursor = head.number + 1
-                yield BlockEvents(head.number, ())
-                return
-            if news < self.cursor:
-                self.cursor = news
-                yield Reorganisation(news - 1, (), self._history.forget_above(news - 1))
-        self._check_at = time.monotonic() + REPLACED_SECONDS
-        replaced = await self._find_replaced(head)
+        replaced = None
+        if news is not None or time.monotonic() >= self._check_at:
+            self._check_at = time.monotonic() + REPLACED_SECONDS
+            replaced = await self._find_replaced(head)
+        if replaced is None and news is None:
+            self._history.remember(SeenBlock(head.number, head.hash, ()))
+            self.cursor = head.number + 1
+            yield BlockEvents(head.number, ())
+            return
+        if replaced is None and news is not None and news < self.cursor:
+            replaced = Reorganisation(news - 1, (), self._history.forget_above(news - 1))
         if replaced is not None:
             self.cursor = min(self.cursor, replaced.block_number + 1)
             yield replaced
