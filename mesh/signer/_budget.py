@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import time
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
 from mesh.base.database import SyncedDatabase
 from mesh.errors import ConfigurationError
-from mesh.signer._log import Head
 from mesh.signer.policy import DAY, HOUR, Spending
 from mesh.signer.protocol import OVER, JobState, OrderJob, SignerFailure
 from schemas.decoding import decode_json
@@ -53,6 +52,21 @@ CREATE TABLE IF NOT EXISTS facts (
 """
 KEPT: Final = 100_000
 """Jobs that are remembered: of those that are over, the oldest are forgotten."""
+
+
+FIRST: Final = "0" * 64
+"""What stands for the hash of the entry before the first one of a log."""
+
+
+class Head(NamedTuple):
+    """Where a log begins and ends: the number of the first entry that is kept, and the hash of the one before it; the
+    number of the last one, its hash, and its line."""
+
+    first: int = 1
+    before: str = FIRST
+    last: int = 0
+    hash: str = FIRST
+    line: str = ""
 
 
 class BudgetHold(StrEnum):

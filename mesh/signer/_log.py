@@ -12,11 +12,12 @@ import os
 import re
 from datetime import UTC, datetime
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from mesh.base.private_files import make_private_folder, open_private, sync_directory, sync_file
+from mesh.signer._budget import Head
 from schemas.address import keccak256
 from schemas.decoding import InvalidData, decode_json
 from schemas.errors import AiraError
@@ -33,8 +34,6 @@ FILE_BYTES: Final = 4 << 20
 """Bytes after which another file is begun."""
 FILES: Final = 16
 """Files that are kept: the oldest goes when there is one more."""
-FIRST: Final = "0" * 64
-"""What stands for the hash of the entry before the first one."""
 _NAME: Final = re.compile(r"log-(\d{12})\.jsonl")
 _LONGEST_LINE: Final = 1 << 16
 
@@ -58,17 +57,6 @@ class SignedEntry(msgspec.Struct, frozen=True, kw_only=True):
     def hash(self) -> str:
         """The digest, 64 hexadecimal digits."""
         return self.digest.hex()
-
-
-class Head(NamedTuple):
-    """Where a log begins and ends: the number of the first entry that is kept, and the hash of the one before it; the
-    number of the last one, its hash, and its line."""
-
-    first: int = 1
-    before: str = FIRST
-    last: int = 0
-    hash: str = FIRST
-    line: str = ""
 
 
 class LogUnusable(AiraError, code="log-unusable"):
