@@ -50,8 +50,7 @@ async def balances(site: Site) -> tuple[int, int]:
         return await chain.tokens.balance(site.address("person")), await chain.tokens.balance(site.address("robot"))
 
 
-@pytest.mark.parametrize("generation", [3, 5])
-@pytest.mark.parametrize("endpoint", ["http", "websocket"])
+@pytest.mark.parametrize(("generation", "endpoint"), [(3, "http"), (5, "websocket")])
 async def test_a_job_is_done_and_paid_once(geth: Geth, site: Site, generation: int, endpoint: str) -> None:
     options: dict[str, Any] = GENERATION_5 | {"generation": 5} if generation == 5 else {}
     site.url = geth.url if endpoint == "http" else geth.ws_url
