@@ -5,9 +5,6 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
-import os
-import secrets
-import stat
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,20 +16,17 @@ from mcp.server.transport_security import TransportSecuritySettings
 
 from bridges.web.access import ServerOptions, require_loopback
 from mesh.base.log_context import log_event
-from mesh.base.private_files import write_new
+from mesh.base.private_files import SHORTEST_TOKEN
 from mesh.errors import ConfigurationError
 from mesh.signer.protocol import LARGEST_REQUEST
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from mcp.server.lowlevel import Server
 
 log = logging.getLogger(__name__)
 
 PATH: Final = "/mcp"
-SHORTEST_TOKEN: Final = 16
 MOST_SESSIONS: Final = 64
 """Sessions of clients of the older revisions; those of the current one have none."""
 ALGORITHMS: Final = ("ES256", "RS256")
@@ -186,28 +180,3 @@ async def _document(session: aiohttp.ClientSession, url: str) -> dict[str, Any]:
             return {}
         found = decode_json(await response.content.read(LARGEST_DOCUMENT))
         return found if isinstance(found, dict) else {}
-
-
-def private_token(path: Path) -> str:
-    """The token in a file that only this user can read, which is made if it is missing. Raises `ConfigurationError`."""
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not path.exists():
-            write_new(path, secrets.token_urlsafe(32).encode() + b"\n")
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
-            status = os.fstat(file.fileno())
-            token = file.read(4096).decode("ascii").strip()
-    except (OSError, UnicodeError) as error:
-        why = getattr(error, "strerror", None) or "not a text in ASCII"
-        raise ConfigurationError(f"can't use the token file {path}: {why}", code="token-file-unusable") from None
-    if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077:
-        raise ConfigurationError(
-            f"others can read the token file {path}", hint=f"chmod 600 {path}", code="token-file-unusable"
-        )
-    if len(token) < SHORTEST_TOKEN:
-        raise ConfigurationError(
-            f"the token in {path} is too short",
-            hint=f"use at least {SHORTEST_TOKEN} characters, or remove the file: a new one is made",
-            code="token-too-short",
-        )
-    return token

@@ -96,7 +96,8 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
 
 def _http_options(settings: Settings, options: dict[str, Any]) -> Any:
     """The `HttpOptions`. Raises `InputError`, `ConfigurationError`."""
-    from bridges.mcp._http import HttpOptions, private_token
+    from bridges.mcp._http import HttpOptions
+    from mesh.base.private_files import private_token
     from mesh.telemetry.metrics import listen_address
 
     host, port = listen_address(options["http"])

@@ -7,17 +7,23 @@ from __future__ import annotations
 
 import errno
 import os
+import secrets
 import stat
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final
 
+from mesh.errors import ConfigurationError
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 PRIVATE_FILE: Final = 0o600
 PRIVATE_FOLDER: Final = 0o700
 _OTHERS: Final = 0o077
+SHORTEST_TOKEN: Final = 16
+LARGEST_SECRET: Final = 16_384
+"""Bytes of a secret in a file."""
 _DATABASE_SUFFIXES: Final = ("", "-wal", "-shm")
 
 
@@ -82,6 +88,42 @@ def write_new(path: Path | str, content: bytes, *, mode: int = PRIVATE_FILE) -> 
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
+
+
+def kept_secret(path: Path, make: Callable[[], bytes], *, what: str, code: str) -> bytes:
+    """The content of a file that only this user can read, which is made if it is missing: the token or key of a server.
+
+    Raises `ConfigurationError` with this `code`; `what` names the file for people.
+    """
+    try:
+        path.parent.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+        if not path.exists():
+            write_new(path, make())
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+            status = os.fstat(file.fileno())
+            content = file.read(LARGEST_SECRET)
+    except OSError as error:
+        raise ConfigurationError(f"can't use the {what} {path}: {error.strerror or error}", code=code) from None
+    if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & _OTHERS:
+        raise ConfigurationError(f"others can read the {what} {path}", hint=f"chmod 600 {path}", code=code)
+    return content
+
+
+def private_token(path: Path) -> str:
+    """The token in a file that only this user can read, which is made if it is missing. Raises `ConfigurationError`."""
+    code = "token-file-unusable"
+    content = kept_secret(path, lambda: secrets.token_urlsafe(32).encode() + b"\n", what="token file", code=code)
+    try:
+        token = content.decode("ascii").strip()
+    except UnicodeError:
+        raise ConfigurationError(f"can't use the token file {path}: not a text in ASCII", code=code) from None
+    if len(token) < SHORTEST_TOKEN:
+        raise ConfigurationError(
+            f"the token in {path} is too short",
+            hint=f"use at least {SHORTEST_TOKEN} characters, or remove the file: a new one is made",
+            code="token-too-short",
+        )
+    return token
 
 
 @contextmanager

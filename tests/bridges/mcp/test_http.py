@@ -20,10 +20,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from bridges.mcp._door import McpDoor
-from bridges.mcp._http import PATH, HttpOptions, application, private_token
+from bridges.mcp._http import PATH, HttpOptions, application
 from mesh.base.asgi_server import AsgiServer
 from mesh.base.door import DoorLimits
 from mesh.base.http_server import HttpServer
+from mesh.base.private_files import private_token
 from mesh.errors import ConfigurationError, PortUnavailable
 from mesh.signer.client import SignerClient
 from mesh.signer.protocol import LARGEST_REQUEST

@@ -1,0 +1,1 @@
+"""A door for agents that speak A2A (Agent2Agent): `aira a2a`."""

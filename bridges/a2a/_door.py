@@ -1,0 +1,404 @@
+"""The door: translates A2A to the operations of a signer, and back.
+
+It holds no key of a person, and decides nothing: the signer behind the socket does, by the person's policy. A task is a
+job of the signer, with the same id, so it is found again after any process was killed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any, Final
+
+from a2a.server.request_handlers import RequestHandler
+from a2a.server.request_handlers.request_handler import validate_request_params
+from a2a.types import (
+    ListTaskPushNotificationConfigsResponse,
+    ListTasksResponse,
+    Message,
+    Task,
+    TaskArtifactUpdateEvent,
+    TaskPushNotificationConfig,
+    TaskState,
+    TaskStatusUpdateEvent,
+)
+from a2a.utils.errors import (
+    A2AError,
+    ExtendedAgentCardNotConfiguredError,
+    InternalError,
+    InvalidParamsError,
+    TaskNotCancelableError,
+    TaskNotFoundError,
+    UnsupportedOperationError,
+)
+from a2a.utils.task import (
+    ListTasksCursor,
+    decode_list_tasks_cursor,
+    encode_list_tasks_cursor,
+    validate_history_length,
+    validate_page_size,
+)
+
+from bridges.a2a._tasks import (
+    HELP,
+    STATES,
+    Wanted,
+    answer_to,
+    artifact_of,
+    changed,
+    key_of,
+    status_of,
+    task_of,
+    wanted_of,
+)
+from mesh.errors import AiraError, InputError, public_text
+from mesh.signer.protocol import FoundQuotes, FoundRobots, Job, SignerError, SignerUnavailable
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator, Mapping
+
+    from a2a.server.context import ServerCallContext
+    from a2a.server.events.event_queue import Event
+    from a2a.types import (
+        AgentCard,
+        CancelTaskRequest,
+        DeleteTaskPushNotificationConfigRequest,
+        GetExtendedAgentCardRequest,
+        GetTaskPushNotificationConfigRequest,
+        GetTaskRequest,
+        ListTaskPushNotificationConfigsRequest,
+        ListTasksRequest,
+        SendMessageRequest,
+        SubscribeToTaskRequest,
+    )
+
+    from bridges.a2a._push import Pusher
+    from bridges.a2a._store import TaskStore
+    from mesh.signer.client import SignerClient
+    from mesh.signer.protocol import Answer, Recording
+
+MOST_CALLS: Final = 32
+"""Operations of the signer at once, besides those that follow jobs."""
+MOST_FOLLOWED: Final = 64
+"""Streams, and messages whose answer waits for the end of a job."""
+WAIT: Final = 25.0
+"""Seconds of one look at a job."""
+LONGEST_WAIT: Final = 600.0
+"""Seconds for which the answer to a message waits for the end of its job; then it is the task as it is."""
+PAGE: Final = 50
+LISTED: Final = 200
+"""Tasks that are listed: the latest."""
+BEFORE_CONTRACT: Final = frozenset({"needs-consent", "ordering", "waiting"})
+CROSSED: Final = frozenset({"already-a-contract", "not-a-contract"})
+"""The codes of errors for a job that has just become a contract, or is none any more."""
+UNKNOWN: Final = frozenset({"invalid-request", "unknown-job"})
+"""The codes of errors for a job that there is none of."""
+
+
+class A2aDoor(RequestHandler):
+    """Handles the requests of A2A; with a `robot` (address), orders are for that one alone."""
+
+    def __init__(self, signer: SignerClient, store: TaskStore, pusher: Pusher, *, robot: str = "") -> None:
+        self._signer = signer
+        self._store = store
+        self._pusher = pusher
+        self._robot = robot
+        self._calls = self._followed = 0
+
+    @validate_request_params
+    async def on_message_send(self, params: SendMessageRequest, context: ServerCallContext) -> Task | Message:
+        """Answer a message; an order is answered with its task, once that is over unless the client won't wait."""
+        validate_history_length(params.configuration)
+        answer = await self._received(params)
+        if isinstance(answer, Message):
+            return answer
+        job = answer
+        if not params.configuration.return_immediately:
+            with self._following(), contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LONGEST_WAIT):
+                    async for changed_job in self._changes(answer):
+                        job = changed_job
+                        if job.state == "needs-consent":
+                            break
+        return await self._task(job)
+
+    @validate_request_params
+    async def on_message_send_stream(
+        self, params: SendMessageRequest, context: ServerCallContext
+    ) -> AsyncGenerator[Event]:
+        """Answer a message; of an order, stream its task until that is over."""
+        validate_history_length(params.configuration)
+        with self._following():
+            answer = await self._received(params)
+            if isinstance(answer, Message):
+                yield answer
+                return
+            async for event in self._events(answer):
+                yield event
+
+    @validate_request_params
+    async def on_subscribe_to_task(
+        self, params: SubscribeToTaskRequest, context: ServerCallContext
+    ) -> AsyncGenerator[Event]:
+        """Stream a task from now on until it is over."""
+        with self._following():
+            job = await self._job(params.id)
+            if job.is_over:
+                raise UnsupportedOperationError("the task is over: nothing follows")
+            async for event in self._events(job):
+                yield event
+
+    @validate_request_params
+    async def on_get_task(self, params: GetTaskRequest, context: ServerCallContext) -> Task | None:
+        """A task as it is now."""
+        validate_history_length(params)
+        return await self._task(await self._job(params.id))
+
+    @validate_request_params
+    async def on_list_tasks(self, params: ListTasksRequest, context: ServerCallContext) -> ListTasksResponse:
+        """The latest tasks, those that changed last first."""
+        validate_history_length(params)
+        size = PAGE
+        if params.HasField("page_size"):
+            validate_page_size(params.page_size)
+            size = params.page_size
+        if params.status not in TaskState.values():
+            raise InvalidParamsError("there is no such state")
+        cursor = decode_list_tasks_cursor(params.page_token) if params.page_token else None
+        if params.page_token and cursor is None:
+            raise InvalidParamsError("the page token is not one of this agent")
+        listed = await self._ask("jobs", {"limit": LISTED})
+        found: list[tuple[tuple[bool, int, str], Job]] = []
+        for job in listed.jobs:  # type: ignore[attr-defined]
+            if params.context_id and self._store.context(job.job_id) != params.context_id:
+                continue
+            if params.status and STATES[job.state][0] != params.status:
+                continue
+            moment = changed(job)
+            if params.HasField("status_timestamp_after") and moment < params.status_timestamp_after.ToDatetime(
+                tzinfo=moment.tzinfo
+            ):
+                continue
+            place = ListTasksCursor(round(moment.timestamp() * 1e9), job.job_id)
+            found.append((place.sort_key(), job))
+        found.sort(key=lambda one: one[0], reverse=True)
+        rest = [one for one in found if cursor is None or one[0] < cursor.sort_key()]
+        page = rest[:size]
+        tasks = [task_of(job, self._store.context(job.job_id)) for _, job in page]
+        if not params.include_artifacts:
+            for task in tasks:
+                task.ClearField("artifacts")
+        last = page[-1][0] if len(rest) > size else None
+        token = "" if last is None else encode_list_tasks_cursor(ListTasksCursor(last[1], last[2]))
+        return ListTasksResponse(tasks=tasks, next_page_token=token, page_size=size, total_size=len(found))
+
+    @validate_request_params
+    async def on_cancel_task(self, params: CancelTaskRequest, context: ServerCallContext) -> Task | None:
+        """Take an order back, or stop its job once it is a contract."""
+        job = await self._job(params.id)
+        if job.is_over:
+            raise TaskNotCancelableError("the task is over already")
+        operations = ["withdraw", "stop_job"] if job.state in BEFORE_CONTRACT else ["stop_job", "withdraw"]
+        for operation in operations:
+            try:
+                job = await self._signer_job(operation, job.job_id)
+                break
+            except SignerError as error:  # it may have become a contract meanwhile, or be none any more
+                if error.code not in CROSSED or operation == operations[-1]:
+                    known = error_of(error)
+                    raise TaskNotCancelableError(known.message, known.data) from None
+            except AiraError as error:
+                raise error_of(error) from None
+        return await self._task(job)
+
+    @validate_request_params
+    async def on_create_task_push_notification_config(
+        self, params: TaskPushNotificationConfig, context: ServerCallContext
+    ) -> TaskPushNotificationConfig:
+        """Push the changes of a task to an address."""
+        return await self._push(await self._job(params.task_id), params)
+
+    @validate_request_params
+    async def on_get_task_push_notification_config(
+        self, params: GetTaskPushNotificationConfigRequest, context: ServerCallContext
+    ) -> TaskPushNotificationConfig:
+        """One of the addresses of a task."""
+        job = await self._job(params.task_id)
+        for config in self._store.pushes(job.job_id):
+            if config.id == params.id:
+                return config
+        raise TaskNotFoundError("the task has no such push notification")
+
+    @validate_request_params
+    async def on_list_task_push_notification_configs(
+        self, params: ListTaskPushNotificationConfigsRequest, context: ServerCallContext
+    ) -> ListTaskPushNotificationConfigsResponse:
+        """The addresses of a task."""
+        job = await self._job(params.task_id)
+        return ListTaskPushNotificationConfigsResponse(configs=self._store.pushes(job.job_id))
+
+    @validate_request_params
+    async def on_delete_task_push_notification_config(
+        self, params: DeleteTaskPushNotificationConfigRequest, context: ServerCallContext
+    ) -> None:
+        """Push the changes of a task there no more."""
+        job = await self._job(params.task_id)
+        self._store.no_push(job.job_id, params.id)
+        await self._store.sync()
+
+    async def on_get_extended_agent_card(
+        self, params: GetExtendedAgentCardRequest, context: ServerCallContext
+    ) -> AgentCard:
+        """There is none: the card has everything."""
+        raise ExtendedAgentCardNotConfiguredError
+
+    async def _received(self, params: SendMessageRequest) -> Message | Job:
+        """Do what a message asks for: its answer, or the job that it orders."""
+        message = params.message
+        if message.task_id:
+            job = await self._job(message.task_id)
+            if message.context_id and message.context_id != self._store.context(job.job_id):
+                raise InvalidParamsError("the task has another context")
+            raise UnsupportedOperationError("a task takes no more messages: cancel it, or ask for another one")
+        wanted = wanted_of(message)
+        if wanted is None:
+            return answer_to(message, HELP)
+        if wanted.operation != "order":
+            return answer_to(message, await self._read(wanted))
+        if params.configuration.HasField("task_push_notification_config"):
+            self._pusher.check(params.configuration.task_push_notification_config)
+        fields = {**wanted.fields, "idempotency_key": key_of(message)}
+        if self._robot and fields.setdefault("robot", self._robot) != self._robot:
+            raise InvalidParamsError(f"this agent orders from {self._robot} only", {"code": "robot-not-allowed"})
+        job = await self._asked_job("order", fields)
+        if message.context_id:
+            self._store.keep_context(job.job_id, message.context_id)
+            await self._store.sync()
+        if params.configuration.HasField("task_push_notification_config"):
+            await self._push(job, params.configuration.task_push_notification_config)
+        return job
+
+    async def _read(self, wanted: Wanted) -> Answer:
+        fields = dict(wanted.fields)
+        if self._robot and wanted.operation == "find_robots":
+            fields["text"] = self._robot
+        answer = await self._ask(wanted.operation, fields)
+        if self._robot and isinstance(answer, FoundQuotes):
+            return FoundQuotes(
+                quotes=tuple(one for one in answer.quotes if one.robot == self._robot),
+                declined=tuple(one for one in answer.declined if one.robot == self._robot),
+                objective=answer.objective,
+            )
+        if self._robot and isinstance(answer, FoundRobots):
+            return FoundRobots(robots=tuple(one for one in answer.robots if one.address == self._robot), more=0)
+        return answer
+
+    async def _push(self, job: Job, asked: TaskPushNotificationConfig) -> TaskPushNotificationConfig:
+        self._pusher.check(asked)
+        config = TaskPushNotificationConfig()
+        config.CopyFrom(asked)
+        config.task_id, config.id = job.job_id, asked.id or job.job_id
+        self._store.push(job.job_id, config)
+        await self._store.sync()
+        self._pusher.watch(job.job_id)
+        return config
+
+    async def _events(self, job: Job) -> AsyncIterator[Event]:
+        """A job's task, then what changes of it, until it is over."""
+        context = self._store.context(job.job_id)
+        yield await self._task(job)
+        has_artifact = bool(job.result)
+        async for now in self._changes(job):
+            if now.revision == job.revision:
+                continue
+            if now.result and not has_artifact:
+                has_artifact = True
+                artifact = artifact_of(now, await self._recording(now))
+                yield TaskArtifactUpdateEvent(
+                    task_id=now.job_id, context_id=context, artifact=artifact, last_chunk=True
+                )
+            event = TaskStatusUpdateEvent(task_id=now.job_id, context_id=context, status=status_of(now, context))
+            event.metadata.CopyFrom(task_of(now, context).metadata)
+            yield event
+
+    async def _changes(self, job: Job) -> AsyncIterator[Job]:
+        """A job each time it has changed, first as it is; the last time when it is over. Outages are waited out."""
+        yield job
+        while not job.is_over:
+            try:
+                now = await self._signer.job(job.job_id, revision=job.revision, wait_seconds=WAIT)
+            except SignerUnavailable:
+                await asyncio.sleep(1.0)
+                continue
+            except AiraError as error:
+                raise error_of(error) from None
+            if now.revision != job.revision:
+                job = now
+                yield job
+
+    @contextlib.contextmanager
+    def _following(self) -> Any:
+        if self._followed >= MOST_FOLLOWED:
+            raise InternalError(
+                "too many jobs are followed at once; ask for the task later", {"code": "too-many-streams"}
+            )
+        self._followed += 1
+        try:
+            yield
+        finally:
+            self._followed -= 1
+
+    async def _task(self, job: Job) -> Task:
+        return task_of(job, self._store.context(job.job_id), await self._recording(job))
+
+    async def _recording(self, job: Job) -> Recording | None:
+        """What the recording of a job has, if it has one that can be read now."""
+        if not job.result:
+            return None
+        try:
+            return await self._signer.recording(job.job_id)
+        except AiraError:
+            return None
+
+    async def _job(self, identity: str) -> Job:
+        try:
+            return await self._signer.job(identity)
+        except AiraError as error:
+            if error.code in UNKNOWN:
+                raise TaskNotFoundError from None
+            raise error_of(error) from None
+
+    async def _signer_job(self, operation: str, identity: str) -> Job:
+        if operation == "withdraw":
+            return await self._signer.withdraw(identity)
+        return await self._signer.stop_job(identity, why="canceled by its client")
+
+    async def _asked_job(self, operation: str, fields: Mapping[str, Any]) -> Job:
+        job = await self._ask(operation, fields)
+        assert isinstance(job, Job)
+        return job
+
+    async def _ask(self, operation: str, fields: Mapping[str, Any]) -> Answer:
+        """Raises `A2AError` only."""
+        if self._calls >= MOST_CALLS:
+            raise InternalError(
+                "too many calls at once; wait for the answers to earlier ones", {"code": "too-many-calls"}
+            )
+        self._calls += 1
+        try:
+            return await self._signer.ask(operation, fields)
+        except AiraError as error:
+            raise error_of(error) from None
+        finally:
+            self._calls -= 1
+
+
+def error_of(error: AiraError) -> A2AError:
+    """An error of A2A, with the code and what to do about it; strangers' words stand apart."""
+    data = {"code": error.code, "next": public_text(error.hint)}
+    if isinstance(error, SignerError) and error.from_strangers is not None:
+        data |= {"from": error.from_strangers.author, "text": error.from_strangers.text}
+    kind = InvalidParamsError if isinstance(error, SignerError | InputError) else InternalError
+    if isinstance(error, SignerUnavailable):
+        kind = InternalError
+    return kind(f"{error.code}: {public_text(error)}", data)

@@ -1,0 +1,205 @@
+"""Push notifications: posts each change of a task to the addresses that its client has named.
+
+A client names any URL, so this is a way to make the door ask machines that only it can reach. It posts to public
+addresses only, unless its operator allows others; what it connects to is the address that was checked, and it follows
+no redirect.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+import socket
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+
+import aiohttp
+from a2a.types import StreamResponse, TaskPushNotificationConfig
+from a2a.utils.errors import InvalidParamsError
+from aiohttp.abc import AbstractResolver, ResolveResult
+from google.protobuf.json_format import MessageToDict
+
+from bridges.a2a._tasks import task_of
+from mesh.base.background import Background
+from mesh.base.lifecycle import Lifecycle
+from mesh.base.log_context import log_event
+from mesh.base.retry import Backoff, RetryPolicy
+from mesh.errors import AiraError
+from mesh.signer.protocol import SignerUnavailable
+
+if TYPE_CHECKING:
+    from contextlib import AsyncExitStack
+
+    from bridges.a2a._store import TaskStore
+    from mesh.signer.client import SignerClient
+    from mesh.signer.protocol import Job
+
+log = logging.getLogger(__name__)
+
+LONGEST_URL: Final = 2_000
+LONGEST_SECRET: Final = 2_000
+POST_SECONDS: Final = 10.0
+ATTEMPTS: Final = 4
+"""How often a change is posted to an address that does not take it."""
+RETRY: Final = RetryPolicy(initial=1.0, ceiling=20.0)
+WAIT: Final = 25.0
+"""Seconds of one look at a job."""
+AT_ONCE: Final = 16
+"""Posts at once."""
+
+
+def is_public(address: str) -> bool:
+    """Whether an IP address is one that anybody can reach: not this machine, a private network, or a special one."""
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return False
+    if isinstance(found, ipaddress.IPv6Address):
+        inner = found.ipv4_mapped or found.sixtofour or (found.teredo[1] if found.teredo else None)
+        if inner is None and found in ipaddress.ip_network("64:ff9b::/96"):
+            inner = ipaddress.ip_address(int(found) & 0xFFFFFFFF)  # type: ignore[assignment]
+        if inner is not None:
+            return is_public(str(inner))
+    return found.is_global and not found.is_multicast
+
+
+class PublicResolver(AbstractResolver):
+    """Resolves names to public addresses only."""
+
+    async def resolve(
+        self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_INET
+    ) -> list[ResolveResult]:
+        """The public addresses of a host. Raises `OSError` if it has none."""
+        found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM, family=family)
+        public = [one for one in found if is_public(str(one[4][0]))]
+        if not public:
+            raise OSError("no public address")
+        return [
+            ResolveResult(
+                hostname=host,
+                host=str(address[0]),
+                port=port,
+                family=kind,
+                proto=number,
+                flags=socket.AI_NUMERICHOST,
+            )
+            for kind, _, number, _, address in public
+        ]
+
+    async def close(self) -> None:
+        """Nothing is open."""
+
+
+class Pusher(Lifecycle):
+    """Pushes the changes of tasks: `async with Pusher(signer, store) as pusher`.
+
+    Entering takes up the tasks of before. Each change is posted at least once, in order, to each of a task's addresses;
+    one that does not take it `ATTEMPTS` times misses it. `anywhere` lets it post into private networks.
+    """
+
+    title = "push notifications"
+
+    def __init__(self, signer: SignerClient, store: TaskStore, *, anywhere: bool = False) -> None:
+        self._signer = signer
+        self._store = store
+        self._anywhere = anywhere
+        self._watched: set[str] = set()
+        self._posts = asyncio.Semaphore(AT_ONCE)
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        connector = aiohttp.TCPConnector(
+            resolver=None if self._anywhere else PublicResolver(), limit=AT_ONCE, force_close=True
+        )
+        timeout = aiohttp.ClientTimeout(total=POST_SECONDS)
+        self._session = await stack.enter_async_context(
+            aiohttp.ClientSession(connector=connector, timeout=timeout, cookie_jar=aiohttp.DummyCookieJar())
+        )
+        self._tasks = await stack.enter_async_context(Background())
+        for job in self._store.waiting():
+            self.watch(job)
+
+    def check(self, config: TaskPushNotificationConfig) -> None:
+        """Raise `InvalidParamsError` for an address that nothing is posted to."""
+        text = config.url
+        try:
+            url = urlsplit(text)
+            host, _ = url.hostname or "", url.port
+        except ValueError:
+            raise InvalidParamsError("the URL of the push notification can't be read") from None
+        if (
+            not (host and len(text) <= LONGEST_URL and text.isascii() and text.isprintable())
+            or url.username is not None
+        ):
+            raise InvalidParamsError("the URL of the push notification is not one to post to")
+        if url.scheme != "https" and not (self._anywhere and url.scheme == "http"):
+            raise InvalidParamsError("push notifications are sent over HTTPS only")
+        if not self._anywhere and (host == "localhost" or (_is_number(host) and not is_public(host))):
+            raise InvalidParamsError("push notifications are sent to public addresses only")
+        secrets = (config.token, config.authentication.scheme, config.authentication.credentials, config.id)
+        if not all(len(one) <= LONGEST_SECRET and one.isascii() and (one.isprintable()) for one in secrets):
+            raise InvalidParamsError("the token or credentials of the push notification can't be sent in a header")
+
+    def watch(self, job: str) -> None:
+        """Push the changes of a job from now on, until it is over."""
+        if job not in self._watched:
+            self._watched.add(job)
+            self._tasks.start(self._follow(job), f"push {job}")
+
+    async def _follow(self, identity: str) -> None:
+        revision, backoff = -1, Backoff(RETRY)
+        try:
+            while self._store.pushes(identity):
+                try:
+                    job = await self._signer.job(identity, revision=revision, wait_seconds=WAIT)
+                except SignerUnavailable:
+                    await asyncio.sleep(backoff.next_delay() or 0.0)
+                    continue
+                except AiraError as error:
+                    log.debug("a job is not pushed any more: %s", error)
+                    self._store.over(identity)
+                    return
+                if job.revision != revision:
+                    revision = job.revision
+                    await asyncio.gather(*(self._post(job, one) for one in self._store.pushes(identity)))
+                if job.is_over:
+                    self._store.over(identity)
+                    return
+        finally:
+            self._watched.discard(identity)
+
+    async def _post(self, job: Job, config: TaskPushNotificationConfig) -> None:
+        body = MessageToDict(StreamResponse(task=task_of(job, self._store.context(job.job_id))))
+        headers = {"Content-Type": "application/a2a+json"}
+        if config.token:
+            headers["X-A2A-Notification-Token"] = config.token
+        if config.authentication.scheme and config.authentication.credentials:
+            headers["Authorization"] = f"{config.authentication.scheme} {config.authentication.credentials}"
+        backoff = Backoff(RETRY)
+        for attempt in range(ATTEMPTS):
+            if attempt:
+                await asyncio.sleep(backoff.next_delay() or 0.0)
+            try:
+                if await self._posted(config.url, body, headers):
+                    return
+            except (aiohttp.ClientError, OSError, TimeoutError, ValueError) as error:
+                log.debug("a push notification failed: %s", type(error).__name__)
+        facts = log_event("push-not-delivered", job=job.job_id, state=job.state)
+        log.warning("the address of a push notification takes none", extra=facts)
+
+    async def _posted(self, url: str, body: dict[str, Any], headers: dict[str, str]) -> bool:
+        async with (
+            self._posts,
+            self._session.post(url, json=body, headers=headers, allow_redirects=False) as response,
+        ):
+            return 200 <= response.status < 300
+
+
+def _is_number(host: str) -> bool:
+    """Whether a host is an address, also in the forms that only some libraries read, such as `127.1` and `0x7f.1`."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        last = host.rstrip(".").rpartition(".")[2]
+        return last.isdigit() or last.lower().startswith("0x")
+    return True

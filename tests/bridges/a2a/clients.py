@@ -1,0 +1,92 @@
+"""The door in this process, and the SDK's own client of it."""
+
+from __future__ import annotations
+
+import uuid
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import httpx
+from a2a.client import ClientConfig, ClientFactory
+from a2a.types import Message, Role, SendMessageRequest, StreamResponse
+from google.protobuf.json_format import ParseDict
+
+from bridges.a2a._card import Card, CardKey
+from bridges.a2a._door import A2aDoor
+from bridges.a2a._http import application
+from bridges.a2a._push import Pusher
+from bridges.a2a._store import TaskStore
+from mesh.base.asgi_server import AsgiServer
+from mesh.base.door import DoorLimits
+from mesh.signer.client import SignerClient
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from a2a.client import Client
+    from a2a.types import Task
+
+TOKEN = "a token of a private file"
+AUTHORIZED = {"Authorization": f"Bearer {TOKEN}", "A2A-Version": "1.0", "Content-Type": "application/json"}
+
+
+@dataclass
+class Served:
+    """A door that is served."""
+
+    url: str
+    key: CardKey
+    pusher: Pusher
+
+    @asynccontextmanager
+    async def client(self, *, streaming: bool = True, binding: str = "JSONRPC") -> AsyncIterator[Client]:
+        async with httpx.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"}, timeout=90) as http:
+            config = ClientConfig(httpx_client=http, streaming=streaming, supported_protocol_bindings=[binding])
+            yield await ClientFactory(config).create_from_url(self.url)
+
+
+@asynccontextmanager
+async def serving(
+    socket: Path,
+    state: Path,
+    *,
+    robot: str = "",
+    push_anywhere: bool = False,
+    limits: DoorLimits = DoorLimits(),  # noqa: B008
+) -> AsyncIterator[Served]:
+    """The door of the signer on a socket, which keeps its state in a folder."""
+    async with AsyncExitStack() as stack:
+        signer = await stack.enter_async_context(SignerClient(socket))
+        key, store = CardKey(state / "key.pem"), TaskStore(state / "a2a.sqlite")
+        store.open()
+        stack.callback(store.close)
+        pusher = await stack.enter_async_context(Pusher(signer, store, anywhere=push_anywhere))
+        door = A2aDoor(signer, store, pusher, robot=robot)
+        cards: list[Card] = []
+        app = application(door, lambda: cards[0], key, TOKEN)
+        server = await stack.enter_async_context(AsgiServer(app, "127.0.0.1", 0, limits=limits))
+        url = f"http://127.0.0.1:{server.port}"
+        cards.append(Card(signer, key, url, robot=robot))
+        yield Served(url, key, pusher)
+
+
+def request(data: dict[str, Any], *, message_id: str = "", context: str = "") -> SendMessageRequest:
+    """A message with one data part."""
+    message = Message(message_id=message_id or str(uuid.uuid4()), role=Role.ROLE_USER, context_id=context)
+    ParseDict({"parts": [{"data": data}]}, message)
+    return SendMessageRequest(message=message)
+
+
+async def sent(client: Client, asked: SendMessageRequest) -> list[StreamResponse]:
+    """All that a client gets for a message."""
+    return [one async for one in client.send_message(asked)]
+
+
+def job_of(task: Task) -> dict[str, Any]:
+    """What the metadata of a task say of its job."""
+    from google.protobuf.json_format import MessageToDict
+
+    found: dict[str, Any] = MessageToDict(task.metadata)["job"]
+    return found
