@@ -89,8 +89,11 @@ PAGE: Final = 50
 LISTED: Final = 200
 """Tasks that are listed: the latest."""
 BEFORE_CONTRACT: Final = frozenset({"needs-consent", "ordering", "waiting"})
-CROSSED: Final = frozenset({"already-a-contract", "not-a-contract"})
-"""The codes of errors for a job that has just become a contract, or is none any more."""
+CROSSED: Final = frozenset({"already-a-contract", "not-a-contract", "order-under-way"})
+"""The codes of errors for a job that is just being sent, has become a contract, or is none any more."""
+CANCEL_ATTEMPTS: Final = 5
+CANCEL_WAIT: Final = 5.0
+"""Seconds for which such a job may go on before the next attempt."""
 UNKNOWN: Final = frozenset({"invalid-request", "unknown-job"})
 """The codes of errors for a job that there is none of."""
 
@@ -196,19 +199,22 @@ class A2aDoor(RequestHandler):
     async def on_cancel_task(self, params: CancelTaskRequest, context: ServerCallContext) -> Task | None:
         """Take an order back, or stop its job once it is a contract."""
         job = await self._job(params.id)
-        if job.is_over:
-            raise TaskNotCancelableError("the task is over already")
-        operations = ["withdraw", "stop_job"] if job.state in BEFORE_CONTRACT else ["stop_job", "withdraw"]
-        for operation in operations:
+        for attempt in range(CANCEL_ATTEMPTS):
+            if job.is_over:
+                raise TaskNotCancelableError("the task is over already")
             try:
-                job = await self._signer_job(operation, job.job_id)
+                if job.state in BEFORE_CONTRACT:
+                    job = await self._signer.withdraw(job.job_id)
+                else:
+                    job = await self._signer.stop_job(job.job_id, why="canceled by its client")
                 break
-            except SignerError as error:  # it may have become a contract meanwhile, or be none any more
-                if error.code not in CROSSED or operation == operations[-1]:
-                    known = error_of(error)
-                    raise TaskNotCancelableError(known.message, known.data) from None
             except AiraError as error:
-                raise error_of(error) from None
+                if error.code not in CROSSED or attempt == CANCEL_ATTEMPTS - 1:
+                    known = error_of(error)
+                    raise (
+                        known if isinstance(known, InternalError) else TaskNotCancelableError(known.message, known.data)
+                    ) from None
+                job = await self._signer.job(job.job_id, revision=job.revision, wait_seconds=CANCEL_WAIT)
         return await self._task(job)
 
     @validate_request_params
@@ -367,11 +373,6 @@ class A2aDoor(RequestHandler):
             if error.code in UNKNOWN:
                 raise TaskNotFoundError from None
             raise error_of(error) from None
-
-    async def _signer_job(self, operation: str, identity: str) -> Job:
-        if operation == "withdraw":
-            return await self._signer.withdraw(identity)
-        return await self._signer.stop_job(identity, why="canceled by its client")
 
     async def _asked_job(self, operation: str, fields: Mapping[str, Any]) -> Job:
         job = await self._ask(operation, fields)
