@@ -111,12 +111,14 @@ def kept_secret(path: Path, make: Callable[[], bytes], *, what: str, code: str) 
 
 def private_token(path: Path) -> str:
     """The token in a file that only this user can read, which is made if it is missing. Raises `ConfigurationError`."""
-    code = "token-file-unusable"
-    content = kept_secret(path, lambda: secrets.token_urlsafe(32).encode() + b"\n", what="token file", code=code)
+    make = lambda: secrets.token_urlsafe(32).encode() + b"\n"  # noqa: E731
+    content = kept_secret(path, make, what="token file", code="token-file-unusable")
     try:
         token = content.decode("ascii").strip()
     except UnicodeError:
-        raise ConfigurationError(f"can't use the token file {path}: not a text in ASCII", code=code) from None
+        raise ConfigurationError(
+            f"can't use the token file {path}: not a text in ASCII", code="token-file-unusable"
+        ) from None
     if len(token) < SHORTEST_TOKEN:
         raise ConfigurationError(
             f"the token in {path} is too short",
