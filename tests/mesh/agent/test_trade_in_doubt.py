@@ -307,6 +307,7 @@ async def test_an_offer_that_can_not_be_signed_again_does_not_stop_the_agent(
     await place.chains["person"].tokens.transfer(place.address("robot"), 5)
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_an_earlier_version_of_an_order_that_a_reorganisation_makes_valid_is_that_order(place: Place) -> None:
     """Generation 5: the order was signed again, because the contract of another one had used its nonce."""
     robot, provider = place.market.accounts["robot"], place.chains["provider"]
