@@ -263,7 +263,7 @@ async def market_of(case: Case) -> AsyncIterator[tuple[Market, Chain]]:
         pipes, processes = {}, {}
         for role, key in zip(ROLES, node.funded_keys, strict=False):
             settings = Settings(
-                chain=case.chain,
+                chain=case.chain,  # type: ignore[arg-type]  # a name of CHAINS
                 connect=(endpoint,),
                 data_dir=str(folder / role),
                 web3_http_provider=f"{case.scheme}://127.0.0.1:{port}/{role}",

@@ -75,7 +75,7 @@ if TYPE_CHECKING:
     from bridges.a2a._push import Pusher
     from bridges.a2a._store import TaskStore
     from mesh.signer.client import SignerClient
-    from mesh.signer.protocol import Answer, Recording
+    from mesh.signer.protocol import Recording, SignerAnswer
 
 MOST_CALLS: Final = 32
 """Operations of the signer at once, besides those that follow jobs."""
@@ -284,7 +284,7 @@ class A2aDoor(RequestHandler):
             await self._push(job, params.configuration.task_push_notification_config)
         return job
 
-    async def _read(self, wanted: Wanted) -> Answer:
+    async def _read(self, wanted: Wanted) -> SignerAnswer:
         fields = dict(wanted.fields)
         if self._robot and wanted.operation == "find_robots":
             fields["text"] = self._robot
@@ -379,7 +379,7 @@ class A2aDoor(RequestHandler):
         assert isinstance(job, Job)
         return job
 
-    async def _ask(self, operation: str, fields: Mapping[str, Any]) -> Answer:
+    async def _ask(self, operation: str, fields: Mapping[str, Any]) -> SignerAnswer:
         """Raises `A2AError` only."""
         if self._calls >= MOST_CALLS:
             raise InternalError(

@@ -18,7 +18,7 @@ from schemas.decoding import InvalidData, decode_json
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from mesh.signer.protocol import Answer, Job, JobState, Recording
+    from mesh.signer.protocol import Job, JobState, Recording, SignerAnswer
 
 LONGEST_ID: Final = 200
 """Characters of a client's message and context ids."""
@@ -98,7 +98,7 @@ def key_of(message: Message) -> str:
     return f"a2a-{hashlib.sha256(message.message_id.encode()).hexdigest()}"
 
 
-def answer_to(message: Message, answer: Answer | str) -> Message:
+def answer_to(message: Message, answer: SignerAnswer | str) -> Message:
     """The reply to a message: an answer of the signer, or a text in constant words."""
     part = Part(text=answer) if isinstance(answer, str) else data_part(msgspec.to_builtins(answer))
     context = message.context_id or str(uuid4())
