@@ -52,7 +52,7 @@ from bridges.a2a._tasks import (
     wanted_of,
 )
 from mesh.errors import AiraError, InputError, public_text
-from mesh.signer.protocol import FoundQuotes, FoundRobots, Job, SignerError, SignerUnavailable
+from mesh.signer.protocol import FoundQuotes, FoundRobots, Job, Jobs, SignerError, SignerUnavailable
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Mapping
@@ -171,8 +171,9 @@ class A2aDoor(RequestHandler):
         if params.page_token and cursor is None:
             raise InvalidParamsError("the page token is not one of this agent")
         listed = await self._ask("jobs", {"limit": LISTED})
+        assert isinstance(listed, Jobs)
         found: list[tuple[tuple[bool, int, str], Job]] = []
-        for job in listed.jobs:  # type: ignore[attr-defined]
+        for job in listed.jobs:
             if params.context_id and self._store.context(job.job_id) != params.context_id:
                 continue
             if params.status and STATES[job.state][0] != params.status:
