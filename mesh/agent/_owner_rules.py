@@ -29,7 +29,7 @@ from schemas.model import PRICE
 from schemas.records import ControlRobot, RobotControl
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from mesh.agent.components import AgentComponents
     from mesh.role.local_stop import Hold
@@ -72,6 +72,8 @@ class OwnerRules:
         self._changing = asyncio.Lock()
         self._least: tuple[str, int, str] | None = None
         """The token (address) of the least price, that price in its smallest unit, and for people."""
+        self._tokens: Mapping[str, str] | None = None
+        """The tokens (addresses) that it is paid in, and their symbols; None until they are needed."""
 
     async def open(self) -> None:
         """Read what the owner has changed before. Raises `InputError` for prices that are none."""
@@ -99,7 +101,7 @@ class OwnerRules:
                 self._use(new, least_price)
 
     def _use(self, changed: ControlRobot, least: tuple[str, int, str] | None) -> None:
-        self._changed, self._least = changed, least
+        self._changed, self._least, self._tokens = changed, least, None
         if changed.refuse is not None:
             self._refused = frozenset(changed.refuse)
 
@@ -131,6 +133,8 @@ class OwnerRules:
             wanted, price, shown = self._least
             if token != wanted or cost < price:
                 return Declined("price-too-low", f"it works for at least {shown}")
+        elif cost and token not in (paid_in := await self._paid_in()):  # in others a number has another worth
+            return Declined("other-token", f"it is paid in {' or '.join(paid_in.values())}")
         return self.closed() or self.full()
 
     def closed(self) -> Declined | None:
@@ -161,6 +165,19 @@ class OwnerRules:
         amounts = partial(chain.tokens.amounts, text, default=settings.erc20_token)
         token, unit, (price,) = await chain.retrying(amounts, outages=outages)
         return token, price, unit.show(price)
+
+    async def _paid_in(self) -> Mapping[str, str]:
+        """The tokens that it is paid in where it has no least price: its own, and that of its price."""
+        if self._tokens is None:
+            self._tokens = await self._parts.chain.retrying(self._find_tokens, outages=self._parts.outages)
+        return self._tokens
+
+    async def _find_tokens(self) -> Mapping[str, str]:
+        tokens, own = self._parts.chain.tokens, self._parts.settings.erc20_token
+        found = {await tokens.address(own)}
+        if self.price:
+            found.add((await tokens.amounts(self.price, default=own)).token)
+        return {token: unit.symbol for token, unit in (await tokens.units(found)).items()}
 
     async def _price_of(self, text: str) -> str:
         """A price that an owner has written, as profiles say it. Raises `InvalidAmount`, `ChainError`."""

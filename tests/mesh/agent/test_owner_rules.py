@@ -119,11 +119,15 @@ async def test_who_is_accepted_and_pays_enough_is_served(place: Place) -> None:
         assert (await contract.outcome()).success
 
 
-async def test_a_price_in_another_token_is_too_low(place: Place) -> None:
+@pytest.mark.parametrize(("options", "code"), [({"least_price": "2"}, "price-too-low"), ({}, "other-token")])
+async def test_any_amount_of_a_token_that_the_robot_is_not_paid_in_is_declined(
+    place: Place, options: dict[str, Any], code: str
+) -> None:
     token = await other_token(place, "person", supply=10**18)
-    robot, _, _ = working(place, least_price="2")
+    robot, _, _ = working(place, **options)
     async with place.at_work(robot) as person:
-        assert (await decline_of(person, cost=10**18, token=token)).code == "price-too-low"
+        declined = await decline_of(person, cost=10**18, token=token)
+        assert (declined.code, "XRT" in declined.detail) == (code, True)
 
 
 async def test_a_full_queue_takes_the_next_job_when_one_has_ended(place: Place) -> None:

@@ -245,7 +245,7 @@ def test_what_the_token_refused_to_return_is_shown_and_claimed(served: ServedCha
     served.finalize(address, success=False)
 
     owed = columns(served.aira("liability", "show", address, by="stranger").stdout)["owed"]
-    unit = f"tokens ({token[:6]}…{token[-4:]})"
+    unit = f"units ({token[:6]}…{token[-4:]})"
     assert owed == f"7 {unit} to {person}, whom the token refused to pay: `aira liability claim {address}`"
     assert "--to" in refused(served.aira("liability", "claim", address, by="stranger"), "claim-refused", person)
     refused(served.aira("liability", "claim", address, "--to", stranger, by="stranger"), "not-a-party", person)
