@@ -19,7 +19,8 @@ import secrets
 import socket
 import struct
 import time
-from contextlib import suppress
+from collections import Counter
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -34,6 +35,7 @@ from mesh.agent.jobs import STOPPED
 from mesh.agent.orders import MEASURED_BLOCKS, OrderState
 from mesh.amounts import ETH
 from mesh.base.background import Background
+from mesh.base.database import DISK_ERRORS
 from mesh.base.file_locks import try_lock
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
@@ -103,9 +105,15 @@ log = logging.getLogger(__name__)
 REQUESTS: Final = Rate(per_second=30.0, burst=300)
 """Requests on one socket."""
 AT_A_TIME: Final = 16
-"""Requests that are worked on at a time, without those that only wait for a job to change."""
+"""Other requests that are worked on at a time, without those that only wait for a job to change."""
+AT_ONCE: Final = frozenset({"stop_job", "withdraw", *OWNER})
+"""Operations that are worked on at once, whatever else is: what ends a job, and those of the owner."""
 WAITING: Final = 256
-"""Requests that wait for a job to change."""
+"""Requests that wait for a place, and those that wait for a job to change."""
+TICK: Final = 0.5
+"""Seconds between two changes of a job that are not kept, new values and progress: robots say how often these come."""
+ORDERS: Final = Rate(per_second=1.0, burst=300)
+"""Orders, also those that are refused: each stays in the log and in the budget's file."""
 CONSENTS: Final = 20
 """Orders that wait for a person's yes."""
 MOST_MESSAGES: Final = 10_000
@@ -155,10 +163,13 @@ class Signer(Lifecycle):
         self._changed: dict[str, asyncio.Event] = {}
         self._ticks: dict[str, int] = {}
         """How often a job has changed in ways that are not kept."""
+        self._ticking: set[str] = set()
+        """Jobs of which such a change is about to be counted."""
         self._progress: dict[str, protocol.JobProgress] = {}
         self._latest: dict[str, dict[str, protocol.LatestValue]] = {}
         self._places = asyncio.Semaphore(AT_A_TIME)
-        self._waiting = 0
+        self._waiting: Counter[bool] = Counter()
+        self._orders = RateLimiter(per_sender=ORDERS)
 
     @property
     def door(self) -> Path:
@@ -247,7 +258,7 @@ class Signer(Lifecycle):
                 known = name in DOOR or name in OWNER
                 why = "this socket has no such operation" if known else "there is no such operation"
                 raise SignerError(why, hint="only the owner's socket has it" if known else "", code="unknown-operation")
-            if not limiter.allow(""):
+            if not limiter.allow("job" if name == "job" else ""):  # whoever follows jobs can still stop them
                 raise SignerError("too many requests", hint="wait a moment", code="too-many-requests")
             try:
                 asked = decode_json(await request.read(), operations[name].request)
@@ -266,16 +277,17 @@ class Signer(Lifecycle):
 
     async def _work_on(self, name: str, asked: Any) -> protocol.SignerAnswer:
         method: Callable[[Any], Awaitable[protocol.SignerAnswer]] = getattr(self, f"_do_{name}")
-        if name == "job":
-            if self._waiting >= WAITING:
-                raise SignerError("too many requests wait for jobs", hint="wait a moment", code="too-many-requests")
-            self._waiting += 1
-            try:
-                return await method(asked)
-            finally:
-                self._waiting -= 1
-        async with self._places:
+        if name in AT_ONCE:
             return await method(asked)
+        is_look = name == "job"
+        if self._waiting[is_look] >= WAITING:
+            raise SignerError("too many requests wait", hint="wait a moment", code="too-many-requests")
+        self._waiting[is_look] += 1
+        try:
+            async with nullcontext() if is_look else self._places:
+                return await method(asked)
+        finally:
+            self._waiting[is_look] -= 1
 
     async def _do_find_robots(self, asked: protocol.FindRobots) -> protocol.FoundRobots:
         wanted = asked.text.casefold()
@@ -341,6 +353,8 @@ class Signer(Lifecycle):
                 )
             if known is not None:
                 return await self._shown(known)
+            if not self._orders.allow(""):
+                raise SignerError("too many orders", hint="wait a moment", code="too-many-requests")
             try:
                 return await self._judge(asked, digest)
             except AiraError as error:
@@ -368,7 +382,7 @@ class Signer(Lifecycle):
         _require(decision)
         job = KeptJob(
             id=f"job-{secrets.token_hex(8)}",
-            request=asked,
+            request=msgspec.structs.replace(asked, messages=()),  # they are in the objective
             digest=digest,
             state="ordering",
             objective=objective,
@@ -406,8 +420,7 @@ class Signer(Lifecycle):
         else:
             self.log.add("allowed", job=job.id, key=_key(asked), note=asked.note, **facts)
             job = self.budget.put(msgspec.structs.replace(job, hold=BudgetHold.OPEN))
-            await self.budget.sync()
-            self._start(job)
+            await self._begin(job)
         return await self._shown(job)
 
     async def _objective(
@@ -459,6 +472,15 @@ class Signer(Lifecycle):
         named = [rule.robots for rule in found]
         return None if None in named else frozenset[str]().union(*(one for one in named if one is not None))
 
+    async def _begin(self, job: KeptJob) -> None:
+        """Order an allowed job, whose cost is bound from here on."""
+        try:
+            await self.budget.sync()
+        except DISK_ERRORS:
+            self._start(job)  # nothing leaves before its hash is on the disk, either
+            raise
+        self._start(job)
+
     def _resume(self, job: KeptJob) -> None:
         """Go on with a job of an earlier run."""
         if job.state != "needs-consent":
@@ -490,6 +512,10 @@ class Signer(Lifecycle):
                     await backoff.wait()
                 else:
                     await self._end(job, "failed", hold=BudgetHold.NONE, error=failure_of(error))
+            except DISK_ERRORS as error:
+                facts = log_event("job-waits", job=job_id, code=type(error).__name__)
+                log.warning("job %s waits for the disk: %s", job_id, type(error).__name__, extra=facts)
+                await backoff.wait()
 
     async def _place(self, job: KeptJob) -> None:
         """Sign the order for the robot that is chosen, and post it. Nothing of it has been signed, or left here."""
@@ -576,9 +602,7 @@ class Signer(Lifecycle):
 
     async def _outlast(self, job: KeptJob) -> None:
         """Wait until an order that was withdrawn can't become a contract any more: then it binds no money."""
-        if job.state != "withdrawn":
-            self.log.add("withdrawn", job=job.id)
-            job = self._put(job, state="withdrawn")
+        job = self._withdrawn(job)
         parts = self.agent.parts
         while parts.chain_head.contract_block < job.deadline:
             if found := await self._contract_of(job):
@@ -683,6 +707,16 @@ class Signer(Lifecycle):
             if job.state == "accepted":
                 self._put(job, state="running")
                 return
+        self._tick_soon(job_id)
+
+    def _tick_soon(self, job_id: str) -> None:
+        """Count a change that is not kept, with all others of the next `TICK` seconds."""
+        if job_id not in self._ticking:
+            self._ticking.add(job_id)
+            asyncio.get_running_loop().call_later(TICK, self._tick, job_id)
+
+    def _tick(self, job_id: str) -> None:
+        self._ticking.discard(job_id)
         self._ticks[job_id] = self._ticks.get(job_id, 0) + 1
         self._tell(job_id)
 
@@ -693,8 +727,7 @@ class Signer(Lifecycle):
                 text, _ = value_text(message, f"robot {job.robot}")
                 moment = time_text(message.log_time_ns / 1e9)
                 kept[message.topic] = protocol.LatestValue(topic=plain(message.topic, 200), value=text, time=moment)
-                self._ticks[job.id] = self._ticks.get(job.id, 0) + 1
-                self._tell(job.id)
+                self._tick_soon(job.id)
 
         while len(self._latest) > 256:
             self._latest.pop(next(iter(self._latest)))
@@ -711,7 +744,8 @@ class Signer(Lifecycle):
         return await self._shown(self._known(asked.job_id))
 
     async def _do_jobs(self, asked: protocol.ListJobs) -> protocol.Jobs:
-        return protocol.Jobs(jobs=tuple([await self._shown(job) for job in self.budget.jobs(asked.limit)]))
+        shown = [await self._shown(job) for job in self.budget.jobs(asked.limit)]
+        return protocol.Jobs(jobs=tuple(msgspec.structs.replace(job, latest=()) for job in shown))
 
     async def _do_stop_job(self, asked: protocol.StopJob) -> Job:
         job = self._known(asked.job_id)
@@ -719,8 +753,9 @@ class Signer(Lifecycle):
             return await self._shown(job)
         if not job.contract:
             raise SignerError("the job is no contract yet", hint="withdraw it instead", code="not-a-contract")
-        self.log.add("stop-asked", job=job.id, why=plain(asked.why))
-        job = self._put(job, stopped_why=asked.why)
+        if job.stopped_why is None:  # whoever asks again is in the log already
+            self.log.add("stop-asked", job=job.id, why=plain(asked.why))
+            job = self._put(job, stopped_why=asked.why)
         contract = await self.agent.contract(job.contract)
         await contract.stop(plain(asked.why, 200) or "a program of the customer stopped it")
         return await self._shown(self._current(job))
@@ -734,13 +769,19 @@ class Signer(Lifecycle):
         if job.state == "needs-consent":
             consent = self.budget.consent(job.consent)
             void = () if consent is None else (msgspec.structs.replace(consent, answer="void"),)
-            self.log.add("withdrawn", job=job.id)
-            return await self._shown(self._put(job, *void, state="withdrawn"))
+            return await self._shown(self._withdrawn(job, *void))
         for order in self.agent.orders():
             if job.order and order.kind == "demand" and lasting_hash(order.message) == job.order:
                 await order.withdraw()
-                return await self._shown(self._put(self._current(job), state="withdrawn"))
+                return await self._shown(self._withdrawn(self._current(job)))
         raise SignerError("the order is being sent", hint="try again in a moment", code="order-under-way")
+
+    def _withdrawn(self, job: KeptJob, *consents: ConsentRecord) -> KeptJob:
+        """The job that was taken back; one that has ended, or become a contract all the same, stays what it is."""
+        if job.is_over or job.contract:
+            return job
+        self.log.add("withdrawn", job=job.id)
+        return self._put(job, *consents, state="withdrawn")
 
     async def _do_recording(self, asked: protocol.ReadRecording) -> protocol.Recording:
         job = self._known(asked.job_id)
@@ -821,12 +862,8 @@ class Signer(Lifecycle):
     async def _consent(self, consent: ConsentRecord) -> protocol.Consent:
         job = self._known(consent.job)
         asked, author = job.request, f"program with the key {_key(job.request)}"
-        lines, more = [(one.topic, one.value) for one in asked.messages], 0
-        if not lines:
-            path = await self.agent.fetch(job.objective)
-            shown, more = await asyncio.to_thread(lambda: message_lines(json_messages(open_objective(path)), author))
-        else:
-            shown, more = message_lines(lines, author)
+        path = await self.agent.fetch(job.objective)
+        shown, more = await asyncio.to_thread(lambda: message_lines(json_messages(open_objective(path)), author))
         description = await self._description(job.model)
         name = self.agent.parts.robots.name(job.robot) if job.robot else ""
         return protocol.Consent(
@@ -862,8 +899,7 @@ class Signer(Lifecycle):
             has_consent=True,
             until=now + job.request.deadline_seconds,
         )
-        await self.budget.sync()
-        self._start(job)
+        await self._begin(job)
         return await self._shown(job)
 
     async def _do_deny(self, asked: protocol.DenyOrder) -> Job:
@@ -930,7 +966,11 @@ class Signer(Lifecycle):
     async def _do_verify_log(self, asked: protocol.VerifyLog) -> protocol.LogVerified:
         await self.budget.sync()
         head, folder = self.budget.log_head(), self.log.folder
-        fault = verify_log(folder, self.agent.address, head) if log_files(folder) else "there is no log"
+        fault = "there is no log"
+        if await asyncio.to_thread(log_files, folder):
+            fault = await asyncio.to_thread(
+                verify_log, folder, self.agent.address, head, latest=lambda: self.budget.log_head().last
+            )
         return protocol.LogVerified(
             holds=not fault,
             entries=head.last - head.first + 1,

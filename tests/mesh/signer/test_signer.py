@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent.hiring import Hiring
+from mesh.base.flood import Rate
 from mesh.errors import ConfigurationError
 from mesh.signer.protocol import SignerError
+from mesh.signer.service import AT_A_TIME, TICK
 from tests.mesh.signer.signers import GOOD, ended, reached
 
 if TYPE_CHECKING:
@@ -120,6 +122,7 @@ async def test_a_job_is_stopped_and_its_refund_frees_no_budget(person: Person, d
         job = await door.order(model=driver.model, messages=[GOOD], cost="1 XRT", idempotency_key="k")
         job = await reached(door, job, lambda one: one.latest)
         assert job.latest[0].value.text == '{"radius":1.0}'
+        assert (await door.jobs())[0].latest == ()
         with pytest.raises(SignerError) as caught:
             await door.withdraw(job.job_id)
         assert caught.value.code == "already-a-contract"
@@ -127,6 +130,45 @@ async def test_a_job_is_stopped_and_its_refund_frees_no_budget(person: Person, d
         assert job.state == "stopped"
         assert await person.spent() == 0
         assert (await door.balance()).hour_left.text == "19 XRT"
+
+
+async def test_a_robot_that_says_much_does_not_keep_others_from_being_heard(person: Person, driver: Driver) -> None:
+    person.allow(driver.model)
+    driver.released.clear()
+    async with person.at_work() as (door, owner, signer):
+        job = await door.order(model=driver.model, messages=[GOOD], cost="1 XRT", idempotency_key="k")
+        job = await reached(door, job, lambda one: one.latest)
+        before = job.revision
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        while job.revision < before + 3:  # the robot says something twenty times a second
+            job = await door.job(job.job_id, revision=job.revision, wait_seconds=5.0)
+        assert loop.time() - began >= 2 * TICK
+        for _ in range(AT_A_TIME):
+            await signer._places.acquire()
+        assert await owner.consents() == ()
+        await door.stop_job(job.job_id)
+        assert signer._places.locked()
+        driver.released.set()
+        for _ in range(AT_A_TIME):
+            signer._places.release()
+        assert (await ended(door, job)).state == "stopped"
+
+
+async def test_many_orders_are_too_many_and_one_that_was_made_is_still_answered(
+    person: Person, driver: Driver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person.allow(driver.model)
+    monkeypatch.setattr("mesh.signer.service.ORDERS", Rate(per_second=0.001, burst=2))
+    order: dict[str, Any] = {"model": driver.model, "messages": [GOOD]}
+    async with person.at_work() as (door, owner, _):
+        job = await door.order(**order, cost="4 XRT", idempotency_key="k")
+        for key, code in (("a", "too-expensive"), ("b", "too-many-requests")):
+            with pytest.raises(SignerError) as caught:
+                await door.order(**order, cost="50 XRT", idempotency_key=key)
+            assert caught.value.code == code
+        assert (await door.order(**order, cost="4 XRT", idempotency_key="k")).job_id == job.job_id
+        assert [one.event for one in (await owner.log()).entries] == ["started", "consent-needed", "refused"]
 
 
 async def test_strangers_text_is_marked_and_made_harmless(person: Person, driver: Driver) -> None:

@@ -98,6 +98,14 @@ def test_a_log_of_which_all_entries_are_signed_anew_ends_elsewhere(
     assert verify_log(folder, SIGNER.address, budget.log_head()) == "entry 5 is another one than the database says"
 
 
+def test_a_log_that_grows_while_it_is_verified_holds(folder: Path, budget: Budget) -> None:
+    log = written(folder, budget)
+    head = budget.log_head()
+    log.add("allowed", cost=5)
+    assert verify_log(folder, SIGNER.address, head, latest=lambda: budget.log_head().last) == ""
+    assert verify_log(folder, SIGNER.address, head).startswith("the log ends with entry 6")
+
+
 def test_a_log_is_bounded_and_its_chain_holds(folder: Path, budget: Budget) -> None:
     log = written(folder, budget, 200, file_bytes=2000, files=3)
     assert len(log_files(folder)) == 3
