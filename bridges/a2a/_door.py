@@ -96,6 +96,8 @@ CANCEL_WAIT: Final = 5.0
 """Seconds for which such a job may go on before the next attempt."""
 UNKNOWN: Final = frozenset({"invalid-request", "unknown-job"})
 """The codes of errors for a job that there is none of."""
+OUTAGES: Final = frozenset({"signer-unavailable", "too-many-requests"})
+"""The codes of errors after which who follows a job asks again."""
 
 
 class A2aDoor(RequestHandler):
@@ -316,7 +318,7 @@ class A2aDoor(RequestHandler):
         yield await self._task(job)
         has_artifact = bool(job.result)
         async for now in self._changes(job):
-            if now.revision == job.revision:
+            if now is job:
                 continue
             if now.result and not has_artifact:
                 has_artifact = True
@@ -334,12 +336,12 @@ class A2aDoor(RequestHandler):
         while not job.is_over:
             try:
                 now = await self._signer.job(job.job_id, revision=job.revision, wait_seconds=WAIT)
-            except SignerUnavailable:
+            except AiraError as error:
+                if error.code not in OUTAGES:
+                    raise error_of(error) from None
                 await asyncio.sleep(1.0)
                 continue
-            except AiraError as error:
-                raise error_of(error) from None
-            if now.revision != job.revision:
+            if now.revision != job.revision or now.is_over:
                 job = now
                 yield job
 

@@ -26,7 +26,6 @@ from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.errors import AiraError
-from mesh.signer.protocol import SignerUnavailable
 
 if TYPE_CHECKING:
     from contextlib import AsyncExitStack
@@ -152,14 +151,14 @@ class Pusher(Lifecycle):
             while self._store.pushes(identity):
                 try:
                     job = await self._signer.job(identity, revision=revision, wait_seconds=WAIT)
-                except SignerUnavailable:
+                except AiraError as error:
+                    if error.code == "unknown-job":
+                        self._store.over(identity)
+                        return
                     await asyncio.sleep(backoff.next_delay() or 0.0)
                     continue
-                except AiraError as error:
-                    log.debug("a job is not pushed any more: %s", error)
-                    self._store.over(identity)
-                    return
-                if job.revision != revision:
+                backoff = Backoff(RETRY)
+                if job.is_over or job.revision != revision:
                     revision = job.revision
                     await asyncio.gather(*(self._post(job, one) for one in self._store.pushes(identity)))
                 if job.is_over:

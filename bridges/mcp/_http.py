@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
 
 import aiohttp
 import jwt
@@ -34,6 +36,7 @@ KEYS_KEPT: Final = 600.0
 """Seconds until the keys of the authorization server are asked for again; at once for a key that is not known."""
 KEYS_PAUSE: Final = 10.0
 """Seconds between two such requests: anybody can name a key that is not known."""
+MOST_KEYS: Final = 100
 LARGEST_DOCUMENT: Final = 1 << 18
 """Bytes of what the authorization server says."""
 
@@ -129,7 +132,7 @@ class IssuedTokens(TokenVerifier):
                 audience=self._url,
                 options={"require": ["exp", "iss", "aud"]},
             )
-        except (jwt.PyJWTError, LookupError, ValueError) as error:
+        except (jwt.PyJWTError, LookupError, TypeError, ValueError) as error:
             log.debug("a token is refused: %s", type(error).__name__)
             return None
         return AccessToken(
@@ -144,13 +147,16 @@ class IssuedTokens(TokenVerifier):
 
     async def _key(self, name: str) -> Any:
         """The key of that name. Raises `KeyError`."""
+        loop = asyncio.get_running_loop()
+        if name in self._keys and loop.time() - self._asked <= KEYS_KEPT:
+            return self._keys[name]  # also while somebody waits for a key that is not known
         async with self._asking:
-            now = asyncio.get_running_loop().time()
+            now = loop.time()
             if now - self._asked > (KEYS_PAUSE if name not in self._keys else KEYS_KEPT):
                 self._asked = now
                 try:
                     self._keys = await self._fetch()
-                except (aiohttp.ClientError, OSError, TimeoutError, InvalidData, LookupError, TypeError) as error:
+                except (aiohttp.ClientError, OSError, InvalidData, LookupError, TypeError, ValueError) as error:
                     fields = log_event("oauth-keys-unavailable", code=type(error).__name__)
                     log.warning("the authorization server gives no keys: %s", type(error).__name__, extra=fields)
         return self._keys[name]
@@ -165,18 +171,27 @@ class IssuedTokens(TokenVerifier):
                 raise LookupError("another issuer")
             listed = (await _document(session, str(about["jwks_uri"])))["keys"]
         keys = {}
-        for each in listed[:100]:
-            if each.get("alg", "ES256") in ALGORITHMS and each.get("use", "sig") == "sig" and each.get("kid"):
-                keys[str(each["kid"])] = jwt.PyJWK(each, each.get("alg")).key
+        for each in listed[:MOST_KEYS]:
+            if not (isinstance(each, dict) and each.get("kid") and each.get("use", "sig") == "sig"):
+                continue
+            if each.get("alg", "ES256") in ALGORITHMS:
+                with suppress(jwt.PyJWTError):  # it may have keys of kinds that are not known here
+                    keys[str(each["kid"])] = jwt.PyJWK(each, each.get("alg")).key
         return keys
 
 
 async def _document(session: aiohttp.ClientSession, url: str) -> dict[str, Any]:
     """A JSON object; an empty one if there is none. Only over TLS, or from this machine."""
-    if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
+    parts = urlsplit(url)
+    if parts.scheme != "https" and parts.hostname not in ("127.0.0.1", "localhost"):
         raise LookupError("not over TLS")
     async with session.get(url, allow_redirects=False) as response:
         if response.status != 200:
             return {}
-        found = decode_json(await response.content.read(LARGEST_DOCUMENT))
+        data = b""
+        async for part in response.content.iter_any():
+            data += part
+            if len(data) > LARGEST_DOCUMENT:
+                raise LookupError("too long")
+        found = decode_json(data)
         return found if isinstance(found, dict) else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,6 +12,7 @@ from mesh.recording import shown_value
 from mesh.signer import protocol
 from mesh.signer._log import time_text
 from mesh.signer.protocol import StrangersText
+from schemas.model import PRICE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -59,7 +61,7 @@ def found_robot(robot: Robot, model: ModelDescription | None, *, is_allowed: boo
         name=strangers(robot.name, author),
         sentence=strangers(robot.about, author),
         models=(protocol.RobotModel(cid=robot.model, title=title),) if robot.model else (),
-        price=plain(robot.price, LONGEST_NAME),
+        price=robot.price if re.fullmatch(PRICE, robot.price) else "",  # it may write anything there
         state=robot.state,
         queue=robot.queue,
         wait_seconds=robot.wait,

@@ -1115,10 +1115,12 @@ def no_robot(declined: list[tuple[str, str, str]]) -> SignerFailure:
     """Why no robot got a job: who declined it, with which codes."""
     codes = "; ".join(f"{robot}: {_word(code)}" for robot, code, _ in declined[:5])
     said = next((strangers(detail, f"robot {robot}") for robot, _, detail in declined if detail), None)
+    is_unpriced = any(code == "no-price" for _, code, _ in declined)
+    named = "name the address of a robot without a price in `robot`, " if is_unpriced else ""
     return SignerFailure(
         code="no-robot-fits",
         message=f"no robot takes the job ({codes or 'none of this model answers'})",
-        next="see quote; order for more, or from another robot",
+        next=f"see quote; {named}order for more, or from another robot",
         from_strangers=said,
     )
 

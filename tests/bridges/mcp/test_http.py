@@ -16,11 +16,11 @@ import jwt
 import pytest
 from aiohttp import web
 from cryptography.hazmat.primitives import serialization
-from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from bridges.mcp._door import McpDoor
-from bridges.mcp._http import PATH, HttpOptions, application
+from bridges.mcp._http import PATH, HttpOptions, IssuedTokens, _document, application
 from mesh.base.asgi_server import AsgiServer
 from mesh.base.door import DoorLimits
 from mesh.base.http_server import HttpServer
@@ -29,6 +29,7 @@ from mesh.errors import ConfigurationError, PortUnavailable
 from mesh.signer.client import SignerClient
 from mesh.signer.protocol import LARGEST_REQUEST
 from tests.bridges.mcp.clients import http_client
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -188,14 +189,25 @@ class AuthorizationServer:
         self.key = ec.generate_private_key(ec.SECP256R1())
         self.issuer = ""
         self.asked = 0
+        self.pause = 0.05
+        """Seconds between two parts of an answer."""
 
     async def about(self, request: web.Request) -> web.Response:
         return web.json_response({"issuer": self.issuer, "jwks_uri": f"{self.issuer}/keys"})
 
-    async def keys(self, request: web.Request) -> web.Response:
+    async def keys(self, request: web.Request) -> web.StreamResponse:
         self.asked += 1
         public = json.loads(jwt.algorithms.ECAlgorithm.to_jwk(self.key.public_key()))
-        return web.json_response({"keys": [public | {"kid": "one", "alg": "ES256", "use": "sig"}]})
+        other = json.loads(jwt.algorithms.RSAAlgorithm.to_jwk(RSA.public_key()))
+        unknown = {"kty": "EC", "crv": "P-0", "x": "AA", "y": "AA", "kid": "unknown", "alg": "ES256"}
+        known = [public | {"kid": "one", "alg": "ES256", "use": "sig"}, other | {"kid": "rsa", "alg": "RS256"}]
+        whole = json.dumps({"keys": [unknown, "no key", *known]}).encode()
+        answer = web.StreamResponse()
+        await answer.prepare(request)
+        for part in (whole[:40], whole[40:]):
+            await answer.write(part)
+            await asyncio.sleep(self.pause)
+        return answer
 
     def token(self, *, key: Any = None, algorithm: str = "ES256", kid: str = "one", **claims: Any) -> str:
         body = {"iss": self.issuer, "aud": AUDIENCE, "exp": time.time() + 60, "sub": "ann", "scope": "work"} | claims
@@ -203,6 +215,7 @@ class AuthorizationServer:
 
 
 AUDIENCE = "https://robots.example/mcp"
+RSA = rsa.generate_private_key(65537, 2048)
 
 
 @asynccontextmanager
@@ -241,6 +254,7 @@ async def test_other_tokens_are_not_taken() -> None:
             "by another key": issuing.token(key=other),
             "by a key that is not known": issuing.token(kid="two"),
             "by the public key as a secret": issuing.token(key=public, algorithm="HS256"),
+            "by the name of a key of another kind": issuing.token(kid="rsa"),
             "unsigned": issuing.token(key="", algorithm="none"),
             "no token": "x.y.z",
         }
@@ -248,3 +262,26 @@ async def test_other_tokens_are_not_taken() -> None:
             async with posting(url, Authorization=f"Bearer {token}") as response:
                 assert response.status == 401, why
         assert issuing.asked == 1, "keys that are not known are not asked for again and again"
+
+
+async def test_who_has_a_token_does_not_wait_for_those_who_name_keys_that_are_not_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("bridges.mcp._http.KEYS_PAUSE", 0.0)
+    async with authorization_server() as issuing:
+        tokens = IssuedTokens(issuing.issuer, AUDIENCE)
+        assert await tokens.verify_token(issuing.token()) is not None
+        issuing.pause = 60.0
+        stranger = asyncio.create_task(tokens.verify_token(issuing.token(kid="two")))
+        await until(lambda: issuing.asked == 2)
+        assert await tokens.verify_token(issuing.token()) is not None
+        assert not stranger.done()
+        stranger.cancel()
+        issuing.pause = 0.0
+
+
+@pytest.mark.parametrize("url", ["http://localhost.example/keys", "http://127.0.0.1.example/", "http://[::1/", "keys"])
+async def test_keys_come_over_tls_only(url: str) -> None:
+    async with aiohttp.ClientSession() as session:
+        with pytest.raises((LookupError, ValueError)):
+            await _document(session, url)
