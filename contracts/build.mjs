@@ -31,6 +31,7 @@ const wanted = {
     LyingToken: tests,
     CallingToken: tests,
     DollarToken: tests,
+    VersionedToken: tests,
   },
   "fixtures/Crowd.sol": { Crowd: tests },
   "fixtures/Validators.sol": { OneSigner: tests, BrokenValidator: tests },

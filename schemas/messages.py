@@ -333,7 +333,8 @@ class Permit(_Message, frozen=True, kw_only=True):
     A promisee publishes one beside a demand, for the factory, so that it needs no transaction and no ether. It replaces
     the allowance, and is for no particular demand. `value` is in the token's smallest unit, `nonce` the token's
     `nonces(owner)`, `deadline` the last second (Unix time) in which the token takes it, `domain` the token's
-    `DOMAIN_SEPARATOR`: 64 hexadecimal digits. Whether nonce and domain are the token's, only the chain can tell.
+    `DOMAIN_SEPARATOR`: 64 hexadecimal digits. Whether nonce and domain are the token's, only the chain can tell: the
+    signature covers the domain, not `token`.
     """
 
     kind: ClassVar[MarketKind] = "permit"

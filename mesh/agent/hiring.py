@@ -113,7 +113,7 @@ class Hiring:
             lighthouse = await self._parts.chain.lighthouses.get(self._parts.settings.lighthouse_contract)
             providers = [*lighthouse.stakes][:PROVIDERS]
             signer, session = self._parts.signer, self._parts.network.session
-            permit = self._parts.chain.permits.of(demand.token, signer.address)
+            permit = self._parts.chain.permits.own(demand.token)
             pair = OrderPair(
                 demand=SendDemand.of(demand),
                 offer=SendOffer.of(offer),

@@ -460,7 +460,7 @@ class Trader(Lifecycle):
         await self._allowances.ensure(order, self._chain.funds.cost_of(order.signed), permit=permit)
 
     def _permit_for(self, demand: Demand) -> Permit | None:
-        return self._chain.permits.of(demand.token, self._address)
+        return self._chain.permits.own(demand.token)
 
     async def _cover_and_send(self, order: TradedOrder) -> None:
         chain = self._chain

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import BoundedDict
+from mesh.chain._abi import decode
 from mesh.chain.errors import NoContracts, Reverted
-from schemas import ZERO_ADDRESS, Permit
+from schemas import ZERO_ADDRESS, Permit, address_bytes, keccak256
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -19,13 +19,17 @@ if TYPE_CHECKING:
 
 LIFETIME: Final = 7 * 86_400
 """Seconds for which a permit is valid that is signed here: longer than orders wait."""
-KNOWN: Final = 8192
-"""Permits of others that are remembered."""
+OWNERS: Final = 2048
+"""Accounts whose permits are remembered."""
 PER_OWNER: Final = 8
 """Tokens of one owner for which permits are remembered."""
 TOKEN_GAS: Final = 100_000
 """Gas for each question to a token."""
 _WORD: Final = 32
+LONGEST_NAME: Final = 5 * _WORD
+"""Bytes of a token's name or version as contracts return it, of which 96 are the text."""
+_VERSION: Final = bytes.fromhex("54fd4d50")
+_DOMAIN_TYPE: Final = keccak256(b"EIP712Domain(string name,string version,uint256 chainId,address verifyingContract)")
 
 PermitArguments = tuple[int, int, int, bytes, bytes]
 
@@ -42,23 +46,28 @@ def permit_arguments(permit: Permit) -> PermitArguments:
 
 
 class Permits:
-    """Signs the account's permits for the factory, and remembers the last one of each owner and token."""
+    """Signs the account's permits for the factory, and remembers the last one of each owner and token.
+
+    A permit is for the token whose domain it has: its signature covers that, and not the token that it names.
+    """
 
     def __init__(self, contracts: Contracts, *, clock: Clock = SYSTEM_CLOCK) -> None:
         self._contracts, self._node, self._clock = contracts, contracts.node, clock
-        self._known: BoundedDict[tuple[str, str], Permit] = BoundedDict(KNOWN)
-        """By token and owner."""
-        self._domains: BoundedDict[str, str] = BoundedDict(KNOWN)
+        self._known: BoundedDict[str, dict[str, Permit]] = BoundedDict(OWNERS)
+        """By owner and domain."""
+        self._signed: BoundedDict[str, Permit] = BoundedDict(OWNERS)
+        """The account's own, by token."""
 
     def __len__(self) -> int:
-        return len(self._known)
+        return sum(map(len, self._known.values()))
 
     def __contains__(self, permit: object) -> bool:
-        return permit in self._known.values()
+        return permit in [*self]
 
     def __iter__(self) -> Iterator[Permit]:
         """The permits that are remembered and not expired."""
-        return iter([permit for permit in self._known.values() if not self._is_over(permit)])
+        known = [permit for permits in self._known.values() for permit in permits.values()]
+        return iter([permit for permit in known if not self._is_over(permit)])
 
     def note(self, permit: Permit) -> bool:
         """Remember a signed permit, whose signer is its owner; whether it is better than what was known.
@@ -68,37 +77,48 @@ class Permits:
         is_taken = self._contracts.version.takes_permits and permit.spender == self._contracts.factory
         if not is_taken or self._is_over(permit):
             return False
-        key = permit.token, permit.owner
-        known = self._known.get(key)
-        if known is not None and _rank(known) >= _rank(permit):
+        permits = self._known.get(permit.owner, {})
+        known = permits.get(permit.domain)
+        if len(permits) >= PER_OWNER if known is None else _rank(known) >= _rank(permit):
             return False
-        if known is None and Counter(owner for _, owner in self._known)[permit.owner] >= PER_OWNER:
-            return False
-        self._known[key] = permit
+        self._known[permit.owner] = permits | {permit.domain: permit}
         return True
 
-    def of(self, token: str, owner: str) -> Permit | None:
-        """The last known permit of an owner for a token, unless it is expired. The token may have taken it already."""
-        permit = self._known.get((token, owner))
+    def has_any_of(self, owner: str) -> bool:
+        """Whether a permit of this owner is known, for whatever token."""
+        return owner in self._known
+
+    def of(self, owner: str, domain: bytes | None) -> Permit | None:
+        """The last known permit of an owner for the token with this domain, unless it is expired.
+
+        The token may have taken it already.
+        """
+        permit = None if domain is None else self._known.get(owner, {}).get(domain.hex())
+        return None if permit is None or self._is_over(permit) else permit
+
+    def own(self, token: str) -> Permit | None:
+        """The account's last permit for a token (address), unless it is expired. The token may have taken it."""
+        permit = self._signed.get(token)
         return None if permit is None or self._is_over(permit) else permit
 
     async def sign(self, token: str, value: int) -> Permit | None:
         """A permit of the account, that the factory may take `value` of a token (address), and remember it.
 
-        None if the token has no permits of EIP-2612, or refuses this one. Raises `NodeUnreachable`, `RequestRefused`.
+        None if the token has no permits of EIP-2612, or refuses this one; also if its domain is not made of its own
+        name, version (`1` if it tells none) and address, since it could be that of a token which is worth more.
+
+        Raises `NodeUnreachable`, `RequestRefused`.
         """
         contracts = self._contracts
         if not contracts.version.takes_permits:
             return None
         account = contracts.signing().account
         functions, owner = self._node.contract("XRT", token), account.address
+        asked = functions.name().data, _VERSION, functions.DOMAIN_SEPARATOR().data, functions.nonces(owner).data
         try:
-            domain, nonce = await self._node.call_all(
-                [(token, functions.DOMAIN_SEPARATOR().data), (token, functions.nonces(owner).data)],
-                gas=TOKEN_GAS,
-                most=_WORD,
-            )
-            if domain is None or nonce is None or len(domain) != _WORD or len(nonce) != _WORD:
+            answers = await self._node.call_all([(token, one) for one in asked], gas=TOKEN_GAS, most=LONGEST_NAME)
+            name, version, domain, nonce = (answer or b"" for answer in answers)
+            if len(nonce) != _WORD or domain != _domain_of(name, version, self._node.chain_id, token):
                 return None
             permit = account.signer.sign(
                 Permit(
@@ -115,7 +135,8 @@ class Permits:
             await self._node.call({"to": token, "data": "0x" + call.data.hex()})
         except (Reverted, NoContracts):
             return None
-        self._known[token, owner] = permit
+        self._signed[token] = permit
+        self._known[owner] = self._known.get(owner, {}) | {permit.domain: permit}
         return permit
 
     async def needed_for(self, demand: Verified[Demand]) -> Permit | None:
@@ -124,23 +145,41 @@ class Permits:
         Raises `NodeUnreachable`, `RequestRefused`.
         """
         order, owner = demand.message, demand.signer
-        permit = self.of(order.token, owner)
-        if permit is None:
+        if not self.has_any_of(owner):
             return None
         functions, fee = self._node.contract("XRT", order.token), fee_for_carrying(order)
+        asked = (
+            functions.allowance(owner, self._contracts.factory),
+            functions.nonces(owner),
+            functions.DOMAIN_SEPARATOR(),
+        )
         try:
-            allowed, nonce = await self._node.read_all(
-                (functions.allowance(owner, self._contracts.factory), functions.nonces(owner)), block="latest"
-            )
+            answers = await self._node.call_all([(order.token, one.data) for one in asked], gas=TOKEN_GAS, most=_WORD)
         except (Reverted, NoContracts):
             return None
-        if nonce == permit.nonce:
-            return permit if fee or allowed < order.cost else None
+        allowed, nonce, domain = answers
+        permit = self.of(owner, domain)
+        if permit is None or allowed is None or nonce is None:
+            return None
+        if int.from_bytes(nonce) == permit.nonce:
+            return permit if fee or int.from_bytes(allowed) < order.cost else None
         # Somebody has brought it to the token, so the allowance stands; it still says that its owner pays the fee.
-        return permit if fee and nonce == permit.nonce + 1 else None
+        return permit if fee and int.from_bytes(nonce) == permit.nonce + 1 else None
 
     def _is_over(self, permit: Permit) -> bool:
         return permit.deadline <= self._clock.time()
+
+
+def _domain_of(name: bytes, version: bytes, chain_id: int, token: str) -> bytes | None:
+    """The domain (EIP-712) of a token that answers with this name and version; None if it tells no name."""
+    try:
+        (named,) = decode(["string"], name)
+        (versioned,) = decode(["string"], version) if version else ("1",)
+    except ValueError:
+        return None
+    texts = [keccak256(text.encode()) for text in (named, versioned)]
+    words = chain_id.to_bytes(_WORD, "big"), bytes(12) + address_bytes(token)
+    return keccak256(b"".join((_DOMAIN_TYPE, *texts, *words)))
 
 
 def _rank(permit: Permit) -> tuple[int, int, int]:

@@ -179,15 +179,27 @@ class Funds:
 
     async def _read(self, batch: Sequence[Holding]) -> list[Funding | None]:
         spender = bytes.fromhex(self._contracts.factory[2:])
-        calls, permits = [], [self._permits.of(*holding) for holding in batch]
-        for (token, holder), permit in zip(batch, permits, strict=True):
+        calls = []
+        for token, holder in batch:
             account = bytes.fromhex(holder[2:])
-            asked = [(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)]
-            calls.append(asked if permit is None else [*asked, (token, _NONCES + account), (token, _DOMAIN)])
+            calls.append([(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)])
+            if self._permits.has_any_of(holder):
+                calls[-1] += [(token, _NONCES + account), (token, _DOMAIN)]
         self.requests += 1
         answers = await asked_together(self._contracts.node, calls, most=_WORD)
-        pairs = zip(answers, permits, strict=True)
-        return [None if one is None else _permitted(_funding(*one[:2]), permit, *one[2:]) for one, permit in pairs]
+        return [
+            None if one is None else self._permitted(holder, _funding(*one[:2]), *one[2:])
+            for (_, holder), one in zip(batch, answers, strict=True)
+        ]
+
+    def _permitted(
+        self, holder: str, funding: Funding, nonce: bytes | None = None, domain: bytes | None = None
+    ) -> Funding:
+        """Funding with the holder's permit as the allowance, if the token takes it by its nonce and domain."""
+        permit = self._permits.of(holder, domain)
+        if permit is None or funding == NO_TOKEN or nonce != permit.nonce.to_bytes(_WORD, "big"):
+            return funding
+        return funding._replace(allowance=max(funding.allowance, permit.value))
 
 
 async def asked_together(
@@ -216,15 +228,6 @@ def _funding(balance: bytes | None, allowance: bytes | None) -> Funding:
     if balance is None or allowance is None or len(balance) != _WORD or len(allowance) != _WORD:
         return NO_TOKEN
     return Funding(int.from_bytes(balance), int.from_bytes(allowance))
-
-
-def _permitted(funding: Funding, permit: Permit | None, *told: bytes | None) -> Funding:
-    """Funding with a permit as the allowance, if the token takes it by what it told of nonce and domain."""
-    if permit is None or funding == NO_TOKEN:
-        return funding
-    if told != (permit.nonce.to_bytes(_WORD, "big"), bytes.fromhex(permit.domain)):
-        return funding
-    return funding._replace(allowance=max(funding.allowance, permit.value))
 
 
 TOKEN_UNREADABLE: Final = "TokenUnreadable"

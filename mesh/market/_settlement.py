@@ -704,7 +704,8 @@ class Settlement:
             partial(parts.chain.liabilities.data_gas, demand.message, offer.message), outages=parts.lookups
         )
         permit = await self._permit(match)
-        carried = 0 if permit is None or permit.token != parts.chain.xrt else fee_for_carrying(demand.message)
+        is_xrt = demand.message.token == parts.chain.xrt
+        carried = 0 if permit is None or not is_xrt else fee_for_carrying(demand.message)
         if parts.free.lacking(match, data_gas=data_gas, carried=carried) and not await parts.free.take(match):
             self._decline(match, data_gas)
             return
