@@ -90,7 +90,9 @@ DOWNLOADED: tuple[Recipe, ...] = (
     CONTAINERS,
     BASE,
 )
-COMPILED: tuple[Recipe, ...] = (ROUTER, ROS2, GETH, KUBO_DAEMON)
+COMPILED: tuple[Recipe, ...] = (ROUTER, ROS2)
+# Beside the crates, whose last steps use one core.
+COMPILED_GO: tuple[Recipe, ...] = (GETH, KUBO_DAEMON)
 
 
 class PeerMissing(Exception):

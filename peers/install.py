@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from peers.catalog import COMPILED, DOWNLOADED, PEERS, PeerMissing
+from peers.catalog import COMPILED, COMPILED_GO, DOWNLOADED, PEERS, PeerMissing
 from peers.recipes import cache_folder
 from peers.running import InstallFailed, Runner
 
@@ -92,4 +92,4 @@ def _alone() -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    sys.exit(main(COMPILED, DOWNLOADED))
+    sys.exit(main(COMPILED, COMPILED_GO, DOWNLOADED))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from peers import install, where
-from peers.catalog import BASE, CHAIN, COMPILED, DOWNLOADED, KUBO, PEERS, ROS2, ROUTER, PeerMissing, locate
+from peers.catalog import BASE, CHAIN, COMPILED, COMPILED_GO, DOWNLOADED, KUBO, PEERS, ROS2, ROUTER, PeerMissing, locate
 from peers.recipes import CargoRecipe, PipRecipe
 from peers.running import Runner
 
@@ -35,7 +35,7 @@ def test_installing_continues_when_a_recipe_fails_and_reports_it_at_the_end(
         monkeypatch.setenv(name, value)
     # Each with pip makes an environment, which takes seconds: one of them is enough.
     downloaded = [recipe for recipe in DOWNLOADED if recipe is KUBO or not isinstance(recipe, PipRecipe)]
-    code, said = install.main(COMPILED, downloaded), capsys.readouterr()
+    code, said = install.main(COMPILED, COMPILED_GO, downloaded), capsys.readouterr()
     lines = {line.split()[0]: line for line in said.out.splitlines() if line and line.split()[0] in PEERS}
     assert set(lines) == set(PEERS)
     assert "MISSING  npm is not installed" in lines["anvil"]

@@ -48,7 +48,10 @@ class EngineFailed(Exception):
 
 
 class DockerDaemon(Server):
-    """A `dockerd` whose images, containers and networks are in its folder. Needs root."""
+    """A `dockerd` whose images, containers and networks are in its folder. Needs root.
+
+    It ends with its containers when the process that started it ends, however that is.
+    """
 
     name = "docker"
 
@@ -70,7 +73,13 @@ class DockerDaemon(Server):
             "bridge": "none",
             "default-address-pool": f"base={NETWORKS},size=24",
         }
-        return [self._program, *(f"--{name}={value}" for name, value in options.items())]
+        return [
+            "setpriv",
+            "--pdeathsig",
+            "TERM",
+            self._program,
+            *(f"--{name}={value}" for name, value in options.items()),
+        ]
 
     def is_ready(self) -> bool:
         return "API listen on" in self.log()

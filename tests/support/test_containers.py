@@ -1,19 +1,21 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import subprocess
-from typing import TYPE_CHECKING
+import sys
+from pathlib import Path
 
 import pytest
 
 from peers.recipes import CERTIFICATES
 from tests.support.containers import BASE_IMAGE, Engine, engine
 from tests.support.peers import require
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from tests.support.waiting import wait_until
 
 __all__ = ["engine"]
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
@@ -23,6 +25,29 @@ __all__ = ["engine"]
 def test_the_requirements_of_containers_are_installed(name: str, words: str) -> None:
     command = [str(require(name)), "--version"]
     assert subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.startswith(words)
+
+
+RUNS_DOCKER = """
+import time
+from tests.support.containers import DockerDaemon
+daemon = DockerDaemon().__enter__()
+print(daemon.folder, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.compose
+@pytest.mark.usefixtures("engine")  # which takes back at the end what a daemon has changed in the firewall
+def test_a_daemon_ends_with_the_run_that_started_it() -> None:
+    command = [sys.executable, "-c", RUNS_DOCKER]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as run:
+        assert run.stdout is not None
+        folder = Path(run.stdout.readline().strip())
+        running = (folder / "pid").exists()
+        run.kill()
+    assert running
+    wait_until(lambda: not (folder / "pid").exists(), what="the end of the daemon", seconds=60)
+    shutil.rmtree(folder)
 
 
 @pytest.mark.compose
