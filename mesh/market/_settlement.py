@@ -229,11 +229,12 @@ class LiabilityEvents:
             self._parts.earnings.mined(event.tx)
         if created is not None:
             self._take_created(*created, block)
+            self.refunds.end_reverted(created[0].address)
         elif isinstance(event, Finalized):
             self.open.pop(event.liability, None)
             self._parts.orders.finalized(event.liability, block)
-            if self.refunds.ended(event.liability):
-                self._parts.store.forget_permitted(event.liability)
+            self.refunds.ended(event.liability)
+            self._parts.store.forget_permitted(event.liability)
 
     async def on_revert(self, event: ChainEvent) -> None:
         """Wait for the others: the orders' versions come first."""
@@ -253,7 +254,8 @@ class LiabilityEvents:
                 self._again += self._parts.orders.reverted(event.liability, Demand, Offer)
             elif isinstance(event, Finalized):
                 self._parts.earnings.reverted(event.tx)
-                self.refunds.end_reverted(event.liability)
+                if self.refunds.end_reverted(event.liability):
+                    self._parts.store.keep_permitted(event.liability)
                 self._again += self._parts.orders.reverted(event.liability, Result)
 
     async def on_head(self, block: int) -> None:

@@ -61,17 +61,18 @@ class DueRefunds:
         if _has_cost(liability):
             self.watch(liability.address)
 
-    def ended(self, address: str) -> bool:
-        """A contract has ended, or was reverted; whether it was watched."""
-        if self._look_at.pop(address, None) is None:
-            return False
-        self._ended[address] = None
-        return True
+    def ended(self, address: str) -> None:
+        """A contract has ended, or was reverted."""
+        if self._look_at.pop(address, None) is not None:
+            self._ended[address] = None
 
-    def end_reverted(self, address: str) -> None:
-        """A reorganisation reverted the end of a contract."""
-        if address in self._ended:
-            self.watch(address)
+    def end_reverted(self, address: str) -> bool:
+        """A contract exists whose end, or whose creation, a reorganisation has reverted; whether it was watched."""
+        if address not in self._ended:
+            return False
+        del self._ended[address]
+        self.watch(address)
+        return True
 
     async def run(self) -> None:
         """Look after each block, until cancelled."""

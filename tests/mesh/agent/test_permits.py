@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from contextlib import asynccontextmanager
+import sqlite3
+from contextlib import asynccontextmanager, closing
 from typing import TYPE_CHECKING, Literal
 
 import pytest
@@ -102,11 +103,20 @@ async def test_the_provider_takes_back_what_nobody_earned(impatient: Place, tmp_
             if not is_restarted:
                 await place.node.mine(REFUND_DELAY)
                 await until_found(lambda: is_back(place, person), what="the cost")
+                await until(lambda: kept(tmp_path / "provider.sqlite") == 0)
         if is_restarted:
+            assert kept(tmp_path / "provider.sqlite") == 1
             await place.node.mine(REFUND_DELAY)
             async with place.provider(store=tmp_path / "provider.sqlite"):
                 await until_found(lambda: is_back(place, person), what="the cost")
+                await until(lambda: kept(tmp_path / "provider.sqlite") == 0)
         assert (await contract.outcome()).code == "no-result"
+
+
+def kept(store: Path) -> int:
+    """How many contracts a provider's file has that were created with a permit and are open."""
+    with closing(sqlite3.connect(store)) as database:
+        return int(database.execute("SELECT count(*) FROM permitted").fetchone()[0])
 
 
 async def is_back(place: Place, person: Agent) -> bool:
