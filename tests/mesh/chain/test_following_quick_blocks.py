@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+import mesh.chain.following
 from mesh.chain import Account, Approval, Chain, deploy
-from mesh.chain.following import REPLACED_SECONDS, Reorganisation
+from mesh.chain.following import Reorganisation
 from mesh.dev._embedded import EmbeddedChain, EmbeddedProvider
 from mesh.settings.chains import CHAINS
 from tests.mesh.chain.conftest import QUICK
@@ -29,7 +30,10 @@ PER_LOOK = 6
 
 
 class Wire(EmbeddedProvider):
-    """Counts calls, and leaves the newest `behind` blocks' logs out, as a machine does that is behind."""
+    """Counts calls, and leaves the newest `behind` blocks' logs out, as a machine does that is behind.
+
+    Calls for the latest block are not counted: the slower the machine, the more there are.
+    """
 
     behind = 0
     refuses_ranges = False
@@ -39,7 +43,8 @@ class Wire(EmbeddedProvider):
         self.asked: Counter[str] = Counter()
 
     async def make_request(self, method: str, params: Any) -> Any:
-        self.asked[method] += 1
+        if params[:1] != ["latest"]:
+            self.asked[method] += 1
         if method == "eth_getLogs" and "fromBlock" in params[0]:
             if self.refuses_ranges:
                 return {"jsonrpc": "2.0", "id": 1, "error": {"code": -32005, "message": "range too large"}}
@@ -66,7 +71,7 @@ class Followed:
                 self._news.set()
 
     async def until(self, fits: Callable[[], bool]) -> None:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(60):
             while not fits():
                 self._news.clear()
                 await self._news.wait()
@@ -178,7 +183,8 @@ async def test_a_node_that_refuses_ranges_is_read_block_by_block(followed: Follo
     assert followed.approved == [9]
 
 
-async def test_an_event_of_a_replaced_block_is_reverted_at_the_next_look() -> None:
+async def test_an_event_of_a_replaced_block_is_reverted_at_the_next_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mesh.chain.following, "REPLACED_SECONDS", float("inf"))
     with Anvil() as anvil:
         account = Account(anvil.private_keys[0])
         await deploy(anvil.url, account)
@@ -192,9 +198,8 @@ async def test_an_event_of_a_replaced_block_is_reverted_at_the_next_look() -> No
             await followed.mine()
             assert followed.approved == [3, 4]
             await chain.node.request("anvil_reorg", PER_LOOK + 2, [])
-            async with asyncio.timeout(REPLACED_SECONDS / 2):
-                await followed.mine()
-                await followed.until(lambda: followed.approved == [3])
+            await followed.mine()
+            await followed.until(lambda: followed.approved == [3])
             await followed.approve(5)
             await followed.mine()
             assert followed.approved == [3, 5]
