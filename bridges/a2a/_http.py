@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hmac
 import json
-import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from a2a.server.request_handlers.response_helpers import build_error_response
 from a2a.server.routes import create_jsonrpc_routes, create_rest_routes
 from a2a.utils.constants import AGENT_CARD_WELL_KNOWN_PATH
+from a2a.utils.errors import ContentTypeNotSupportedError
 from google.protobuf.json_format import MessageToDict
 from starlette.applications import Starlette
 from starlette.responses import JSONResponse
@@ -88,6 +89,9 @@ class Guarded:
         if not length.isdigit() or len(length) > 12 or int(length) > LARGEST_REQUEST:
             await _refuse(send, 413, f"a request has at most {LARGEST_REQUEST} bytes", (b"connection", b"close"))
             return
+        if scope["path"] == "/" and not headers.get(b"content-type", b"").lower().startswith(b"application/json"):
+            await _answer(send, 200, build_error_response(None, ContentTypeNotSupportedError("send application/json")))
+            return
         arrived = 0
 
         async def bounded() -> Message:
@@ -100,11 +104,11 @@ class Guarded:
 
 
 async def _refuse(send: Send, status: int, text: str, header: tuple[bytes, bytes]) -> None:
-    body = json.dumps({"error": {"code": status, "message": text}}).encode()
-    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode()), header]
+    await _answer(send, status, {"error": {"code": status, "message": text}}, header)
+
+
+async def _answer(send: Send, status: int, answer: dict[str, Any], *more: tuple[bytes, bytes]) -> None:
+    body = json.dumps(answer).encode()
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode()), *more]
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})
-
-
-logging.getLogger("a2a").setLevel(logging.CRITICAL)
-"""What clients send that is refused is no warning for the operator, and the SDK would log its text."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import stat
 import sys
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,15 +24,15 @@ _TOO_LONG: Final = "a message that is too long\n"
 
 
 async def serve_stdio(server: Server[Any]) -> None:
-    """Serve the client until it closes stdin. Raises `InputError` if stdin is a file."""
-    loop = asyncio.get_running_loop()
-    reader = asyncio.StreamReader(limit=LONGEST_LINE)
-    try:
-        await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    except ValueError:
+    """Serve the client until it closes stdin. Raises `InputError` if stdin is a file, or /dev/null."""
+    kind = os.fstat(sys.stdin.fileno()).st_mode
+    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):
         raise InputError(
             "stdin is no pipe", hint="an MCP client starts this command; for HTTP use --http", code="stdin-unusable"
-        ) from None
+        )
+    loop = asyncio.get_running_loop()
+    reader = asyncio.StreamReader(limit=LONGEST_LINE)
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
     lines: Any = _lines(reader)  # the SDK iterates over it, and asks no more of a file
     async with stdio_server(stdin=lines) as (incoming, outgoing):
         await server.run(incoming, outgoing, server.create_initialization_options())

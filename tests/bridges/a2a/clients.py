@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import uuid
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from bridges.a2a._store import TaskStore
 from mesh.base.asgi_server import AsgiServer
 from mesh.base.door import DoorLimits
 from mesh.signer.client import SignerClient
+from tests.support.commands import AIRA
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -33,18 +35,50 @@ AUTHORIZED = {"Authorization": f"Bearer {TOKEN}", "A2A-Version": "1.0", "Content
 
 
 @dataclass
-class Served:
-    """A door that is served."""
+class Reached:
+    """A door that is served somewhere."""
 
     url: str
-    key: CardKey
-    pusher: Pusher
 
     @asynccontextmanager
     async def client(self, *, streaming: bool = True, binding: str = "JSONRPC") -> AsyncIterator[Client]:
         async with httpx.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"}, timeout=90) as http:
             config = ClientConfig(httpx_client=http, streaming=streaming, supported_protocol_bindings=[binding])
             yield await ClientFactory(config).create_from_url(self.url)
+
+
+@dataclass
+class Served(Reached):
+    """A door that is served in this process."""
+
+    key: CardKey
+    pusher: Pusher
+
+
+def token_file(state: Path) -> Path:
+    """The private file with the token, in a folder for a door's state."""
+    state.mkdir(mode=0o700, exist_ok=True)
+    path = state / "token"
+    path.write_text(TOKEN)
+    path.chmod(0o600)
+    return path
+
+
+@asynccontextmanager
+async def process(socket: Path, state: Path) -> AsyncIterator[Reached]:
+    """`aira a2a` in a process of its own, which is killed in the end."""
+    command = [*AIRA, "a2a", "--http", "127.0.0.1:0", "--socket", str(socket), "--data-dir", str(state)]
+    door = await asyncio.create_subprocess_exec(
+        *command, "--token-file", str(token_file(state)), stdout=asyncio.subprocess.PIPE
+    )
+    try:
+        assert door.stdout is not None
+        async with asyncio.timeout(60):
+            line = await door.stdout.readline()
+        yield Reached(line.decode().split()[-1])
+    finally:
+        door.kill()
+        await door.wait()
 
 
 @asynccontextmanager

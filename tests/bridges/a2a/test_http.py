@@ -55,6 +55,13 @@ async def test_a_request_of_an_older_protocol_is_refused(tmp_path: Path) -> None
     assert (status, json.loads(text)["error"]["code"]) == (200, -32009), "no version means 0.3"
 
 
+async def test_what_is_not_sent_as_json_is_of_a_type_that_is_not_supported(tmp_path: Path) -> None:
+    headers = AUTHORIZED | {"Content-Type": "text/plain"}
+    async with serving(NOWHERE, tmp_path) as door:
+        status, text = await asked(door.url, CALL, **headers)
+    assert (status, json.loads(text)["error"]["code"]) == (200, -32005)
+
+
 @pytest.mark.parametrize("body", [b" " * (LARGEST_REQUEST + 1)])
 async def test_a_body_that_is_too_large_is_refused(tmp_path: Path, body: bytes) -> None:
     async with serving(NOWHERE, tmp_path) as door:

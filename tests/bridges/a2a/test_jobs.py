@@ -12,6 +12,7 @@ from a2a.types import (
     CancelTaskRequest,
     GetTaskRequest,
     ListTasksRequest,
+    StreamResponse,
     SubscribeToTaskRequest,
     TaskPushNotificationConfig,
     TaskState,
@@ -27,7 +28,7 @@ from aiohttp import web
 from google.protobuf.json_format import MessageToDict
 
 from mesh.base.http_server import HttpServer
-from tests.bridges.a2a.clients import Served, job_of, request, sent, serving
+from tests.bridges.a2a.clients import Served, job_of, process, request, sent, serving
 from tests.mesh.signer.signers import GOOD
 from tests.support.waiting import until
 
@@ -204,6 +205,33 @@ async def test_a_task_is_found_again_when_the_door_was_away(person: Person, driv
             assert last.status_update.status.state == TaskState.TASK_STATE_COMPLETED
             with pytest.raises(TaskNotFoundError):
                 await client.get_task(GetTaskRequest(id="job-0000000000000000"))
+
+
+async def test_a_task_is_found_again_when_the_door_was_killed(person: Person, driver: Driver) -> None:
+    driver.released.clear()
+    person.allow(driver.model)
+    folder = person.folder / "a2a"
+    async with person.at_work() as (_, _, signer):
+        async with process(signer.door, folder) as door, door.client(streaming=False) as client:
+            asked = request(order(driver), message_id="once", context="mine")
+            asked.configuration.return_immediately = True
+            (answer,) = await sent(client, asked)
+            await until(lambda: driver.begun)
+        async with process(signer.door, folder) as door, door.client() as client:
+            first, *_, last = await release_and_read(driver, client.send_message(asked))
+            assert (first.task.id, first.task.context_id) == (answer.task.id, "mine")
+            assert last.status_update.status.state == TaskState.TASK_STATE_COMPLETED
+    assert len(driver.begun) == 1
+    assert await person.spent() == 10**9
+
+
+async def release_and_read(driver: Driver, stream: AsyncIterator[StreamResponse]) -> list[StreamResponse]:
+    """All events of a stream; the robot finishes once the first one came."""
+    events = []
+    async for event in stream:
+        driver.released.set()
+        events.append(event)
+    return events
 
 
 async def test_each_change_is_pushed_with_its_secrets_also_after_a_restart(person: Person, driver: Driver) -> None:

@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -18,7 +19,6 @@ from tests.support.commands import AIRA, SOON
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 HELLO = {
     "jsonrpc": "2.0",
@@ -121,8 +121,10 @@ def test_stdout_has_only_messages(raw: Raw) -> None:
 
 def test_a_file_is_no_client(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("{}\n")
-    with (tmp_path / "file").open("rb") as file:
-        done = subprocess.run([*AIRA, "mcp", "--data-dir", str(tmp_path)], stdin=file, capture_output=True, check=False)
-    assert done.returncode == 2
-    assert b"[stdin-unusable]" in done.stderr
-    assert b"--http" in done.stderr
+    command = [*AIRA, "mcp", "--data-dir", str(tmp_path)]
+    for path in (tmp_path / "file", Path("/dev/null")):
+        with path.open("rb") as file:
+            done = subprocess.run(command, stdin=file, capture_output=True, check=False, timeout=SOON)
+        assert done.returncode == 2
+        assert b"[stdin-unusable]" in done.stderr
+        assert b"--http" in done.stderr
