@@ -109,7 +109,7 @@ export async function signAndPost(demand: Demand, shown: Hex, robot: Address | "
   // Before it is sent: what is signed may become a job, whatever the server answers. One for a robot is never published.
   rememberOrder({ hash: own, deadline: Number(demand.deadline), wire: robot ? "" : wire });
   const posted = robot
-    ? await signedRecord("pairs", "aira pair", account, { signature: "", demand: orderFields(demand, signature), offer, maker: account.address })
+    ? await signedRecord("pairs", "aira pair", account, { demand: orderFields(demand, signature), offer, maker: account.address })
     : await postText<PostedOrder>("orders", wire);
   if (posted.order.hash !== own) throw new ServerLies(texts.lieHash);
   return own;

@@ -63,6 +63,10 @@ test("records that a wallet signs have the hashes that Python gives them", () =>
   const accept = (order: Parameters<typeof orderFields>[0]) => recordHash("aira accept", { signature: "", demand: orderFields(order, ""), robot: address, maker: address });
   assert.equal(accept({ ...terms, nonce: 7n, sender: address }), "0x0e0fab30fb002b19863c549487eb2947843e463e3b079d91552f44324f4d7c94");
   assert.equal(accept({ ...terms, nonce: "ab".repeat(32) }), "0x713364bc16340f8a66e6b3e540a2c62c2cd6a0aca2a437ce56bef54978c69e4e");
+  const signature = "ab".repeat(65);
+  const { validatorFee: _, ...offered } = terms;
+  const [demand, offer] = [orderFields({ ...terms, nonce: 7n, sender: address }, signature), orderFields({ ...offered, lighthouseFee: 1n, nonce: 7n, sender: address }, signature)];
+  assert.equal(recordHash("aira pair", { demand, offer, maker: address }), "0xa8bbe661ce418952000a16c8bb1be8f2755302cd1ae24a3858294a73e2076f3b");
   const stop = { liability: address, by: address, why: 'so "ä" \u2028 </x>', time: 7 };
   assert.equal(recordHash("aira stop", stop), "0x658a82bb35e1f102c8ad5e31fb2e26a2d2aff76e267df54d42ec8dc7749cb190");
 });
