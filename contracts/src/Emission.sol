@@ -21,16 +21,21 @@ abstract contract Emission {
     /// @notice The token that is minted.
     XRT public immutable xrt;
 
+    /// @notice wn that 100 units of counted gas are worth. Whoever deploys chooses it: a fork may make the same work
+    /// take more gas than the schedule counts.
+    uint256 public immutable emissionPercent;
+
     /// @notice Gas of all liabilities that have ended.
     uint256 public totalGasConsumed;
 
-    constructor(XRT xrt_) {
+    constructor(XRT xrt_, uint256 emissionPercent_) {
         xrt = xrt_;
+        emissionPercent = emissionPercent_;
     }
 
     /// @notice wn that this much gas is worth.
-    function wnFromGas(uint256 gas) public pure returns (uint256) {
-        return gas;
+    function wnFromGas(uint256 gas) public view returns (uint256) {
+        return gas * emissionPercent / 100;
     }
 
     /// @notice Generation 3's name of `totalGasConsumed`.

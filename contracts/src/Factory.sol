@@ -62,7 +62,11 @@ contract Factory is
     /// @param ens_ registry in which this factory owns the parents of the lighthouses' names.
     /// @param xrt_ token that has, or will have, this factory as its minter.
     /// @param refundDelay_ in blocks; longer than any work is to take.
-    constructor(IENS ens_, XRT xrt_, uint256 refundDelay_) LighthouseNames(ens_) Emission(xrt_) {
+    /// @param emissionPercent_ wn that providers are paid for 100 units of gas.
+    constructor(IENS ens_, XRT xrt_, uint256 refundDelay_, uint256 emissionPercent_)
+        LighthouseNames(ens_)
+        Emission(xrt_, emissionPercent_)
+    {
         refundDelay = refundDelay_;
         liabilityCode = address(new Liability(address(xrt_)));
         lighthouseCode = address(new Lighthouse(xrt_));

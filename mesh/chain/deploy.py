@@ -57,6 +57,8 @@ class DeploymentPlan:
     """How long the current provider may be silent before another takes the turn."""
     refund_delay: int = 50_400
     """From the creation of a liability until it can be refunded (a week of 12-second blocks)."""
+    emission_percent: int = 100
+    """wn that providers are minted for 100 units of gas; more after a fork that makes the same work take more gas."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,8 +157,9 @@ async def _fitting(node: Node, owner: str, plan: DeploymentPlan, found: Mapping[
             del fits["XRT"]
     if "Factory" in fits:
         factory = node.contract("Factory", fits["Factory"])
-        has = [await node.read(call) for call in (factory.ens(), factory.xrt(), factory.refundDelay())]
-        if has != [ens, fits.get("XRT"), plan.refund_delay]:
+        calls = factory.ens(), factory.xrt(), factory.refundDelay(), factory.emissionPercent()
+        has = [await node.read(call) for call in calls]
+        if has != [ens, fits.get("XRT"), plan.refund_delay, plan.emission_percent]:
             del fits["Factory"]
     return fits
 
@@ -180,7 +183,7 @@ class _Deployer:
         ens = await self._create("ENSRegistry")
         resolver = await self._create("Resolver", ens)
         xrt = await self._create("XRT", plan.initial_supply)
-        factory = await self._create("Factory", ens, xrt, plan.refund_delay)
+        factory = await self._create("Factory", ens, xrt, plan.refund_delay, plan.emission_percent)
         token = self._node.contract("XRT", xrt)
         await self._ensure(token.minter(), factory, token.setMinter(factory))
         await self._name(self._node.contract("ENSRegistry", ens), resolver, xrt=xrt, factory=factory)

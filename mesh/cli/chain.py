@@ -48,6 +48,14 @@ command = LazyGroup(
     help="blocks until the cost of an unfinished job can be refunded; can't be changed later [a week of the chain's"
     " blocks; 50400 if none is named]",
 )
+@click.option(
+    "--emission-percent",
+    type=click.IntRange(1, 10_000),
+    default=100,
+    show_default=True,
+    help="wn that providers are minted for 100 units of gas; more where the chain's fork makes work take more gas;"
+    " can't be changed later",
+)
 @click.option("--again", is_flag=True, help="deploy even if the chain already has the contracts; the old ones stay")
 @with_json
 @with_signing_settings()
@@ -58,6 +66,7 @@ async def deploy_contracts(
     minimal_stake: str,
     timeout_blocks: int,
     refund_delay: int | None,
+    emission_percent: int,
     again: bool,
     as_json: bool,
 ) -> None:
@@ -76,6 +85,7 @@ async def deploy_contracts(
         minimal_stake=XRT.parse(minimal_stake),
         timeout_blocks=timeout_blocks,
         refund_delay=refund_delay or settings.profile.blocks_in(REFUND_SECONDS),
+        emission_percent=emission_percent,
     )
     check_lighthouse(plan.lighthouse, minimal_stake=plan.minimal_stake)  # it is created last, too late for an error
     account = await asyncio.to_thread(load_account, settings)

@@ -2,8 +2,8 @@
 
 It creates those that cover its gas, its customers', and a number of free ones a day. Creating and finalizing a contract
 costs the provider gas, and on OP-type rollups a fee for the data, which counts as the gas that it would buy. The fee of
-the offer covers it, and what the factory mints when work was paid for, both counted at the factory's rate of 1 wn for a
-unit of gas. Anybody can sign any number of orders that bring neither, with keys made for it.
+the offer covers it, and what the factory mints when work was paid for, both counted at the factory's rate, by default
+1 wn for a unit of gas. Anybody can sign any number of orders that bring neither, with keys made for it.
 """
 
 from __future__ import annotations
@@ -188,11 +188,13 @@ class FreeContracts:
         a_day: int = A_DAY,
         customers: Collection[str] = (),
         always_minted: bool = False,
+        emission: int = 100,
         store: MarketStore,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._account = account
         self._xrt = xrt
+        self._emission = emission
         self.a_day = a_day
         self._customers = frozenset(customers)
         self._always_minted = always_minted
@@ -217,11 +219,20 @@ class FreeContracts:
         """
         demand, offer = match.demand.message, match.offer.message
         cost, fee = demand.cost, offer.lighthouse_fee
-        gas = _gas(demand.generation, cost, fee)
+        worth = self._worth(_gas(demand.generation, cost, fee))
         strangers = len({match.demand.signer, match.offer.signer, self._account}) == 3
         is_minted = demand.token == self._xrt and strangers
-        minted = gas if self._always_minted else min(cost, gas) if is_minted else 0
-        return max(gas + data_gas - fee - minted - carried, 0)
+        minted = worth if self._always_minted else min(cost, worth) if is_minted else 0
+        return max(worth + self._worth(data_gas) - fee - minted - carried, 0)
+
+    def why(self, match: Match, *, data_gas: int = 0) -> str:
+        """Why a contract that does not cover the gas is not created, for the makers of its orders."""
+        demand, fee = match.demand.message, match.offer.message.lighthouse_fee
+        enough = f"a cost of {XRT.show(self._worth(_gas(demand.generation, 1, fee)))} does"
+        if demand.token != self._xrt or data_gas:
+            gas = _gas(demand.generation, demand.cost, 1) + data_gas
+            enough = f"a fee of {XRT.show(self._worth(gas))} in the offer does"
+        return f"its contract would not cover the provider's gas, and there is no free one left now: {enough}, or wait"
 
     async def take(self, match: Match) -> bool:
         """Whether to create a contract that does not cover its gas; what it uses up is on disk when this returns."""
@@ -242,20 +253,14 @@ class FreeContracts:
     def earned(self, liability: Liability, minted: int) -> None:
         """A contract was finalized, for which the factory minted so much wn: its maker may have a free one for it."""
         maker = liability.promisee
-        if minted + liability.lighthouse_fee >= GAS[5]:
+        if minted + liability.lighthouse_fee >= self._worth(GAS[5]):
             self._credit[maker] = min(self._credit.get(maker, 0) + 1, CREDIT)
+
+    def _worth(self, gas: int) -> int:
+        return gas * self._emission // 100
 
     def _refilled(self, now: float) -> float:
         return min(self._left + max(now - self._at, 0.0) * self.a_day / DAY, self._most)
-
-
-def why(match: Match, xrt: str, *, data_gas: int = 0) -> str:
-    """Why a contract that does not cover the gas is not created, for the makers of its orders."""
-    demand, fee = match.demand.message, match.offer.message.lighthouse_fee
-    enough = f"a cost of {XRT.show(_gas(demand.generation, 1, fee))} does"
-    if demand.token != xrt or data_gas:
-        enough = f"a fee of {XRT.show(_gas(demand.generation, demand.cost, 1) + data_gas)} in the offer does"
-    return f"its contract would not cover the provider's gas, and there is no free one left now: {enough}, or wait"
 
 
 def _gas(generation: int, cost: int, fee: int) -> int:

@@ -39,7 +39,6 @@ from mesh.chain import (
     fee_for_carrying,
 )
 from mesh.errors import AiraError, ChainError, InputError, public_text
-from mesh.market._earnings import why
 from mesh.market.book import RETRIED, Added, Match, OrderStage, order_id
 from mesh.market.transactions import Stakes
 from mesh.market.withdrawals import withdrawn_id
@@ -773,7 +772,7 @@ class Settlement:
         orders = self._parts.orders
         is_waiting = order_id(match.demand) in orders.book or orders.is_paired(match.demand)
         for order in match if is_waiting else (match.offer,):
-            self.rejections.reject(order, Refusal.UNPAID, why(match, self._parts.chain.xrt, data_gas=data_gas))
+            self.rejections.reject(order, Refusal.UNPAID, self._parts.free.why(match, data_gas=data_gas))
 
     def _creation(self, match: Match) -> Callable[[], Awaitable[CreatedContract]]:
         """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`."""

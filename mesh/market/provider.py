@@ -237,12 +237,17 @@ class Provider(Role):
         )
         self.book.expire(head.contract_block)
         await self._restore(latest)
+        emission, is_ours = 100, await self._chain.has_mesh_contracts()
+        if is_ours:
+            node = self._chain.node
+            emission = await node.read(node.contract("Factory", self._chain.factory).emissionPercent())
         self.free = FreeContracts(
             self.address,
             self._chain.xrt,
             a_day=options.free_contracts,
             customers=options.customers,
-            always_minted=not await self._chain.has_mesh_contracts(),
+            always_minted=not is_ours,
+            emission=emission,
             store=self._store,
         )
         outages, lookups = OutageLog(log, "chain"), OutageLog(log, "node")

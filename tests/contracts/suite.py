@@ -57,7 +57,9 @@ class Person:
 class Suite:
     """The deployed contracts. The first person deploys and holds the XRT that the others are given."""
 
-    def __init__(self, chain: Chain, *, refund_delay: int = REFUND_DELAY, supply: int = SUPPLY) -> None:
+    def __init__(
+        self, chain: Chain, *, refund_delay: int = REFUND_DELAY, supply: int = SUPPLY, emission: int = 100
+    ) -> None:
         self.chain = chain
         self.web3 = chain.web3
         self.people = tuple(Person(Signer(key).address, Signer(key)) for key in chain.keys)
@@ -65,7 +67,7 @@ class Suite:
         self.ens = self.deploy("ENSRegistry")
         self.resolver = self.deploy("Resolver", self.ens.address)
         self.xrt = self.deploy("XRT", supply)
-        self.factory = self.deploy("Factory", self.ens.address, self.xrt.address, refund_delay)
+        self.factory = self.deploy("Factory", self.ens.address, self.xrt.address, refund_delay, emission)
         self.send(self.xrt.functions.setMinter(self.factory.address))
         self._name()
 

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.contracts.suite import REFUND_DELAY, XRT
+from tests.contracts.market import Market
+from tests.contracts.suite import REFUND_DELAY, XRT, Suite
 
 if TYPE_CHECKING:
-    from tests.contracts.market import Market
+    from tests.contracts.evm import Chain
 
 pytestmark = pytest.mark.sample("market")
 
@@ -34,6 +35,16 @@ def test_the_provider_who_finalizes_is_paid_for_the_gas_of_a_paid_liability(mark
     gas = suite.factory.functions.gasConsumedOf(liability.address).call()
     assert minted(market, before) == suite.factory.functions.wnFromGas(gas).call() > 0
     assert suite.balance(market.provider) == holding + minted(market, before)
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+def test_whoever_deploys_says_what_gas_is_worth(chain: Chain, undone: None, generation: int) -> None:
+    market = Market(Suite(chain, emission=256), generation)
+    liability = market.create(cost=COST)
+    before = supply(market)
+    market.finalize(liability)
+    gas = market.suite.factory.functions.gasConsumedOf(liability.address).call()
+    assert minted(market, before) == gas * 256 // 100
 
 
 def test_no_more_is_minted_than_was_paid(market: Market) -> None:

@@ -102,7 +102,7 @@ def refused(name: str, *values: Any) -> ModelRevert:
 
 
 def checked(value: int) -> int:
-    """A sum as Solidity has it: it panics beyond 256 bits."""
+    """A sum or a product as Solidity has it: it panics beyond 256 bits."""
     if not 0 <= value < 1 << 256:
         raise ModelRevert(PANIC + word(OVERFLOW))
     return value

@@ -39,8 +39,8 @@ class ModelFactory(ModelEscrow):
 
     NAME = "Factory"
 
-    def begin(self, ens: bytes = NOBODY, xrt: bytes = NOBODY, delay: int = 0) -> None:
-        for name, value in (("ens", ens), ("xrt", xrt), ("delay", delay)):
+    def begin(self, ens: bytes = NOBODY, xrt: bytes = NOBODY, delay: int = 0, percent: int = 0) -> None:
+        for name, value in (("ens", ens), ("xrt", xrt), ("delay", delay), ("percent", percent)):
             self.set(name, value)
         for number, name in ((1, "Liability"), (2, "Lighthouse")):
             made = keccak256(b"\xd6\x94" + self.address + bytes([number]))[12:]
@@ -71,8 +71,11 @@ class ModelFactory(ModelEscrow):
     def totalGasUtilizing(self) -> int:
         return self.totalGasConsumed()
 
+    def emissionPercent(self) -> int:
+        return int(self.get("percent"))
+
     def wnFromGas(self, gas: int) -> int:
-        return gas
+        return checked(gas * self.emissionPercent()) // 100
 
     def isLighthouse(self, account: bytes) -> bool:
         return bool(self.get("lighthouse", account))
@@ -291,7 +294,7 @@ class ModelFactory(ModelEscrow):
         self.set("gas", self.totalGasConsumed() + gas)
         strangers = terms.promisee != terms.promisor and provider not in (terms.promisee, terms.promisor)
         if success and provider != NOBODY and terms.token == self.xrt() and terms.cost and strangers:
-            ModelToken(self.run, self.xrt(), self.address).mint(provider, min(gas, terms.cost))
+            ModelToken(self.run, self.xrt(), self.address).mint(provider, min(self.wnFromGas(gas), terms.cost))
 
 
 class _Implementation(ModelContract):

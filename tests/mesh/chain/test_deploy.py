@@ -43,7 +43,8 @@ async def test_a_fresh_chain_takes_less_than_three_seconds_of_cpu() -> None:
 
 
 async def test_the_deployment_follows_its_plan() -> None:
-    plan = DeploymentPlan(lighthouse="home", initial_supply=7 * XRT, minimal_stake=5, timeout_blocks=9, refund_delay=33)
+    terms = {"initial_supply": 7 * XRT, "minimal_stake": 5, "timeout_blocks": 9, "refund_delay": 33}
+    plan = DeploymentPlan(lighthouse="home", emission_percent=256, **terms)
     async with EmbeddedChain() as node:
         account = Account(node.funded_keys[3])
         deployment = await deploy(node.provider, account, plan=plan)
@@ -54,8 +55,8 @@ async def test_the_deployment_follows_its_plan() -> None:
             state = await chain.lighthouses.get("home")
             assert (state.minimal_stake, state.timeout_blocks) == (5, 9)
             assert await chain.block_number() == deployment.block_number
-            refund_delay = chain.node.contract("Factory", chain.factory).refundDelay()
-            assert await chain.node.read(refund_delay) == 33
+            factory = chain.node.contract("Factory", chain.factory)
+            assert [await chain.node.read(call) for call in (factory.refundDelay(), factory.wnFromGas(50))] == [33, 128]
 
 
 async def test_the_first_deployment_of_a_development_chain_is_found_without_an_address() -> None:

@@ -56,6 +56,12 @@ def test_fee_and_emission_cover_the_gas(lacking: int, terms: dict[str, Any]) -> 
     assert made().lacking(pair(**terms)) == lacking
 
 
+def test_where_gas_is_worth_more_it_takes_more_to_cover_it() -> None:
+    free = made(emission=200)
+    assert [free.lacking(pair(cost=cost)) for cost in (0, COVERED, 2 * COVERED)] == [2 * 268_000, COVERED, 0]
+    assert "0.000638 XRT" in free.why(pair())
+
+
 def test_nothing_is_minted_for_work_among_oneself() -> None:
     alone = Match(verified_demand(cost=COVERED), verified_offer(signer=PERSON, cost=COVERED))
     own = pair(cost=COVERED, person=PROVIDER)
