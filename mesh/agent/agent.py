@@ -217,6 +217,7 @@ class DemandTerms(TypedDict, total=False):
     token: str
     validator: str
     validator_fee: int | str | None
+    permit_fee: int | str
     lifetime: int | None
     robot: str
     max_cost: int | str | None
@@ -537,6 +538,7 @@ class Agent(Program):
         token: str = "",
         validator: str = "",
         validator_fee: int | str | None = None,
+        permit_fee: int | str = 0,
         lifetime: int | None = None,
         robot: str = "",
         max_cost: int | str | None = None,
@@ -550,6 +552,10 @@ class Agent(Program):
         as `[("/blink", "red"), ("/stop", Empty())]`; the agent serves it. The other terms are as for `offer`;
         `validator_fee` is `"0.1 XRT"`, or wn; by default what the validator announces. The factory gets the allowance
         that they need. A restarted agent sends the order again.
+
+        `permit_fee` is what the provider gets for creating the contract with a permit of this agent, which needs no
+        ether for that: an amount in the token of the `cost`. It is charged once, when the contract is created, and only
+        with the permit. A demand has one fee, so it can't have a validator, too.
 
         With a `robot` (its name or address) only that one gets the job: it is asked for its offer, and the demand is
         not published. Raises `DemandDeclined` with its reason if it makes none, `ServiceFailed` if it does not answer,
@@ -575,6 +581,7 @@ class Agent(Program):
         check_attempts(retry, start_within, robot="" if robot in CHOICES else robot)
         cid = await self._cid_of(objective)
         others: dict[str, Any] = {"token": token, "validator": validator, "validator_fee": validator_fee}
+        others["permit_fee"] = permit_fee
         chosen: dict[str, Any] = {"cost": cost, "model": model, "max_cost": max_cost, "start_within": start_within}
         attempts = None
         if retry or start_within is not None:
@@ -603,6 +610,7 @@ class Agent(Program):
         token: str,
         validator: str,
         validator_fee: int | str | None,
+        permit_fee: int | str,
         lifetime: int | None,
         robot: str,
         attempts: Attempts | None,
@@ -614,7 +622,7 @@ class Agent(Program):
             model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
         )
         await self.runtime.require_fit(cid, terms["model"])
-        fee = await self._announced_fee(terms) if validator_fee is None else XRT.amount(validator_fee)
+        fee = await self._fee_of(terms, validator_fee, permit_fee)
         named = ""
         if robot:
             named = await robot_address(self.network.session, self.channel, robot, model=terms["model"])
@@ -833,10 +841,36 @@ class Agent(Program):
         """Copy a file to the agent's store, which serves it to others; returns its CID."""
         return await asyncio.to_thread(self.parts.store.put_file, Path(path))
 
+    async def _fee_of(self, terms: Terms, validator_fee: int | str | None, permit_fee: int | str) -> int:
+        """The fee of a demand with these terms: the validator's in wn, or without one that for a permit."""
+        if terms["validator"] != ZERO_ADDRESS:
+            if permit_fee:
+                raise InputError(
+                    "a demand with a validator has no permit_fee",
+                    hint="omit one of them: a demand has one fee, which is the validator's if it has one",
+                    code="fee-misplaced",
+                )
+            return await self._announced_fee(terms) if validator_fee is None else XRT.amount(validator_fee)
+        if validator_fee is not None and XRT.amount(validator_fee):
+            raise InputError(
+                "a demand without a validator has no validator_fee",
+                hint="name a validator, or give a permit_fee, which the provider gets",
+                code="fee-misplaced",
+            )
+        if not permit_fee:
+            return 0
+        paid = await self.parts.chain.tokens.amounts(permit_fee, token=terms["token"])
+        if paid.values[0] and not await self.parts.chain.permits.are_taken(paid.token):
+            raise InputError(
+                f"the token {paid.unit.symbol} has no permits, so nobody would be paid a permit_fee",
+                hint="omit the permit_fee: the factory is approved by a transaction",
+                code="token-without-permits",
+            )
+        return paid.values[0]
+
     async def _announced_fee(self, terms: Terms) -> int:
         """What the validator of these terms wants, in wn. Raises `ValidatorSilent`."""
-        if (validator := terms["validator"]) == ZERO_ADDRESS:
-            return 0
+        validator = terms["validator"]
         generation = self.settings.generation
         await check_named(self.parts.chain, validator, lighthouse=terms["lighthouse"], generation=generation)
         announced = await self.runtime.validators.find(validator)

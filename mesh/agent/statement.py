@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
+from mesh.chain import Holding, permit_fee
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
 
@@ -30,7 +31,8 @@ class Entry:
     """A contract in a statement. `time` (Unix) and `block` are those of its end, or of its creation if it is open.
 
     `earned` and `spent` are what the account received and paid for the job, in the smallest unit of the contract's
-    token; `fee` is what it paid to the provider, or to the validator, in wn. `gas` is what the transactions of creation
+    token, also to the provider for a permit; `fee` is what it paid to the provider for its offer, or to the validator,
+    in wn. `gas` is what the transactions of creation
     and end cost, in wei, and `own_gas` what the account itself paid of that. Both are None where the node does not say
     the price. `tx` is the transaction at `time`.
     """
@@ -128,12 +130,15 @@ def _entry(dated: Dated, account: str, gas: Mapping[str, GasPaid]) -> Entry:
     fee = one.lighthouse_fee if one.promisor == account else 0
     if one.promisee == account and one.validator != ZERO_ADDRESS and one.state in ("paid", "failed"):
         fee += one.validator_fee
+    made = gas[dated.created.tx]
+    # It is only charged if the contract was created with the permit.
+    paid_for_permit = min(permit_fee(one), made.received.get(Holding(one.token, one.promisee), 0))
     return Entry(
         time=last.time,
         block=last.block_number,
         liability=one,
         earned=one.cost if is_paid and one.promisor == account else 0,
-        spent=one.cost if is_paid and one.promisee == account else 0,
+        spent=(one.cost if is_paid else 0) + paid_for_permit if one.promisee == account else 0,
         fee=fee,
         gas=_total(step.wei for step in steps),
         own_gas=_total(step.wei for step in steps if step.payer == account),

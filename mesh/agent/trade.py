@@ -47,7 +47,7 @@ from mesh.base.background import Background
 from mesh.base.flood import SENDERS, KnownSenders, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
-from mesh.chain import Allowances, OrderAlreadyUsed
+from mesh.chain import Allowances, OrderAlreadyUsed, permit_fee
 from mesh.errors import AiraError, ChainError
 from mesh.network import PresentAgents
 from mesh.role.database import LedgerUnusable
@@ -200,6 +200,8 @@ class Order:
         return await self._trader.contract_unless_declined(self._traded, on_progress)
 
 
+UNCOVERED: Final = ("ERC20InsufficientAllowance", "FeeNotPermitted")
+"""Rejections of an order whose allowance or permit is gone."""
 STOP_SECONDS: Final = 3.0
 """For which an agent that ends waits until the providers have confirmed that they use none of its offers."""
 
@@ -456,8 +458,11 @@ class Trader(Lifecycle):
 
     async def _ensure(self, order: TradedOrder) -> None:
         """Make sure that the factory may take what an order costs, for a demand by a permit if the token has such."""
-        permit = order.signed.token if isinstance(order.signed, Demand) else ""
-        await self._allowances.ensure(order, self._chain.funds.cost_of(order.signed), permit=permit)
+        signed, costs, ensure = order.signed, self._chain.funds.cost_of(order.signed), self._allowances.ensure
+        if isinstance(signed, Demand):  # a fee for a permit is paid with one only
+            await ensure(order, costs, permit=signed.token, always=permit_fee(signed) > 0)
+        else:
+            await ensure(order, costs)
 
     def _permit_for(self, demand: Demand) -> Permit | None:
         return self._chain.permits.own(demand.token)
@@ -713,7 +718,7 @@ class Trader(Lifecycle):
         await self._parts.chain_head.reached(await self._chain.block_number())
         if (order := self._orders.get(identity)) is None or not order.is_open:
             return
-        if reason == "ERC20InsufficientAllowance" and not order.is_overtaken(used - 1):
+        if reason in UNCOVERED and not order.is_overtaken(used - 1):
             # A reorganisation took the allowance in a block that was not read here.
             self._send_covered([order])
         if order.nonce is not None and order.nonce > used:
@@ -730,7 +735,7 @@ class Trader(Lifecycle):
             facts = log_event("order-rejected", order=rejection.order, provider=rejection.provider)
             why = rejection.reason, rejection.detail
             log.warning("%s can't use the %s now (%s: %s)", rejection.provider, order, *why, extra=facts)
-            if rejection.reason == "ERC20InsufficientAllowance":  # another order has used the permit
+            if rejection.reason in UNCOVERED:  # another order has used the permit
                 self._send_covered([order])
 
     def _pair_declined(self, decline: Decline) -> None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from mesh.base.clock import Clock
     from mesh.chain._contracts import Contracts
-    from schemas import Demand, Verified
+    from schemas import Demand, Liability, Verified
 
 LIFETIME: Final = 7 * 86_400
 """Seconds for which a permit is valid that is signed here: longer than orders wait."""
@@ -34,9 +34,12 @@ _DOMAIN_TYPE: Final = keccak256(b"EIP712Domain(string name,string version,uint25
 PermitArguments = tuple[int, int, int, bytes, bytes]
 
 
-def fee_for_carrying(demand: Demand) -> int:
-    """What a demand pays, in its token's smallest unit, for carrying its permit; 0 if its fee is a validator's."""
-    return demand.validator_fee if demand.validator == ZERO_ADDRESS else 0
+def permit_fee(order: Demand | Liability) -> int:
+    """What a demand pays the provider, in its token's smallest unit, that creates its contract with its permit.
+
+    0 if its fee is a validator's. Without a permit it is not charged.
+    """
+    return order.validator_fee if order.validator == ZERO_ADDRESS else 0
 
 
 def permit_arguments(permit: Permit) -> PermitArguments:
@@ -110,16 +113,12 @@ class Permits:
         Raises `NodeUnreachable`, `RequestRefused`.
         """
         contracts = self._contracts
-        if not contracts.version.takes_permits:
-            return None
         account = contracts.signing().account
         functions, owner = self._node.contract("XRT", token), account.address
-        asked = functions.name().data, _VERSION, functions.DOMAIN_SEPARATOR().data, functions.nonces(owner).data
         try:
-            answers = await self._node.call_all([(token, one) for one in asked], gas=TOKEN_GAS, most=LONGEST_NAME)
-            name, version, domain, nonce = (answer or b"" for answer in answers)
-            if len(nonce) != _WORD or domain != _domain_of(name, version, self._node.chain_id, token):
+            if (told := await self._told(token, owner)) is None:
                 return None
+            domain, nonce = told
             permit = account.signer.sign(
                 Permit(
                     owner=owner,
@@ -139,6 +138,13 @@ class Permits:
         self._known[owner] = self._known.get(owner, {}) | {permit.domain: permit}
         return permit
 
+    async def are_taken(self, token: str) -> bool:
+        """Whether `sign` may be able to sign for a token (address). Raises `NodeUnreachable`, `RequestRefused`."""
+        try:
+            return await self._told(token, ZERO_ADDRESS) is not None
+        except (Reverted, NoContracts):
+            return False
+
     async def needed_for(self, demand: Verified[Demand]) -> Permit | None:
         """The permit to create a demand's contract with; None if it needs none, or none is known that may help.
 
@@ -147,7 +153,7 @@ class Permits:
         order, owner = demand.message, demand.signer
         if not self.has_any_of(owner):
             return None
-        functions, fee = self._node.contract("XRT", order.token), fee_for_carrying(order)
+        functions, fee = self._node.contract("XRT", order.token), permit_fee(order)
         asked = (
             functions.allowance(owner, self._contracts.factory),
             functions.nonces(owner),
@@ -165,6 +171,18 @@ class Permits:
             return permit if fee or int.from_bytes(allowed) < order.cost else None
         # Somebody has brought it to the token, so the allowance stands; it still says that its owner pays the fee.
         return permit if fee and int.from_bytes(nonce) == permit.nonce + 1 else None
+
+    async def _told(self, token: str, owner: str) -> tuple[bytes, bytes] | None:
+        """A token's domain and the owner's nonce, a word each; None if the contracts or the token take no permits."""
+        if not self._contracts.version.takes_permits:
+            return None
+        functions = self._node.contract("XRT", token)
+        asked = functions.name().data, _VERSION, functions.DOMAIN_SEPARATOR().data, functions.nonces(owner).data
+        answers = await self._node.call_all([(token, one) for one in asked], gas=TOKEN_GAS, most=LONGEST_NAME)
+        name, version, domain, nonce = (answer or b"" for answer in answers)
+        if len(nonce) != _WORD or domain != _domain_of(name, version, self._node.chain_id, token):
+            return None
+        return domain, nonce
 
     def _is_over(self, permit: Permit) -> bool:
         return permit.deadline <= self._clock.time()

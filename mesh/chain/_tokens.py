@@ -261,11 +261,13 @@ class Allowances:
         self._ahead: dict[str, int] = {}
         self._approving = asyncio.Lock()
 
-    async def ensure(self, order: Hashable, amounts: Mapping[str, int], *, permit: str = "") -> None:
+    async def ensure(
+        self, order: Hashable, amounts: Mapping[str, int], *, permit: str = "", always: bool = False
+    ) -> None:
         """Make sure that the factory may take `amounts` (by token) for `order` and what the other orders may cost.
 
         What lacks of the token `permit` (an address) is approved by a signature, which `permits` has then, if the token
-        takes such; else, and of other tokens, by a transaction.
+        takes such; else, and of other tokens, by a transaction. With `always` it is signed also if nothing lacks.
 
         The account must own what its open orders cost; withdrawn ones only need the allowance. Raises
         `InsufficientTokens`; a new order is then not counted.
@@ -276,7 +278,8 @@ class Allowances:
                     others = (costs for key, costs in self._open.items() if key != order)
                     funds = amount + _sum(others, token)
                     needed = funds + _sum(self._withdrawn.values(), token)
-                    await self._ensure(token, funds=funds, needed=needed, is_permitted=token == permit)
+                    is_permitted = token == permit
+                    await self._ensure(token, funds=funds, needed=needed, is_permitted=is_permitted, always=always)
             if order not in self._withdrawn:
                 self._open[order] = amounts
 
@@ -294,13 +297,13 @@ class Allowances:
         self._open.pop(order, None)
         self._withdrawn.pop(order, None)
 
-    async def _ensure(self, token: str, *, funds: int, needed: int, is_permitted: bool) -> None:
+    async def _ensure(self, token: str, *, funds: int, needed: int, is_permitted: bool, always: bool) -> None:
         factory, tokens = self._factory, self._tokens
         balance, allowed = await tokens.balance_and_allowance(self._account, factory, token=token)
         if balance < funds:
             raise InsufficientTokens(self._account, token, balance=balance, needed=funds)
-        permits = self._permits if is_permitted else None
-        if allowed < needed and permits is not None and await permits.sign(token, needed) is not None:
+        permits = self._permits if is_permitted and (always or allowed < needed) else None
+        if permits is not None and await permits.sign(token, needed) is not None:
             facts = log_event("permit-signed", token=token, amount=needed)
             log.info("signed a permit for %d of token %s, so no transaction is needed", needed, token, extra=facts)
             return

@@ -22,6 +22,7 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
         "ERC20InsufficientAllowance": "approve the spender for that amount first",
         "ERC20InsufficientBalance": "send the account the missing tokens, or lower the amount",
         "ERC20InvalidReceiver": "check the address that receives the tokens",
+        "FeeNotPermitted": "the fee for a permit is paid with a valid permit only; sign a new one",
         "DeadlineReached": "the order has expired; sign a new one with a later deadline",
         "OrderUsed": "an order makes at most one contract, and none once it is withdrawn; sign a new one",
         "WrongNonce": "of several orders, withdraw the one with the lowest nonce first",

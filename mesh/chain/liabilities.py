@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import compress
 from typing import TYPE_CHECKING, Final
@@ -13,12 +14,15 @@ from msgspec.structs import replace
 from mesh.chain._contracts import result_arguments
 from mesh.chain._node import getters
 from mesh.chain._permits import permit_arguments
+from mesh.chain._tokens import Holding
 from mesh.chain.answers import LIABILITY_GETTERS, liability_record
 from mesh.chain.errors import NoContracts, NodeUnreachable, NotALiability, OrderAlreadyUsed, RequestRefused, Reverted
 from mesh.chain.following import (
     EventSources,
     Finalized,
     NewLiability,
+    Transfer,
+    decode_log,
     first_event,
     list_blocks,
     list_created,
@@ -33,11 +37,12 @@ from schemas.messages import cancellation_hash, message_hash, order_abi
 from schemas.signing import recover
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from mesh.chain._abi import ContractCall
     from mesh.chain._contracts import Contracts
     from mesh.chain._node import Node
+    from mesh.chain.answers import MinedTransaction
     from mesh.chain.transactions import Receipt
     from schemas.messages import Demand, Offer, Order, Permit, Result
     from schemas.records import Liability
@@ -60,6 +65,8 @@ class Created:
     nonce: int
     gas_used: int
     wei: int
+    has_permit: bool = False
+    """Whether it was created with a permit, so that the promisee has paid the fee for that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +102,14 @@ class Dated:
 
 @dataclass(frozen=True, slots=True)
 class GasPaid:
-    """What a transaction cost, wei (None: the node does not say the price of gas), and the account that paid it."""
+    """What a transaction cost, wei (None: the node does not say the price of gas), and the account that paid it.
+
+    `received` is what tokens say that others transferred to that account.
+    """
 
     wei: int | None
     payer: str | None
+    received: Mapping[Holding, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,7 +236,7 @@ class Liabilities:
         for start in range(0, len(wanted), ASKED_AT_ONCE):
             some = wanted[start : start + ASKED_AT_ONCE]
             for tx, receipt in zip(some, await asyncio.gather(*map(self._node.receipt, some)), strict=True):
-                found[tx] = GasPaid(None, None) if receipt is None else GasPaid(receipt.wei(), receipt.sender)
+                found[tx] = GasPaid(None, None) if receipt is None else _gas_paid(receipt)
         return found
 
     async def _created_before(self, block: int, wanted: set[str]) -> dict[str, tuple[str, int]]:
@@ -307,7 +318,7 @@ class Liabilities:
     async def create(self, lighthouse: str, demand: Demand, offer: Offer, *, permit: Permit | None = None) -> Created:
         """Create a liability from two signed orders, as a provider of the lighthouse; perhaps with the maker's permit.
 
-        Without a validator, the provider earns the demand's fee with the permit, in the demand's token.
+        With the permit the provider earns the demand's `permit_fee`, in the demand's token.
 
         Raises `InvalidMessage` for an unsigned order or one with a name that is not resolved.
         """
@@ -322,7 +333,8 @@ class Liabilities:
         )
         made = first_event(receipt.logs, NewLiability, emitter=self._contracts.factory)
         self._version.recognise(made.liability)
-        return Created(made.liability, receipt.tx, receipt.nonce, receipt.gas_used, receipt.wei)
+        has_permit = permit is not None
+        return Created(made.liability, receipt.tx, receipt.nonce, receipt.gas_used, receipt.wei, has_permit)
 
     async def data_gas(self, demand: Demand, offer: Offer) -> int:
         """The gas for whose price the data of a contract's two transactions goes to Ethereum, on OP-type rollups."""
@@ -484,6 +496,15 @@ class Liabilities:
 
 def _concerns(liability: Liability, party: str) -> bool:
     return not party or party in (liability.promisee, liability.promisor)
+
+
+def _gas_paid(receipt: MinedTransaction) -> GasPaid:
+    received: Counter[Holding] = Counter()
+    for log in receipt.logs:
+        event = decode_log(log)
+        if isinstance(event, Transfer) and event.recipient == receipt.sender != event.sender:
+            received[Holding(log.address, event.sender)] += event.value
+    return GasPaid(receipt.wei(), receipt.sender, received)
 
 
 def cost_receiver(liability: Liability) -> str:

@@ -24,6 +24,7 @@ import click
 from mesh.agent.errors import OrderExpired
 from mesh.amounts import XRT
 from mesh.base.background import Background
+from mesh.chain import permit_fee as permit_fee_of
 from mesh.cli.chain_client import check_balance
 from mesh.cli.files import file_or_cid, model_named, require_writable
 from mesh.cli.liability import device_lines
@@ -33,6 +34,7 @@ from mesh.cli.output import format_duration, plural, print_json, print_line, pri
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
 from mesh.watching.robots import labelled, robot_address
+from schemas import Demand
 from schemas.address import ZERO_ADDRESS
 from schemas.decoding import decode_json
 
@@ -213,6 +215,9 @@ class JobPrinter:
         facts |= {"name": name} if (name := self._name_of(order.robot)) else {}
         facts |= {"number": self.number} if self.number else {}
         words = f"{self.terms(order.message.cost, order.robot)}, valid until block {order.deadline:,}"
+        if isinstance(order.message, Demand) and (fee := permit_fee_of(order.message)):
+            facts["permitFee"] = str(fee)
+            words += f"; {self._unit.show(fee)} more to the provider with the permit"
         self.line(f"posted {order.hash}, {words}", kind="posted", **facts, deadline=order.deadline)
 
     @property
@@ -525,6 +530,11 @@ async def agreed_fee(
     "--validator-fee", type=AmountText(), help="the validator's fee, in XRT (or wn) [what the validator announces]"
 )
 @click.option(
+    "--permit-fee",
+    type=TokenAmountText(),
+    help="what the provider gets for creating the contract with a permit of yours, in the token of --cost [nothing]",
+)
+@click.option(
     "--lifetime",
     type=click.IntRange(min=1),
     help="number of blocks for which the demand is valid [about ten minutes]",
@@ -555,6 +565,7 @@ async def demand(
     *,
     objective: str,
     validator_fee: str | None,
+    permit_fee: str | None = None,
     out: Path | None,
     as_json: bool,
     confirmed: bool = False,
@@ -604,14 +615,21 @@ async def demand(
         raise InputError(
             "--validator-fee needs --validator", hint="give --validator, or omit the fee", code="invalid-options"
         )
+    if permit_fee and terms["validator"]:
+        raise InputError(
+            "--permit-fee can't be used with --validator",
+            hint="omit one of them: a demand has one fee, which is the validator's if it has one",
+            code="invalid-options",
+        )
     if out is not None:
         await asyncio.to_thread(require_writable, out)
     checked = await asyncio.to_thread(_check_objective, settings, source) if isinstance(source, Path) else None
     # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(model.name, settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
-        given = (terms["cost"],) if max_cost is None else (terms["cost"], max_cost)
+        given = [permit_fee or 0, terms["cost"], *([] if max_cost is None else [max_cost])]
         token, unit, amounts = await agent.parts.chain.tokens.amounts(*given, default=agent.settings.erc20_token)
-        terms |= {"token": token, "cost": amounts[0]}
+        for_permit, cost, most = amounts[0], amounts[1], amounts[-1]
+        terms |= {"token": token, "cost": cost}
         with closing(JobPrinter(unit, as_json=as_json, name_of=agent.parts.robots.name)) as printer:
             changes = print_connection_changes(agent.parts.network, before=printer.close)
             tasks.start(changes, "network losses")
@@ -621,7 +639,6 @@ async def demand(
             if model.file is not None:  # for robots and pages that read its description
                 await agent.add(model.file)
             cid = source if isinstance(source, str) else await agent.add(source)
-            cost, most = amounts[0], amounts[-1]
             if most < cost:
                 raise InputError("--max-cost is less than --cost", hint="omit one of them", code="invalid-options")
             named = await _address_of(agent, robot) if robot and robot not in BY_QUOTE else ""
@@ -640,8 +657,12 @@ async def demand(
                 robot=named,
             )
             if order is None:
-                await check_balance(agent.parts.chain, unit, most, token=token)
-                terms |= {"robot": named or robot, "max_cost": None if max_cost is None else most}
+                await check_balance(agent.parts.chain, unit, most + for_permit, token=token)
+                terms |= {
+                    "permit_fee": for_permit,
+                    "robot": named or robot,
+                    "max_cost": None if max_cost is None else most,
+                }
                 order = await _post(agent, cid, checked, printer, retry=retry, start_within=start_within, **terms)
             elif retry or start_within is not None:
                 click.echo("aira: --retry and --start-within are only for new demands", err=True)

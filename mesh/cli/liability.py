@@ -15,6 +15,7 @@ import click
 from mesh.amounts import XRT, Unit
 from mesh.base.background import Background
 from mesh.base.outage_log import OutageLog
+from mesh.chain import permit_fee
 from mesh.chain.errors import Reverted
 from mesh.chain.liabilities import cost_receiver
 from mesh.cli.chain_client import account_of, notice_when_slow, open_chain, open_signing_chain, own_address, units_of
@@ -243,7 +244,7 @@ def describe_liability(
 ) -> dict[str, str | None]:
     """A liability for people; `own` is the reader's address."""
     is_judged = liability.validator != ZERO_ADDRESS
-    fee = XRT.show(liability.validator_fee)
+    fee = permit_fee(liability)
     return {
         "liability": liability.address,
         "state": OUTCOMES[liability.state],
@@ -255,7 +256,8 @@ def describe_liability(
         "objective": liability.objective,
         "result": liability.result or None,
         "lighthouse": f"{liability.lighthouse}  for {XRT.show(liability.lighthouse_fee)}",
-        "validator": f"{liability.validator}  for {fee}" if is_judged else "none",
+        "validator": f"{liability.validator}  for {XRT.show(liability.validator_fee)}" if is_judged else "none",
+        "permit": f"{unit.show(fee)} to the provider, if it was created with one" if fee else None,
         "refund": refundable,
     }
 

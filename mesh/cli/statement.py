@@ -45,8 +45,9 @@ async def statement(
     """Show what the account has earned and spent: a row for each contract, and the sums per month and model.
 
     Times are UTC. A contract is in the month in which it ended; an open one in that of its creation. EARNED and SPENT
-    are the costs of paid jobs; FEE is what the account paid to the provider or the validator, in XRT; GAS is what the
-    transactions of the contract cost, of which OWN GAS was paid by the account, in the chain's coin.
+    are the costs of paid jobs, and SPENT also what the provider got for a permit; FEE is what the account paid to the
+    provider for an offer, or to the validator, in XRT; GAS is what the transactions of the contract cost, of which OWN
+    GAS was paid by the account, in the chain's coin.
 
     --csv has exact decimals without separators, also the parties, blocks, transactions and recordings.
     """

@@ -1,9 +1,10 @@
 """What a provider earns and spends, and which contracts it creates.
 
 It creates those that cover its gas, its customers', and a number of free ones a day. Creating and finalizing a contract
-costs the provider gas, and on OP-type rollups a fee for the data, which counts as the gas that it would buy. The fee of
-the offer covers it, and what the factory mints when work was paid for, both counted at the factory's rate, by default
-1 wn for a unit of gas. Anybody can sign any number of orders that bring neither, with keys made for it.
+costs the provider gas, and on OP-type rollups a fee for the data, which counts as the gas that it would buy. Three
+things cover it: the fee of the offer, the fee for the demand's permit, and what the factory mints when work was paid
+for. They count at the factory's rate, by default 1 wn for a unit of gas, and a fee for a permit only in XRT: what it is
+worth in another token is not known. Anybody can sign any number of orders that bring none of them, with keys made for it.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Earnings(msgspec.Struct, frozen=True, kw_only=True):
     """What a provider did so far, without what reorganisations reverted.
 
     Contracts created and finalized; messages rejected, by reason; gas used, and wei spent on it, including failed
-    transactions; fees earned, and XRT minted for the gas (both wn).
+    transactions; fees earned in XRT, and XRT minted for the gas (both wn).
     """
 
     created: int
@@ -95,7 +96,7 @@ class EarningsLedger:
         self._gone: BoundedDict[str, EarningsEntry] = BoundedDict(REMEMBERED)
 
     def created(self, created: Created, *, fee: int) -> None:
-        """A contract was created; its promisor paid `fee` (wn)."""
+        """A contract was created, for which its parties paid `fee` (wn)."""
         entry = EarningsEntry(created=1, gas_used=created.gas_used, spent=created.wei, fees=fee)
         self._enter(created.tx, entry)
 
@@ -159,7 +160,9 @@ GAS: Final = {3: 268_000, 5: 224_000}
 GAS_OF_COST: Final = 51_000
 """… this if the demand has a cost, and …"""
 GAS_OF_FEE: Final = 19_500
-"""… this if the offer has a fee."""
+"""… this if the offer has a fee, and …"""
+GAS_OF_PERMIT_FEE: Final = 16_300
+"""… this if the demand has a fee for its permit."""
 
 A_DAY: Final = 100
 """Free contracts a day, by default."""
@@ -211,11 +214,11 @@ class FreeContracts:
         """How many may be created now for strangers."""
         return int(self._refilled(self._clock.time()))
 
-    def lacking(self, match: Match, *, data_gas: int = 0, carried: int = 0) -> int:
+    def lacking(self, match: Match, *, data_gas: int = 0, permit_fee: int = 0) -> int:
         """The wn that a contract lacks to cover the provider's gas; 0 if it covers it.
 
-        `data_gas` is what its data costs besides, as gas; nothing is minted for that. `carried` is the fee for carrying
-        the demand's permit, wn.
+        `data_gas` is what its data costs besides, as gas; nothing is minted for that. `permit_fee` is what the
+        demand pays for its permit, in its token; it counts if that is XRT.
         """
         demand, offer = match.demand.message, match.offer.message
         cost, fee = demand.cost, offer.lighthouse_fee
@@ -223,7 +226,10 @@ class FreeContracts:
         strangers = len({match.demand.signer, match.offer.signer, self._account}) == 3
         is_minted = demand.token == self._xrt and strangers
         minted = worth if self._always_minted else min(cost, worth) if is_minted else 0
-        return max(worth + self._worth(data_gas) - fee - minted - carried, 0)
+        if permit_fee:
+            data_gas += GAS_OF_PERMIT_FEE
+            fee += permit_fee if demand.token == self._xrt else 0
+        return max(worth + self._worth(data_gas) - fee - minted, 0)
 
     def why(self, match: Match, *, data_gas: int = 0) -> str:
         """Why a contract that does not cover the gas is not created, for the makers of its orders."""

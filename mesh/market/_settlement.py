@@ -36,7 +36,7 @@ from mesh.chain import (
     RequestRefused,
     Reverted,
     TransactionTimeout,
-    fee_for_carrying,
+    permit_fee,
 )
 from mesh.errors import AiraError, ChainError, InputError, public_text
 from mesh.market.book import RETRIED, Added, Match, OrderStage, order_id
@@ -75,6 +75,8 @@ TOTAL: Final = Rate(per_second=50.0, burst=1000)
 """Rejections in all: each is signed, logged and published."""
 ORDER_USED: Final = "OrderUsed"
 """The contracts' error for an order that became a liability, or was withdrawn there."""
+NOT_PERMITTED: Final = "FeeNotPermitted"
+"""Their error for a demand whose fee for a permit comes without a valid one."""
 UNNAMED_ERROR: Final = "Reverted"
 """The reason of a rejection when the contract's error has no name."""
 
@@ -174,7 +176,7 @@ def at_fault(match: Match, error: str, arguments: Sequence[Any]) -> tuple[Verifi
             return both
         case "ERC20InsufficientAllowance", _, _, needed if needed == match.offer.message.lighthouse_fee:
             return both if needed in (match.demand.message.cost, match.demand.message.validator_fee) else (match.offer,)
-        case "ERC20InsufficientAllowance" | "ValidatorWithoutCode", *_:
+        case "ERC20InsufficientAllowance" | "ValidatorWithoutCode" | "FeeNotPermitted", *_:
             return (match.demand,)
     return both
 
@@ -704,10 +706,8 @@ class Settlement:
         data_gas = await parts.chain.retrying(
             partial(parts.chain.liabilities.data_gas, demand.message, offer.message), outages=parts.lookups
         )
-        permit = await self._permit(match)
-        is_xrt = demand.message.token == parts.chain.xrt
-        carried = 0 if permit is None or not is_xrt else fee_for_carrying(demand.message)
-        if parts.free.lacking(match, data_gas=data_gas, carried=carried) and not await parts.free.take(match):
+        fee = permit_fee(demand.message) if await self._permit(match) is not None else 0
+        if parts.free.lacking(match, data_gas=data_gas, permit_fee=fee) and not await parts.free.take(match):
             self._decline(match, data_gas)
             return
         try:
@@ -716,7 +716,7 @@ class Settlement:
                 shortage = next(filter(None, await self.shortages(match)), "")  # which may be over by now
                 if shortage and await self._set_aside_unfunded(match, shortage, "its maker can't pay any more"):
                     return
-                created = await parts.queue.send(self._creation(match), priority=priority)
+                created = await parts.queue.send(self._creation(match, fee), priority=priority)
         except MatchWithdrawn:
             self._put_back(match)
         except Reverted as error:
@@ -730,10 +730,13 @@ class Settlement:
             self._versions.sent(match, created.nonce)
             key = CreatedKey(parts.channel.lighthouse, demand.message.model)
             parts.channel.put(str(key), created.liability.encode())
-            parts.earnings.created(created, fee=offer.message.lighthouse_fee)
-            if permit is not None:
+            paid = permit_fee(demand.message) if created.has_permit else 0
+            in_xrt = paid if demand.message.token == parts.chain.xrt else 0
+            parts.earnings.created(created, fee=offer.message.lighthouse_fee + in_xrt)
+            if created.has_permit:
                 self.events.created_with_permit(created.liability)
-            facts = {"gas": created.gas_used, "demand": demand.hash.hex(), "offer": offer.hash.hex()}
+            facts = {"gas": created.gas_used, "permit_fee": paid, "demand": demand.hash.hex()}
+            facts["offer"] = offer.hash.hex()
             with liability_context(created.liability):
                 log.info("created, gas %(gas)d", facts, extra=log_event("contract-created", **facts))
             if not await self.events.is_confirmed(match, created.tx):
@@ -774,8 +777,11 @@ class Settlement:
         for order in match if is_waiting else (match.offer,):
             self.rejections.reject(order, Refusal.UNPAID, self._parts.free.why(match, data_gas=data_gas))
 
-    def _creation(self, match: Match) -> Callable[[], Awaitable[CreatedContract]]:
-        """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`."""
+    def _creation(self, match: Match, fee: int) -> Callable[[], Awaitable[CreatedContract]]:
+        """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`.
+
+        With a `fee` for the demand's permit it raises `Reverted` if the permit can't be used any more.
+        """
         parts, (demand, offer), may_be_sent = self._parts, match, False
 
         async def attempt() -> CreatedContract:
@@ -785,6 +791,8 @@ class Settlement:
             await parts.store.keep_sent(parts.orders.sending(*match))
             try:
                 permit = await parts.chain.permits.needed_for(demand)
+                if fee and permit is None and not may_be_sent:
+                    raise Reverted(NOT_PERMITTED, arguments=(demand.signer,))
                 create = partial(parts.chain.liabilities.create, parts.lighthouse, demand.message, offer.message)
                 return await create(permit=permit)
             except (NodeUnreachable, TransactionTimeout):

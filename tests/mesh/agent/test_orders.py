@@ -46,7 +46,7 @@ async def test_open_orders_are_taken_up_again_with_their_allowance(
     chain = place.chains["person"]
     async with place.agent("person", enable_executor=False) as person:
         demand = await person.order(cid_of_bytes(b"dear work"), cost=7000)
-        other = await person.order(cid_of_bytes(b"cheap work"), validator_fee=11)
+        other = await person.order(cid_of_bytes(b"cheap work"), cost=11)
     async with place.agent("person", enable_executor=False) as person:
         assert [(order.hash, order.kind, order.state) for order in person.orders()] == [
             (demand.hash, "demand", OrderState.OPEN),

@@ -15,6 +15,8 @@ from mesh.chain import Account, DeploymentPlan
 from mesh.chain.deploy import XRT
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import deploy_market
+from mesh.errors import InputError
+from schemas import Demand
 from tests.mesh.agent.restarts import COST, speaking, words
 from tests.mesh.agent.trades import job, working
 from tests.support.market import MODEL, QUICK_RESEND, Founded, Place, offering
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from mesh.agent.agent import DemandTerms
     from tests.support.routers import EmbeddedRouter
 
 GENERATIONS = pytest.mark.parametrize("generation", [3, 5])
@@ -76,6 +79,83 @@ async def test_orders_at_once_share_a_permit(place: Place, generation: Literal[3
         contracts = await asyncio.gather(*(person.demand(job(place), cost=cost) for cost in costs))
         assert all([(await contract.outcome()).success for contract in contracts])
         assert await person.chain.tokens.balance() == FUNDS - sum(costs)
+
+
+FEE = 40_000
+
+
+@pytest.mark.sample("generation")
+@GENERATIONS
+async def test_the_provider_is_paid_for_the_permit(place: Place, generation: Literal[3, 5]) -> None:
+    async with (
+        place.provider() as provider,
+        working(place.agent("robot")),
+        penniless(place, generation) as person,
+        asyncio.timeout(60),
+    ):
+        had, cost = await place.balance("provider"), 5
+        contract = await person.demand(job(place), cost=cost, permit_fee=f"{FEE}wn")
+        assert contract.liability.validator_fee == FEE
+        assert (await contract.outcome()).success
+        await until(lambda: provider.earnings().finalized == 1)
+        earned = provider.earnings()
+        assert earned.fees == FEE
+        assert await place.balance("provider") == had + FEE + earned.minted
+        assert await person.chain.tokens.balance() == FUNDS - cost - FEE
+        (entry,) = (await person.statement()).entries
+        assert (entry.spent, entry.fee) == (cost + FEE, 0)
+
+
+async def test_a_permit_is_signed_for_the_fee_also_if_the_cost_is_approved(place: Place) -> None:
+    async with (
+        place.provider() as provider,
+        working(place.agent("robot")),
+        place.agent("person") as person,
+        asyncio.timeout(60),
+    ):
+        await person.chain.tokens.approve(person.chain.factory, FUNDS)
+        contract = await person.demand(job(place), cost=5, permit_fee=FEE)
+        assert (await contract.outcome()).success
+        assert provider.earnings().fees == FEE
+
+
+async def test_a_fee_without_a_permit_is_not_charged(place: Place) -> None:
+    """As demands of the legacy network may have one: the contracts took it for nothing there."""
+    async with (
+        place.provider() as provider,
+        working(place.agent("robot")),
+        place.agent("person") as person,
+        asyncio.timeout(60),
+    ):
+        await person.chain.tokens.approve(person.chain.factory, FUNDS)
+        had, cid = await place.balance("person"), await person.add(job(place))
+        terms = await person.runtime.trader.writer.terms(
+            model=MODEL, objective=cid, cost=5, token="", validator="", lifetime=500
+        )
+        demand = await person.runtime.trader.writer.sign(Demand, terms, validator_fee=FEE)
+        await person.parts.outbox.post(demand)
+        await until(lambda: provider.earnings().finalized == 1)
+        assert provider.earnings().fees == 0
+        assert await place.balance("person") == had - 5
+        entry = (await person.statement()).entries[-1]
+        assert (entry.spent, entry.liability.validator_fee) == (5, FEE)
+        await person.chain.tokens.approve(person.chain.factory, 0)
+
+
+@pytest.mark.parametrize("terms", [{"permit_fee": 1, "validator": "0x" + "11" * 20}, {"validator_fee": 1}])
+async def test_a_demand_has_one_fee(place: Place, terms: DemandTerms) -> None:
+    async with place.agent("person") as person:
+        with pytest.raises(InputError) as refused:
+            await person.order(job(place), cost=5, **terms)
+        assert refused.value.code == "fee-misplaced"
+
+
+@pytest.mark.usefixtures("without_permits")
+async def test_a_fee_for_a_permit_needs_a_token_with_permits(place: Place) -> None:
+    async with place.agent("person") as person:
+        with pytest.raises(InputError) as refused:
+            await person.order(job(place), cost=5, permit_fee=1)
+        assert refused.value.code == "token-without-permits"
 
 
 REFUND_DELAY = 40

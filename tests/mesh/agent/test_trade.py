@@ -170,8 +170,8 @@ async def test_a_refused_demand_does_not_count(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
         with pytest.raises(InsufficientTokens):
-            await person.demand(OBJECTIVE, cost=balance - 10, validator_fee=11)
-        demand = asyncio.create_task(person.demand(OBJECTIVE, cost=balance - 10, validator_fee=10))
+            await person.demand(OBJECTIVE, cost=balance - 10, permit_fee=11)
+        demand = asyncio.create_task(person.demand(OBJECTIVE, cost=balance - 10, permit_fee=10))
         await posted(person)
         demand.cancel()
         await asyncio.wait([demand])

@@ -62,6 +62,19 @@ def test_where_gas_is_worth_more_it_takes_more_to_cover_it() -> None:
     assert "0.000638 XRT" in free.why(pair())
 
 
+@pytest.mark.parametrize(
+    ("lacking", "fee", "terms"),
+    [
+        (0, 16_300, {"cost": COVERED}),
+        (16_299, 1, {"cost": COVERED}),
+        (0, 268_000 + 16_300, {"cost": 0}),
+        (COVERED + 16_300, 10**18, {"cost": COVERED, "token": "0x" + "11" * 20}),
+    ],
+)
+def test_the_fee_for_a_permit_covers_gas_if_it_is_in_xrt(lacking: int, fee: int, terms: dict[str, Any]) -> None:
+    assert made().lacking(pair(**terms), permit_fee=fee) == lacking
+
+
 def test_nothing_is_minted_for_work_among_oneself() -> None:
     alone = Match(verified_demand(cost=COVERED), verified_offer(signer=PERSON, cost=COVERED))
     own = pair(cost=COVERED, person=PROVIDER)
