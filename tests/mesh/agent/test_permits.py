@@ -146,7 +146,7 @@ async def test_a_fee_without_a_permit_is_not_charged(place: Place) -> None:
 async def test_a_demand_has_one_fee(place: Place, terms: DemandTerms) -> None:
     async with place.agent("person") as person:
         with pytest.raises(InputError) as refused:
-            await person.order(job(place), cost=5, **terms)
+            await person.order(job(place), **terms)
         assert refused.value.code == "fee-misplaced"
 
 

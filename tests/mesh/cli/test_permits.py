@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
-COST = 500_000
+COST, FEE = 500_000, 40_000
 ROBOT = f"""
 from mesh import Agent
 agent = Agent("{MODEL}")
@@ -43,15 +43,18 @@ async def test_a_person_needs_no_ether(anvil: Anvil, router: EmbeddedRouter, tmp
         first, had = await chain.block_number(), await chain.tokens.balance()
         sent = await chain.node.transaction_count(person, block="latest")
         robot = Serving(sys.executable, tmp_path / "robot.py", says="account 0x", variables=site.variables("robot"))
-        words = ("demand", "--model", MODEL, "--objective", str(site.job("work")), "--cost", f"{COST}wn", "--json")
+        words = ("demand", "--model", MODEL, "--objective", str(site.job("work")), "--cost", f"{COST}wn")
+        words = (*words, "--permit-fee", f"{FEE}wn", "--json")
         variables = site.variables("person", generation=generation)
         async with site.provider() as provider, robot:
             for _ in range(2):
                 ordered = await asyncio.to_thread(aira, *words, **variables)
                 assert ordered.returncode == 0, (ordered.stderr, provider.log(), robot.log())
-                assert json.loads(ordered.stdout.splitlines()[-1])["success"] is True
+                said = [json.loads(line) for line in ordered.stdout.splitlines()]
+                assert said[-1]["success"] is True
+                assert [one["permitFee"] for one in said if one.get("kind") == "posted"] == [str(FEE)]
         last = await chain.block_number()
         for block in range(first, last + 1):
             assert await chain.node.request("eth_getBalance", person, hex(block)) == "0x0"
         assert await chain.node.transaction_count(person, block="pending") == sent
-        assert await chain.tokens.balance() == had - 2 * COST
+        assert await chain.tokens.balance() == had - 2 * (COST + FEE)
