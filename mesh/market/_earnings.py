@@ -4,7 +4,7 @@ It creates those that cover its gas, its customers', and a number of free ones a
 costs the provider gas, and on OP-type rollups a fee for the data, which counts as the gas that it would buy. Three
 things cover it: the fee of the offer, the fee for the demand's permit, and what the factory mints when work was paid
 for. They count at the factory's rate, by default 1 wn for a unit of gas, and a fee for a permit only in XRT: what it is
-worth in another token is not known. Anybody can sign any number of orders that bring none of them, with keys made for it.
+worth in another token is not known. Anybody can sign any number of orders without them, with keys made for it.
 """
 
 from __future__ import annotations
