@@ -222,7 +222,9 @@ class Trader(Lifecycle):
         self._parts = parts
         self._chain = parts.chain
         self._address = parts.signer.address
-        self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address, parts.chain.permits)
+        self._allowances = Allowances(
+            parts.chain.tokens, parts.chain.factory, self._address, parts.chain.permits, self._carries_permits
+        )
         self._orders: dict[str, TradedOrder] = {}
         self.writer = TermsWriter(parts, self._orders)
         self.answers = OpenOffers()
@@ -463,6 +465,10 @@ class Trader(Lifecycle):
             await ensure(order, costs, permit=signed.token, always=permit_fee(signed) > 0)
         else:
             await ensure(order, costs)
+
+    async def _carries_permits(self) -> bool:
+        """Whether a provider here takes permits: those of 2018, behind a bridge, don't. Without ether, hope for one."""
+        return bool(await self._parts.channel.present("provider")) or not await self._chain.tokens.eth_balance()
 
     def _permit_for(self, demand: Demand) -> Permit | None:
         return self._chain.permits.own(demand.token)

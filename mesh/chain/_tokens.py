@@ -25,7 +25,7 @@ from schemas.address import ZERO_ADDRESS, is_ens_name, shortened
 from schemas.messages import Offer
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Hashable, Iterable, Mapping, Sequence
 
     from mesh.base.clock import Clock
     from mesh.chain._abi import ContractCall, ContractFunctions
@@ -247,11 +247,22 @@ def _lacks(funding: Funding | None, amount: int) -> str:
 
 
 class Allowances:
-    """The allowance of the factory: what the orders of `account` may cost, by order and token (smallest unit)."""
+    """The allowance of the factory: what the orders of `account` may cost, by order and token (smallest unit).
 
-    def __init__(self, tokens: Tokens, factory: str, account: str, permits: Permits | None = None) -> None:
+    With `permits` it may be signed instead of sent, where `is_carried` says that somebody will bring it to the token.
+    """
+
+    def __init__(
+        self,
+        tokens: Tokens,
+        factory: str,
+        account: str,
+        permits: Permits | None = None,
+        is_carried: Callable[[], Awaitable[bool]] | None = None,
+    ) -> None:
         self._tokens = tokens
         self._permits = permits
+        self._is_carried = is_carried
         self._factory = factory
         self._account = account
         self._open: dict[Hashable, Mapping[str, int]] = {}
@@ -302,8 +313,8 @@ class Allowances:
         balance, allowed = await tokens.balance_and_allowance(self._account, factory, token=token)
         if balance < funds:
             raise InsufficientTokens(self._account, token, balance=balance, needed=funds)
-        permits = self._permits if is_permitted and (always or allowed < needed) else None
-        if permits is not None and await permits.sign(token, needed) is not None:
+        is_signed = is_permitted and (always or (allowed < needed and await self._are_carried()))
+        if is_signed and self._permits is not None and await self._permits.sign(token, needed) is not None:
             facts = log_event("permit-signed", token=token, amount=needed)
             log.info("signed a permit for %d of token %s, so no transaction is needed", needed, token, extra=facts)
             return
@@ -321,6 +332,9 @@ class Allowances:
                 facts = log_event("allowance-retried", token=token, amount=allowance)
                 log.info("approving the allowance again: %s", error, extra=facts)
             allowed = await tokens.allowance(self._account, factory, token=token)
+
+    async def _are_carried(self) -> bool:
+        return self._is_carried is None or await self._is_carried()
 
     def _times(self, token: str, allowed: int) -> int:
         """How many times what is needed is approved: more and more, when contracts have used up what was approved.

@@ -10,7 +10,7 @@ from tests.contracts.market import Market
 from tests.contracts.suite import REFUND_DELAY, XRT, Suite
 
 if TYPE_CHECKING:
-    from tests.contracts.evm import Chain
+    from tests.contracts.chains import Chain
 
 pytestmark = pytest.mark.sample("market")
 

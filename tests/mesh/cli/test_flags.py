@@ -133,7 +133,7 @@ def test_listen_is_an_address_in_every_command() -> None:
 
 SERVERS = frozenset(
     {
-        *("board run", "bridge ipfs", "bridge ros1", "bridge ros2", "edge", "provider", "signer", "web"),
+        *("board run", "bridge ipfs", "bridge ros1", "bridge ros2", "edge", "provider", "signer", "web", "a2a"),
         *("foxglove agent", "foxglove job", "foxglove market"),
     }
 )
