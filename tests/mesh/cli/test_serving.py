@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.amounts import InvalidAmount
 from mesh.chain.errors import NodeUnreachable, UnknownName
 from mesh.errors import AiraError, ConfigurationError, InputError, NetworkUnavailable
 from mesh.recording import open_objective
@@ -201,7 +200,7 @@ def test_a_demand_without_keyfile_is_one_clear_line() -> None:
         (("--model", "blink", "--objective", SOME_CID), InputError, "'blink'"),
         (("--model", "no.model.3.robonomics.eth", "--objective", SOME_CID), UnknownName, "no.model.3.robonomics.eth"),
         ((*ORDER, SOME_CID, "--cost", str(10**30)), "balance-too-low", "XRT"),
-        ((*ORDER, SOME_CID, "--cost", "1wei"), InvalidAmount, "'1wei'"),
+        ((*ORDER, SOME_CID, "--cost", "1wei"), "unknown-token", "'wei'"),
         ((*ORDER, SOME_CID, "--validator-fee", "1"), "invalid-options", "--validator"),
     ],
 )
