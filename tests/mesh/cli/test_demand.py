@@ -254,6 +254,7 @@ async def test_a_cost_that_the_token_refuses_to_return_is_owed(site: Site, outpu
     async with site.chain("person") as chain:
         token = await deploy_blocking_token(chain, 100)
         await block(chain, token, site.address("person"))
+    robot.settings = replace(robot.settings, erc20_token=token)
 
     @robot.on_demand
     async def offer(demand: Verified[Demand]) -> None:

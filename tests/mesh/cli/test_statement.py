@@ -156,7 +156,7 @@ def test_a_symbol_that_is_a_formula_is_text_in_csv(fresh: ServedChain) -> None:
         cell.startswith(("=", "+", "-", "@")) for line in done.stdout.splitlines() for cell in line.split(",")
     )
     said = fresh.aira("statement", by="robot").stdout
-    assert f"0.000000007 =A1 {token[:6]}…{token[-4:]}" in said
+    assert f"0.000000007 =A1 ({token[:6]}…{token[-4:]})" in said
 
 
 def test_tokens_are_never_added_up_with_others(fresh: ServedChain) -> None:
