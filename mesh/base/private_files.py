@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import os
-import secrets
 import stat
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final
@@ -111,6 +110,8 @@ def kept_secret(path: Path, make: Callable[[], bytes], *, what: str, code: str) 
 
 def private_token(path: Path) -> str:
     """The token in a file that only this user can read, which is made if it is missing. Raises `ConfigurationError`."""
+    import secrets  # loads OpenSSL, which edge agents do without
+
     make = lambda: secrets.token_urlsafe(32).encode() + b"\n"  # noqa: E731
     content = kept_secret(path, make, what="token file", code="token-file-unusable")
     try:

