@@ -116,7 +116,7 @@ async def test_what_a_token_refused_to_pay_is_named_with_the_command_that_claims
 
     result = (await machine.examined("person", "person", erc20_token=token)).one("tokens")
     assert (result.status, result.code) == (CheckStatus.WARN, "tokens-owed")
-    assert "is owed 30 tokens" in result.message
+    assert "is owed 30 units (0x" in result.message
     assert "aira liability claim" in result.hint
 
 

@@ -31,7 +31,7 @@ def test_every_role_has_its_grants_and_every_grant_names_keys_of_the_mesh() -> N
 def test_every_family_of_keys_may_be_written_by_somebody() -> None:
     """The families with a `put` or a `serve` of their own; a new family must be thought of here."""
     written = {str(one) for one in get_args(Key)}
-    assert len(written) == 22
+    assert len(written) == 23
     grants = {
         key for role, grants in ROLES.items() if role != "router" for grant in grants for key in grant.keys
         if grant.rights & {Right.PUT, Right.SERVE, Right.TOKEN}
@@ -40,6 +40,7 @@ def test_every_family_of_keys_may_be_written_by_somebody() -> None:
         "demand",
         "offer",
         "withdrawal",
+        "permit",
         "result",
         "feedback",
         "pending",
@@ -86,7 +87,7 @@ def test_only_the_markets_of_the_roster_are_open() -> None:
 
     puts = next(one.keys for one in access_of(two) if one.right is Right.PUT)
 
-    markets = [f"aira/{market}/{keys}" for keys in ("demand/*", "withdrawal") for market in (MARKET, "b.eth")]
+    markets = [f"aira/{market}/{keys}" for keys in ("demand/*", "withdrawal", "permit") for market in (MARKET, "b.eth")]
     assert set(puts) == {f"aira/agent/{ARM}/**", *markets}
 
 
