@@ -6,7 +6,7 @@ A role says what events mean to it (`FollowsChain`), and `follow_chain` does the
     for each block    a reorganisation: `on_revert` for each event that it reverts, the newest first; `on_reorganised`
                       the records of new liabilities are read in one call
                       `on_event` for each event, in the order of the chain
-                      the cursor is stored (without events now and then), the head advances, `on_head`
+                      the cursor is stored (of quick blocks now and then), the head advances, `on_head`
     a failure         of the node, or a liability that it can't read any more: position again, after a delay
 
 Handling is idempotent. Before the events of a block are handled, the history that has them is stored with the cursor
@@ -38,6 +38,7 @@ from mesh.chain import (
     Reorganisation,
     RequestRefused,
 )
+from mesh.chain.following import QUICK
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Sequence
@@ -99,7 +100,7 @@ class ChainHead:
 
 
 SAVE_SECONDS: Final = 5.0
-"""How often a role saves how far it has read, where nothing happens: a restarted one reads these blocks again."""
+"""How often a role saves how far it has read, where blocks are quick and nothing happens."""
 
 
 class CursorStore(Protocol):
@@ -165,7 +166,7 @@ async def follow_chain(
     """
     read = read or chain.liabilities.get_all_with_orders
     kept, backoff = History(chain.node.timing.reorg_depth), Backoff(chain.node.timing.outage_retry)
-    save_at = 0.0
+    pace, save_at = SAVE_SECONDS if chain.node.profile.block_seconds < QUICK else 0.0, 0.0
     while True:
         last, history = await _position(chain, head, kept, store)
         try:
@@ -179,7 +180,7 @@ async def follow_chain(
                     is_news = bool(block.events) or isinstance(block, Reorganisation)
                     if store is not None and (is_news or time.monotonic() >= save_at):
                         await store.set_cursor(block.block_number, history=history.encode())
-                        save_at = time.monotonic() + SAVE_SECONDS
+                        save_at = time.monotonic() + pace
                     head.advance_to(block.block_number, contract_block)
                     await role.on_head(block.block_number)
                     backoff.reset()
