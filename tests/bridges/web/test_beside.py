@@ -88,6 +88,9 @@ def test_the_page_goes_on_when_its_market_is_started_afresh(tmp_path: Path) -> N
 
     with Serving(*AIRA, *up, says="provider    0x") as market, Serving(*AIRA, *web, says="page  ") as page:
         wait_until(is_connected, what="the page on the chain")
+        # Until it has read a block, it could not tell another chain of this length from this one.
+        connected_at = answer(f"{url}/market")["block"]
+        wait_until(lambda: answer(f"{url}/market")["block"] >= connected_at + 2, what="two more blocks on the page")
         market.end(signal.SIGINT)
         market.start()
         page.wait_until_said("the chain was started afresh")
