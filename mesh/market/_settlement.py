@@ -752,9 +752,11 @@ class Settlement:
         return await self._parts.chain.retrying(ask, outages=self._parts.lookups)
 
     def note_permit(self, permit: Verified[Permit]) -> None:
-        """Remember a permit beside a demand: its maker can pay by it."""
+        """Remember a permit beside a demand: its maker can pay by it. It is sent again as often as the demand is."""
         if permit.signer in self.blocked or not self._parts.chain.funds.note(permit.message):
-            self._parts.drops.count("permits", permit.signer)
+            known = self._parts.chain.permits.of(permit.signer, bytes.fromhex(permit.message.domain))
+            if permit.signer in self.blocked or known != permit.message:
+                self._parts.drops.count("permits", permit.signer)
             self._parts.forget(permit, after=self._pause)
 
     def _stakes(self, match: Match) -> Stakes:
