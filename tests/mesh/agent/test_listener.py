@@ -13,6 +13,7 @@ from mesh.chain import Chain, Timing
 from mesh.chain.following import RECENT
 from mesh.chain.liabilities import Liabilities
 from mesh.dev import JsonRpcServer
+from mesh.role import following
 from schemas import message_hash
 from tests.mesh.agent.listeners import RecordingListener, contract, finalize, ledger, listening, opened, started
 from tests.support.log_events import logged_events
@@ -142,7 +143,10 @@ async def test_a_block_that_was_not_handled_to_its_end_is_handled_again(place: P
     assert [liability.address for liability, *_ in listener.liabilities] == [address]
 
 
-async def test_the_head_is_reported_and_saved_as_the_chain_grows(place: Place, ledger: Ledger) -> None:
+async def test_the_head_is_reported_and_saved_as_the_chain_grows(
+    place: Place, ledger: Ledger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(following, "SAVE_SECONDS", 0.0)
     async with listening(place, ledger) as listener:
         await started(ledger)
         await place.node.mine(3)
