@@ -137,7 +137,8 @@ async def test_a_demand_is_handled_again_after_a_failure_that_passes(place: Plac
     async with place.at_work(robot) as person:
         await person.demand(place.save(objective(("/go", "there"))), cost=100)
         assert len(attempts) > len(set(attempts)) == 1
-        assert robot.drops.totals() == {error.code: 1}
+        others = {"unfunded"}  # the permit beside the demand may be read after it
+        assert {code: many for code, many in robot.drops.totals().items() if code not in others} == {error.code: 1}
 
 
 async def test_of_many_free_demands_few_are_handled(place: Place) -> None:
