@@ -99,6 +99,7 @@ async def test_a_job_changes_exactly_these_metrics_of_its_provider(place: Place)
         assert changes.pop("aira_minted_wn_total", 0) >= 0
         assert {name: value for name, value in changes.items() if "duplicate" not in name} == {
             "aira_messages_total{demand,accepted}": 1,
+            "aira_messages_total{permit,accepted}": 1,
             "aira_messages_total{offer,accepted}": 1,
             "aira_messages_total{result,accepted}": 1,
             "aira_matches_total": 1,
