@@ -343,6 +343,7 @@ class JobRun(Job):
         return await asyncio.to_thread(self._recorder.close, sync=sync)
 
     async def _save_regularly(self, ledger: Ledger) -> None:
+        _playing.set("")  # in this task: it is no handler, so its timer says nothing of one
         saved = self.position
         while True:
             await asyncio.sleep(SAVE_INTERVAL)
@@ -357,6 +358,7 @@ class JobRun(Job):
         return position
 
     async def _publish_regularly(self) -> None:
+        _playing.set("")  # in this task: it is no handler, so its timer says nothing of one
         published = None
         while True:
             if self.position != published:
