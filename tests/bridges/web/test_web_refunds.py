@@ -38,7 +38,7 @@ async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(
         async with (
             Place(Founded(node, market), router.endpoint, tmp_path) as place,
             place.provider(),
-            offering(place.agent("robot")),  # it has no handlers: its jobs wait for `start`
+            offering(place.agent("robot")) as robot,  # it has no handlers: its jobs wait for `start`
             opened(
                 place.settings("person"), account=market.accounts["person"], chain=place.chains["person"]
             ) as components,
@@ -52,6 +52,7 @@ async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(
             if is_refused:
                 wanted["token"] = token = await deploy_blocking_token(place.chains["person"], COST)
                 await block(place.chains["person"], token, market.accounts["person"].address)
+                await robot.control(least_price=f"1 {token}")
                 cost = 0  # of XRT
             order = (await browser.post("local/orders", wanted, status=202))["order"]["hash"]
 

@@ -10,6 +10,7 @@ import pytest
 from mesh.agent.ledger import Phase
 from mesh.watching import status_of
 from schemas.status import Status
+from tests.mesh.agent.conftest import without_permits  # noqa: F401
 from tests.mesh.cli.site import FEE, Site, has_event, has_traceback
 from tests.support.log_events import logged_facts
 from tests.support.waiting import until, until_found
@@ -97,6 +98,7 @@ async def test_a_reverted_contract_is_created_again_and_its_job_paid_once(
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("without_permits")
 async def test_orders_are_sent_again_only_with_their_allowance_when_a_reorganisation_reverted_it(
     anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -126,6 +128,7 @@ async def test_orders_are_sent_again_only_with_their_allowance_when_a_reorganisa
         assert done == ["again"]
 
 
+@pytest.mark.usefixtures("without_permits")
 async def test_the_allowance_of_an_open_order_is_ensured_again_when_a_reorganisation_reverted_it(
     anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
