@@ -15,7 +15,7 @@ PROGRAM = """
 import os, socket, sys
 from importlib import import_module
 
-import serial, aiohttp, web3  # what they import is theirs
+import a2a, aiohttp, mcp, serial, uvicorn, web3  # what they import is theirs
 
 class Hidden:
     def find_spec(self, name, path=None, target=None):

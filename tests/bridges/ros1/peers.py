@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import subprocess
+import tempfile
 import xmlrpc.client
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -28,6 +29,7 @@ def environment(master: str, folder: Path, messages: Path | None = None) -> dict
     return {
         "PATH": "/usr/bin:/bin",
         "HOME": str(folder),
+        "TMPDIR": tempfile.gettempdir(),
         "ROS_MASTER_URI": master,
         "ROS_IP": "127.0.0.1",
         "ROS_HOME": str(folder),

@@ -136,7 +136,7 @@ async def test_a_job_survives_the_kill_of_the_node(geth: Geth, site: Site) -> No
         outcome = await contract.outcome()
         made = await person.parts.chain.liabilities.list(promisee=person.address)
     assert outcome.success
-    assert done == ["survives"]
+    assert set(done) == {"survives"}  # twice if the node lost the block of the contract, which is made again then
     assert [one.address for one in made].count(contract.address) == 1
     assert await balances(site) == (before[0] - COST, before[1] + COST - FEE)
 
