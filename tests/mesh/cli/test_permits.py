@@ -43,8 +43,8 @@ async def test_a_person_needs_no_ether(anvil: Anvil, router: EmbeddedRouter, tmp
         first, had = await chain.block_number(), await chain.tokens.balance()
         sent = await chain.node.transaction_count(person, block="latest")
         robot = Serving(sys.executable, tmp_path / "robot.py", says="account 0x", variables=site.variables("robot"))
-        words = ("demand", "--model", MODEL, "--objective", str(site.job("work")), "--cost", f"{COST}wn")
-        words = (*words, "--permit-fee", f"{FEE}wn", "--json")
+        paid = ("--cost", f"{COST}wn", "--permit-fee", f"{FEE}wn")
+        words = ("demand", "--model", MODEL, "--objective", str(site.job("work")), *paid, "--json")
         variables = site.variables("person", generation=generation)
         async with site.provider() as provider, robot:
             for _ in range(2):
