@@ -54,7 +54,7 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
         from mesh.signer.client import SignerClient
     from bridges.web.access import server_tls
     from mesh.base.private_files import private_token
-    from mesh.signer.protocol import DOOR_SOCKET
+    from mesh.signer.protocol import DOOR_SOCKET, signer_folder
     from mesh.telemetry.metrics import listen_address
     from schemas import parse_address
 
@@ -73,16 +73,17 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
     key = await asyncio.to_thread(CardKey, state / "a2a-card-key.pem")
     store = TaskStore(state / "a2a.sqlite")
     async with AsyncExitStack() as stack:
-        signer = await stack.enter_async_context(SignerClient(options["socket"] or state / "signer" / DOOR_SOCKET))
+        signer = await stack.enter_async_context(
+            SignerClient(options["socket"] or signer_folder(settings) / DOOR_SOCKET)
+        )
         store.open()
         stack.callback(store.close)
         pusher = await stack.enter_async_context(Pusher(signer, store, anywhere=options["push_anywhere"]))
         door = A2aDoor(signer, store, pusher, robot=robot)
-        shown = f"[{host}]" if ":" in host else host
         card: list[Card] = []
         app = application(door, lambda: card[0], key, chosen.token)
         front = await stack.enter_async_context(AsgiServer(app, host, port, tls=tls, option="--http"))
-        url = options["url"].rstrip("/") or f"{'https' if tls else 'http'}://{shown}:{front.port}"
+        url = options["url"].rstrip("/") or front.url
         card.append(Card(signer, key, url, robot=robot))
         announce(log, "a2a-started", f"a2a         {url}", url=url)
         await asyncio.Event().wait()

@@ -28,7 +28,7 @@ from mesh.errors import AiraError
 from mesh.role.running import run_until_stopped
 from mesh.settings import StorageSettings
 from mesh.signer.policy import InvalidPolicy, parse_policy, read_policy_file
-from mesh.signer.protocol import DOOR_SOCKET, OWNER_SOCKET
+from mesh.signer.protocol import DOOR_SOCKET, OWNER_SOCKET, signer_folder
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -68,7 +68,7 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
         from bridges.mcp._door import McpDoor
         from mesh.signer.client import SignerClient
 
-    socket = options["socket"] or settings.state_directory / "signer" / DOOR_SOCKET
+    socket = options["socket"] or signer_folder(settings) / DOOR_SOCKET
     async with SignerClient(socket) as signer:
         server = McpDoor(signer).server
         if options["http"] is None:
@@ -88,8 +88,7 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
         app = application(server, chosen)
         async with AsyncExitStack() as stack:
             front = await stack.enter_async_context(AsgiServer(app, chosen.host, chosen.port, tls=tls, option="--http"))
-            host = f"[{chosen.host}]" if ":" in chosen.host else chosen.host
-            url = f"{'https' if tls else 'http'}://{host}:{front.port}{PATH}"
+            url = f"{front.url}{PATH}"
             announce(log, "mcp-started", f"mcp         {url}", url=url)
             await asyncio.Event().wait()
 
@@ -219,7 +218,7 @@ def _owner(settings: Settings, socket: Path | None) -> SignerClient:
     with needs_extra("mcp", "aira mcp"):
         from mesh.signer.client import SignerClient
 
-    return SignerClient(socket or settings.state_directory / "signer" / OWNER_SOCKET)
+    return SignerClient(socket or signer_folder(settings) / OWNER_SOCKET)
 
 
 def _print_words(digest: str, words: tuple[str, ...], *, as_json: bool) -> None:

@@ -62,6 +62,12 @@ class AsgiServer(Lifecycle):
         self.port = port
         """Where it listens."""
 
+    @property
+    def url(self) -> str:
+        """Where it is reached, without a path."""
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"{'http' if self._tls is None else 'https'}://{host}:{self.port}"
+
     async def _open(self, stack: AsyncExitStack) -> None:
         listening = await self._listen()
         stack.callback(listening.close)

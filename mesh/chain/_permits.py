@@ -108,7 +108,7 @@ class Permits:
         """A permit of the account, that the factory may take `value` of a token (address), and remember it.
 
         None if the token has no permits of EIP-2612, or refuses this one; also if its domain is not made of its own
-        name, version (`1` if it tells none) and address, since it could be that of a token which is worth more.
+        name, version (`1` if it has none) and address: it could be that of a token which is worth more.
 
         Raises `NodeUnreachable`, `RequestRefused`.
         """
@@ -189,7 +189,7 @@ class Permits:
 
 
 def _domain_of(name: bytes, version: bytes, chain_id: int, token: str) -> bytes | None:
-    """The domain (EIP-712) of a token that answers with this name and version; None if it tells no name."""
+    """The domain (EIP-712) of a token that answers with this name and version; None if it has no name."""
     try:
         (named,) = decode(["string"], name)
         (versioned,) = decode(["string"], version) if version else ("1",)

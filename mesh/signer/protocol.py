@@ -21,6 +21,9 @@ from mesh.errors import AiraError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
+
+    from mesh.settings import Settings
 
 DOOR_SOCKET: Final = "door.sock"
 OWNER_SOCKET: Final = "owner.sock"
@@ -28,6 +31,12 @@ LARGEST_REQUEST: Final = 1 << 20
 """Bytes of a request."""
 LARGEST_ANSWER: Final = 8 << 20
 """Bytes of an answer."""
+
+
+def signer_folder(settings: Settings) -> Path:
+    """Where a signer with these settings has its sockets."""
+    return settings.state_directory / "signer"
+
 
 Name: TypeAlias = Annotated[str, Meta(max_length=200)]
 JobId: TypeAlias = Annotated[str, Meta(pattern=r"^job-[0-9a-f]{16}$")]

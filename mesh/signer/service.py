@@ -126,11 +126,6 @@ CHOICES: Final = ("cheapest", "first")
 ORDER_EXPIRED: Final = SignerFailure(code="order-expired", message="no contract was made in time", next="order again")
 
 
-def signer_folder(settings: Settings) -> Path:
-    """Where a signer with these settings has its sockets."""
-    return settings.state_directory / "signer"
-
-
 class Signer(Lifecycle):
     """Serves the operations of `protocol` for an account: `async with Signer(settings, policy) as signer`.
 
@@ -158,7 +153,7 @@ class Signer(Lifecycle):
         self._policy_path = policy
         self._clock = clock
         self.agent = Agent(settings=self.settings, account=account, chain=chain, resend=resend)
-        self.folder = signer_folder(settings)
+        self.folder = protocol.signer_folder(settings)
         self._keys: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._changed: dict[str, asyncio.Event] = {}
         self._ticks: dict[str, int] = {}

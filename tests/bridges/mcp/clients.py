@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def _mode(version: str) -> str:
-    """How the SDK's client is told to speak a revision."""
+    """The mode in which the SDK's client speaks a revision."""
     return "legacy" if version == LATEST_HANDSHAKE_VERSION else "auto"
 
 

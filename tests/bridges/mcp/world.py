@@ -114,7 +114,7 @@ class World:
     def write_policy(
         self, *, above: str = "3 XRT", hour: str = "20 XRT", jobs: int = 2, by_client: bool = False
     ) -> None:
-        """The policy of the person, who has not put it into use yet."""
+        """The person's policy, which is not in use yet."""
         names = {"model": self.cid, "robot": self.robot}
         said = str(by_client).lower()
         self.policy.write_text(POLICY.format(above=above, hour=hour, jobs=jobs, by_client=said, **names))

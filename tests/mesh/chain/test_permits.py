@@ -45,7 +45,7 @@ async def test_a_permit_is_signed_for_a_token_that_has_its_own_domain(market: De
         permit = await chain.permits.sign(token, 1000)
         assert permit is not None
         assert chain.permits.own(token) == permit
-        assert await chain.permits.sign(chain.xrt, 1000) is not None, "whose version is not told, and 1"
+        assert await chain.permits.sign(chain.xrt, 1000) is not None, "it has no version, so 1"
 
 
 async def test_nothing_is_signed_for_a_token_with_the_domain_of_another(market: DeployedMarket) -> None:
