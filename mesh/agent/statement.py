@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from mesh.chain import Holding, permit_fee
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
 
@@ -123,6 +122,8 @@ async def read_statement(chain: Chain, account: str, *, since: int = 0, until: i
 
 
 def _entry(dated: Dated, account: str, gas: Mapping[str, GasPaid]) -> Entry:
+    from mesh.chain import Holding, permit_fee  # here, for importing an agent must not load the chain
+
     one, last = dated.liability, dated.ended or dated.created
     steps = {step.tx: gas[step.tx] for step in (dated.created, last)}.values()
     is_paid = one.state == "paid"
