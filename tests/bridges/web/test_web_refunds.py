@@ -70,7 +70,9 @@ async def test_the_cost_of_a_job_that_nobody_finishes_comes_back(
                 async with session.post(
                     f"{server.url}/api/v1/local/refunds", json={"liability": address}, headers={"X-Aira-Request": "1"}
                 ) as response:
-                    return response.status == 200
+                    is_here = response.status == 200
+                # The provider or the person's agent may have been faster.
+                return is_here or (await place.chains["provider"].liabilities.get(address)).state == "called-off"
 
             await until_found(refunded, what="the refund")
             assert await place.balance("person") == before
