@@ -632,14 +632,27 @@ class Settlement:
         order: Verified[Order],
         reason: str,
         detail: str = "its maker lacks the money, or the factory may not take it",
+        *,
+        patience: float = 0.0,
     ) -> None:
-        """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
-        now = asyncio.get_running_loop().time()
+        """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that.
+
+        Its maker is told, for an order that is new after `patience` seconds: its permit may come a moment later.
+        """
+        now, is_new = asyncio.get_running_loop().time(), self._parts.orders.state(order_id(order)) is None
         if self._parts.orders.is_paired(order):
             self.rejections.reject(order, reason, detail)
         elif self._parts.orders.set_aside(order, now=now, head=self._parts.head.head):
-            self.rejections.reject(order, reason, detail)  # each copy, because an earlier rejection may have been lost
+            if patience and is_new:
+                self._tasks.create_task(self._tell_later(order, reason, detail, patience))
+            else:  # each copy, because an earlier rejection may have been lost
+                self.rejections.reject(order, reason, detail)
         self._parts.forget(order, after=self._pause)
+
+    async def _tell_later(self, order: Verified[Order], reason: str, detail: str, patience: float) -> None:
+        await asyncio.sleep(patience)
+        if self._parts.orders.state(order_id(order)) is OrderStage.UNFUNDED:
+            self.rejections.reject(order, reason, detail)
 
     def withdraw(self, withdrawal: Verified[Withdrawal]) -> None:
         """Honour a withdrawal: its order leaves the book, and is refused until its deadline.

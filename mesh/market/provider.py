@@ -61,6 +61,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+PERMIT_SECONDS: Final = 1.0
+"""How long a provider waits for the permit of a new demand before it says that the demand can't be paid."""
 CHECKED: Final = 512
 """Orders whose makers' funds are asked for at once."""
 WAITING: Final = 32_768
@@ -149,7 +151,7 @@ class Arrivals:
         for order, shortage in zip(orders, await self._settlement.shortages(orders), strict=True):
             if shortage:
                 self._drops.count("unfunded", order.signer)
-                self._settlement.set_aside(order, shortage)
+                self._settlement.set_aside(order, shortage, patience=PERMIT_SECONDS)
             else:
                 self._settlement.add(order)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import pytest
 
-from mesh import Agent
+from mesh import Agent, Progress
 from mesh.chain import Account, DeploymentPlan
 from mesh.chain.deploy import XRT
 from mesh.dev import EmbeddedChain
@@ -64,6 +64,22 @@ async def test_a_person_without_ether_gets_a_job_done(place: Place, generation: 
         assert await tokens.balance() == FUNDS - 21 - 300 * 1000
         assert await tokens.allowance(person.address, person.chain.factory) == 0
         assert provider.earnings().created == 2
+
+
+async def test_nobody_is_told_of_a_permit_that_comes_a_moment_after_its_demand(place: Place) -> None:
+    heard: list[Progress] = []
+    async with place.provider(), working(place.agent("robot")), penniless(place, 3) as person, asyncio.timeout(60):
+        outbox = person.parts.outbox
+        permit_for, outbox.permit_for = outbox.permit_for, lambda _demand: None
+        order = await person.order(job(place), cost=21)
+        waiting = asyncio.create_task(order.contract(on_progress=heard.append))
+        await asyncio.sleep(0.3)
+        outbox.permit_for = permit_for
+        own = person.chain.permits.own(person.chain.xrt)
+        assert own is not None
+        person.channel.publish(own)
+        assert (await (await waiting).outcome()).success
+    assert "rejected" not in [progress.kind for progress in heard]
 
 
 @pytest.mark.sample("generation")
