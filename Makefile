@@ -17,8 +17,8 @@ TYPED := schemas mesh bridges peers tests bench examples documentation
 JOBS ?= $(shell echo $$((2 * $$(getconf _NPROCESSORS_ONLN))))
 # CI measures coverage, which takes time.
 COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
-# A busy machine may delay or drop what a test waits for. At most three tests run a second time, each with its traceback.
-RERUNS := --reruns 1 --max-suite-reruns 3 --rerun-show-tracebacks
+# A busy machine may delay or drop what a test waits for. At most eight tests run a second time, each with its traceback.
+RERUNS := --reruns 1 --max-suite-reruns 8 --rerun-show-tracebacks
 
 .PHONY: help setup demo test simulate simulate-mutants compose-test crash-test lint peers bench contracts contracts-check \
 	page page-check slither firmware docs pictures lock release upgrade-sample clean

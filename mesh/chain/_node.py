@@ -902,12 +902,15 @@ class Node:
     async def call_all(self, calls: Sequence[Call], *, gas: int, most: int) -> list[bytes | None]:
         """What each call returns, `most` bytes of it, and None if it fails, also because it needs more than `gas`.
 
-        Raises `Reverted` and `RequestRefused`, as when all calls together are too much for the node.
+        Asked again if the answer does not decode. Raises `Reverted` and `RequestRefused`, as when all calls together
+        are too much for the node.
         """
-        try:
-            return await self._call_together(calls, "latest", gas=gas, most=most)
-        except SpoiledAnswer as error:
-            raise InvalidAnswer(f"{len(calls)} calls in one", str(error)) from None
+        for _ in range(READ_ATTEMPTS):
+            try:
+                return await self._call_together(calls, "latest", gas=gas, most=most)
+            except SpoiledAnswer as error:
+                failure = error
+        raise InvalidAnswer(f"{len(calls)} calls in one", str(failure))
 
     async def _call_together(
         self, calls: Sequence[Call], block: int | str, *, gas: int = UNLIMITED_GAS, most: int = LONGEST

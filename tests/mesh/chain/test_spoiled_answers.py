@@ -110,6 +110,19 @@ async def test_a_node_that_says_it_has_no_latest_block_is_asked_again(anvil: Anv
         assert proxy.spoiled.total()
 
 
+async def test_a_permit_is_signed_through_a_node_that_at_times_lacks_the_contracts(
+    market: DeployedMarket, anvil: Anvil
+) -> None:
+    """What several functions return comes in one answer, which is asked for again if it is empty."""
+    emptying: dict[str, Any] = {"methods": frozenset({"eth_call"}), "kinds": ("emptied",), "rate": 0.0}
+    async with SpoilingProxy(anvil.url, seed=1, **emptying) as proxy:
+        async with Chain(proxy.url, account=market.stranger, ens=market.deployment.ens, timing=PATIENT) as chain:
+            proxy.rate = 0.1
+            for value in range(1, 21):
+                assert await chain.permits.sign(chain.xrt, value) is not None
+        assert proxy.spoiled.total()
+
+
 @pytest.mark.sample("kind")
 @pytest.mark.parametrize("method", ANSWERS)
 @pytest.mark.parametrize("kind", KINDS)
