@@ -1,15 +1,17 @@
-"""Whole jobs on geth by the rules of today's Ethereum: in both generations, refunded, judged, while it is killed."""
+"""Whole jobs on geth by the rules of today's Ethereum: by permit, refunded, judged, while it is killed."""
 
 from __future__ import annotations
 
 import asyncio
+import secrets
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
+from mesh.chain import Account
 from mesh.chain.deploy import DeploymentPlan
 from schemas import Result
-from tests.mesh.cli.site import FEE, GENERATION_5, Site
+from tests.mesh.cli.site import FEE, GENERATION_5, Site, has_event
 from tests.support.nodes import Geth
 from tests.support.waiting import until, until_found
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 COST: Final = 700
+PERMIT_FEE: Final = 40
 REFUND_DELAY: Final = 30
 """Blocks."""
 TIMEOUT: Final = 120.0
@@ -68,6 +71,34 @@ async def test_a_job_is_done_and_paid_once(geth: Geth, site: Site, generation: i
     assert done == ["once"]
     after = await balances(site)
     assert after == (before[0] - COST, before[1] + COST - FEE)
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_a_person_without_ether_has_a_job_done_by_permit(site: Site, generation: int) -> None:
+    options: dict[str, Any] = GENERATION_5 | {"generation": 5} if generation == 5 else {}
+    site.accounts["penniless"] = account = Account(secrets.token_bytes(32))
+    async with site.chain("person") as chain:
+        first = await chain.block_number()
+        await chain.tokens.transfer(account.address, COST + PERMIT_FEE)
+    done: list[str] = []
+    paid = (await balances(site))[1]
+    async with (
+        asyncio.timeout(TIMEOUT),
+        site.provider() as provider,
+        site.robot(done, **options),
+        site.agent("penniless", **options) as person,
+    ):
+        chain = person.parts.chain
+        assert await chain.tokens.allowance(account.address, chain.factory) == 0
+        contract = await person.demand(site.job("permitted"), cost=COST, permit_fee=PERMIT_FEE)
+        assert (await contract.outcome()).success
+        assert done == ["permitted"]
+        assert has_event(provider, "contract-created", liability=contract.address, permit_fee=str(PERMIT_FEE))
+        assert await chain.tokens.balance() == 0
+        assert await chain.node.transaction_count(account.address, block="pending") == 0
+        for block in range(first, await chain.block_number() + 1):
+            assert await chain.node.request("eth_getBalance", account.address, hex(block)) == "0x0"
+    assert (await balances(site))[1] == paid + COST - FEE
 
 
 async def test_a_validator_judges_and_pays(site: Site) -> None:
