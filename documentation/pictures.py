@@ -13,25 +13,16 @@ from documentation.staging import ROOT
 
 PICTURES: Final = ROOT / "docs" / "pictures"
 QUALITY: Final = 80
-MOMENTS: Final = {
-    "page-job.webp": "job-live.png",
-    "page-order.webp": "quotes.png",
-    "page-order-phone.webp": "form-phone-light.png",
-    "page-robots.webp": "robots-two.png",
-}
-"""Pictures of moments that a test brings about, with its screenshot; the others are of pages as one comes to them."""
 
 
 def screenshot(picture: str) -> str:
-    """The file that a test writes for a picture: `page-job-done-phone-dark.webp` is that of a job, on a phone, dark.
+    """The file that a test writes for a picture: `page-job-done-phone-dark.webp` is a done job on a phone, dark.
 
     What a tutorial ends with has the tutorial's name.
     """
-    if picture in MOMENTS:
-        return MOMENTS[picture]
     if (ROOT / "docs" / "tutorials" / picture).with_suffix(".md").exists():
         return f"{Path(picture).stem}.png"
-    found = re.fullmatch(r"page-([a-z]+(?:-away)?)(?:-done)?(-phone)?(-dark)?\.webp", picture)
+    found = re.fullmatch(r"page-([a-z-]+?)(-phone)?(-dark)?\.webp", picture)
     if not found:
         raise ValueError(f"{picture}: no test makes a picture of this name")
     return f"{found[1]}-{'phone' if found[2] else 'desktop'}-{'dark' if found[3] else 'light'}.png"

@@ -135,7 +135,7 @@ def test_every_bar_is_a_number_of_its_benchmark() -> None:
 
 def test_every_picture_is_a_screenshot_of_a_test() -> None:
     tests = "".join(path.read_text() for path in sorted((ROOT / "tests" / "web").glob("test_*.py")))
-    made = ('"{}": ', "{}-{{look}}", '/ "{}"')
+    made = ('"{}": ', "{}-{{look(", 'pictures, "{}"')
     assert [page for page in pages_in_pictures() if not any(form.format(page) in tests for form in made)] == []
 
 

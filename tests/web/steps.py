@@ -6,6 +6,8 @@ import json
 import urllib.request
 from typing import TYPE_CHECKING, Any, Final
 
+from tests.web.browser import DESKTOP, PHONE
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -112,6 +114,20 @@ boxes.forEach((one, place) => {
 return found;
 """
 """Texts that cover each other."""
+
+
+def check_looks(browser: Browser, pictures: Path, name: str) -> None:
+    """Check what is shown on a desk and on a phone, light and dark."""
+    for size in (PHONE, DESKTOP):
+        for dark in (True, False):
+            browser.resize(size)
+            browser.set_dark(dark)
+            check(browser, pictures / f"{name}-{look(size, dark)}")
+
+
+def look(size: tuple[int, int], dark: bool) -> str:
+    """How the file of a screenshot ends."""
+    return f"{'phone' if size == PHONE else 'desktop'}-{'dark' if dark else 'light'}.png"
 
 
 def check(browser: Browser, picture: Path) -> None:

@@ -14,7 +14,7 @@ from selenium.webdriver.common.keys import Keys
 from schemas.model import parse_description
 from tests.support.objectives import objective
 from tests.web.browser import DESKTOP, PHONE, Browser
-from tests.web.steps import check, facts, fill_in, objective_values, review
+from tests.web.steps import check, facts, fill_in, look, objective_values, review
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -218,14 +218,13 @@ def test_a_signature_that_comes_after_the_dialog_was_closed_orders_nothing(form:
 def test_the_form_and_the_dialog_can_be_read(form: Browser, pictures: Path, size: tuple[int, int], dark: bool) -> None:
     form.resize(size)
     form.set_dark(dark)
-    look = f"{'phone' if size == PHONE else 'desktop'}-{'dark' if dark else 'light'}.png"
     field(form, "Angle").send_keys("2,5")
     field(form, "Ticks").send_keys("1.5")
     form.find(".field.wrong")
-    check(form, pictures / f"numbers-{look}")
+    check(form, pictures / f"numbers-{look(size, dark)}")
     field(form, "Ticks").send_keys("3")
     review(form)
-    check(form, pictures / f"words-{look}")
+    check(form, pictures / f"words-{look(size, dark)}")
 
 
 def test_a_topic_with_one_number_has_no_blank_plot(form: Browser, site: Site) -> None:

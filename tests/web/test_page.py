@@ -13,7 +13,7 @@ from selenium.webdriver.common.keys import Keys
 from tests.support.commands import Serving
 from tests.support.ports import free_port
 from tests.web.browser import DESKTOP, PHONE, Browser
-from tests.web.steps import anybody, check, facts, fill_in, order, review, sign
+from tests.web.steps import anybody, check, facts, fill_in, look, order, review, sign
 
 UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
@@ -239,15 +239,14 @@ def test_a_robots_own_page_has_one_button_and_fits_in_a_frame(site: Site, tmp_pa
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 def test_each_page_is_accessible(site: Site, paid_job: str, pictures: Path, size: tuple[int, int], dark: bool) -> None:
-    look = f"{'phone' if size == PHONE else 'desktop'}-{'dark' if dark else 'light'}.png"
     with Browser(site.url, site.wallet(), size=size, dark=dark) as browser:
         browser.go()
         browser.connect()
         assert browser.wallet
         robot = facts(site, f"liabilities/{paid_job}")["liability"]["promisor"]
-        routes = {"robots": "", "robot": f"robot/{robot}", "market": "market", "jobs": "jobs", "site": "site"}
+        routes = {"home": "", "robot": f"robot/{robot}", "market": "market", "jobs": "jobs", "site": "site"}
         routes |= {"lighthouse": "site/lighthouse", "account": f"account/{browser.wallet.address}"}
-        routes |= {"job": f"job/{paid_job}"}
+        routes |= {"job-done": f"job/{paid_job}"}
         for name, route in routes.items():
             browser.go(route)
             browser.until(lambda: not browser.all("[aria-busy=true]") and browser.all("h1"), name)
@@ -255,12 +254,12 @@ def test_each_page_is_accessible(site: Site, paid_job: str, pictures: Path, size
                 browser.press("Details")
                 browser.click("#log summary")
                 browser.until(lambda: not browser.all("[aria-busy=true]"), "the log")
-            if name == "job":
+            if name == "job-done":
                 browser.until(lambda: len(browser.all(".findings .badge.good")) >= 18, "all checks")
                 browser.find(".path canvas, .path svg")
-            check(browser, pictures / f"{name}-{look}")
+            check(browser, pictures / f"{name}-{look(size, dark)}")
         fill_in(browser, site)
         review(browser)
-        check(browser, pictures / f"review-{look}")
+        check(browser, pictures / f"review-{look(size, dark)}")
         browser.press("Not now")
-        check(browser, pictures / f"form-{look}")
+        check(browser, pictures / f"form-{look(size, dark)}")

@@ -17,23 +17,15 @@ import pytest
 from selenium.webdriver.common.keys import Keys
 
 from tests.support.commands import Serving, aira
-from tests.web.browser import DESKTOP, PHONE, Browser
+from tests.web.browser import Browser
 from tests.web.conftest import HERE
-from tests.web.steps import check, facts, fill_in, sign
+from tests.web.steps import check, check_looks, facts, fill_in, sign
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
     from tests.web.conftest import Site
-
-
-LOOKS = [
-    (f"{name}-{'dark' if dark else 'light'}", size, dark)
-    for name, size in (("desktop", DESKTOP), ("phone", PHONE))
-    for dark in (False, True)
-]
-"""Screens on which a page is looked at."""
 
 
 CLICKS: Final = "window.clicks = 0; addEventListener('click', (event) => { clicks += event.isTrusted; }, true)"
@@ -93,7 +85,7 @@ def test_a_newcomer_orders_from_the_cheaper_robot_watches_it_and_stops_it(
         browser.go()
         browser.sees("Scout")
         browser.sees("Digger")
-        check(browser, pictures / "robots-two.png")
+        check_looks(browser, pictures, "robots")
         browser.press("Order")
         browser.click(f"#{browser.label('Duration').get_attribute('for')}")
         for key in (Keys.HOME, Keys.DELETE, "6", "0"):
@@ -102,7 +94,7 @@ def test_a_newcomer_orders_from_the_cheaper_robot_watches_it_and_stops_it(
         prices = [float(price.text.split()[0]) for price in browser.all(".quote .price-tag")]
         assert min(prices) == 2.5 < max(prices)
         browser.click(f".quote [value='{scout}']")
-        check(browser, pictures / "quotes.png")
+        check_looks(browser, pictures, "quotes")
         browser.click("#order:not([disabled])")
         assert "Duration\n60 s" in browser.find("#in-words").text
         assert "2.5 XRT" in browser.find("dialog[open]").text
@@ -118,7 +110,7 @@ def test_a_newcomer_orders_from_the_cheaper_robot_watches_it_and_stops_it(
         browser.until(lambda: browser.find(".path figcaption").text not in shown, "the next position")
         browser.driver.refresh()  # what came before is shown again
         browser.sees("/position")
-        check(browser, pictures / "job-live.png")
+        check_looks(browser, pictures, "job")
         browser.click("#stop")
         browser.sees("You get the price back.")
         browser.click("#stop-now")
@@ -181,10 +173,7 @@ def test_an_owner_changes_the_price_sees_the_notification_and_its_job_and_downlo
         browser.sees("It finishes its jobs and takes no new ones.")
         browser.sees("takes no jobs now")
         browser.until(lambda: "2.5 XRT" in browser.find(".owner .lead").text, "the income")
-        for look, size, dark in LOOKS:
-            browser.resize(size)
-            browser.set_dark(dark)
-            check(browser, pictures / f"owner-{look}.png")
+        check_looks(browser, pictures, "owner")
         with urllib.request.urlopen(browser.find("#statement").get_attribute("href") or "", timeout=30) as answer:
             rows = list(csv.DictReader(io.StringIO(answer.read().decode())))
         assert [row["earned"] for row in rows if row["state"] == "paid"] == ["2.5"]
@@ -219,20 +208,14 @@ def test_a_robot_that_left_stands_as_away_with_what_it_read_and_did_before_anybo
             browser.go()
         browser.sees("away since")
         assert not browser.all(f".robots a[href*='{rover}']")
-        for look, size, dark in LOOKS:
-            browser.resize(size)
-            browser.set_dark(dark)
-            check(browser, pictures / f"away-{look}.png")
+        check_looks(browser, pictures, "away")
         browser.press("Rover")
         browser.sees("What it read last")
         browser.find(".tracks canvas")
         assert charges(url, rover)[: len(before)] == before
         browser.find(f".list-row[href='#/job/{job}']")
         assert not browser.all("a[href*='#/order/model/']")
-        for look, size, dark in LOOKS:
-            browser.resize(size)
-            browser.set_dark(dark)
-            check(browser, pictures / f"robot-away-{look}.png")
+        check_looks(browser, pictures, "robot-away")
 
 
 def charges(url: str, robot: str) -> list[float]:
