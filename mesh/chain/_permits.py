@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from mesh.base.clock import Clock
     from mesh.chain._contracts import Contracts
-    from schemas import Demand, Liability, Verified
+    from schemas import Demand, Liability
 
 LIFETIME: Final = 7 * 86_400
 """Seconds for which a permit is valid that is signed here: longer than orders wait."""
@@ -75,14 +75,15 @@ class Permits:
     def note(self, permit: Permit) -> bool:
         """Remember a signed permit, whose signer is its owner; whether it is better than what was known.
 
-        One is better that has a later nonce or, with the same, approves more or for longer. It must be for the factory.
+        One is better with a later nonce or, with the same, if it approves more or for longer; any is better than an
+        expired one. It must be for the factory.
         """
         is_taken = self._contracts.version.takes_permits and permit.spender == self._contracts.factory
         if not is_taken or self._is_over(permit):
             return False
         permits = self._known.get(permit.owner, {})
         known = permits.get(permit.domain)
-        if len(permits) >= PER_OWNER if known is None else _rank(known) >= _rank(permit):
+        if len(permits) >= PER_OWNER if known is None else _rank(known) >= _rank(permit) and not self._is_over(known):
             return False
         self._known[permit.owner] = permits | {permit.domain: permit}
         return True
@@ -144,33 +145,6 @@ class Permits:
             return await self._told(token, ZERO_ADDRESS) is not None
         except (Reverted, NoContracts):
             return False
-
-    async def needed_for(self, demand: Verified[Demand]) -> Permit | None:
-        """The permit to create a demand's contract with; None if it needs none, or none is known that may help.
-
-        Raises `NodeUnreachable`, `RequestRefused`.
-        """
-        order, owner = demand.message, demand.signer
-        if not self.has_any_of(owner):
-            return None
-        functions, fee = self._node.contract("XRT", order.token), permit_fee(order)
-        asked = (
-            functions.allowance(owner, self._contracts.factory),
-            functions.nonces(owner),
-            functions.DOMAIN_SEPARATOR(),
-        )
-        try:
-            answers = await self._node.call_all([(order.token, one.data) for one in asked], gas=TOKEN_GAS, most=_WORD)
-        except (Reverted, NoContracts):
-            return None
-        allowed, nonce, domain = answers
-        permit = self.of(owner, domain)
-        if permit is None or allowed is None or nonce is None:
-            return None
-        if int.from_bytes(nonce) == permit.nonce:
-            return permit if fee or int.from_bytes(allowed) < order.cost else None
-        # Somebody has brought it to the token, so the allowance stands; it still says that its owner pays the fee.
-        return permit if fee and int.from_bytes(nonce) == permit.nonce + 1 else None
 
     async def _told(self, token: str, owner: str) -> tuple[bytes, bytes] | None:
         """A token's domain and the owner's nonce, a word each; None if the contracts or the token take no permits."""

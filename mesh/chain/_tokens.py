@@ -17,6 +17,7 @@ from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import BoundedDict
 from mesh.base.log_context import log_event
 from mesh.chain._abi import decode
+from mesh.chain._permits import TOKEN_GAS, permit_fee
 from mesh.chain.errors import InsufficientTokens, NoContracts, RequestRefused, Reverted
 from mesh.chain.following import Approval, decode_log, topics_of
 from mesh.errors import ChainError, InputError
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from mesh.chain._contracts import Contracts
     from mesh.chain._node import Call, Node
     from mesh.chain._permits import Permits
-    from schemas import Liability, Permit, Verified
+    from schemas import Demand, Liability, Permit, Verified
     from schemas.messages import Order
 
 
@@ -42,8 +43,6 @@ BATCH: Final = 256
 """Accounts in one request: the answers are 18 KB, of 24 that a node returns (EIP-170)."""
 AT_ONCE: Final = 4
 """Requests at a time."""
-TOKEN_GAS: Final = 100_000
-"""Gas for each question to a token."""
 KEPT_POLLS: Final = 3
 """Intervals between polls of the chain for which an answer is used."""
 SHORT_POLLS: Final = 0.25
@@ -146,6 +145,34 @@ class Funds:
         if is_better:
             self._known.pop(Holding(permit.token, permit.owner), None)
         return is_better
+
+    async def permit_for(self, demand: Verified[Demand]) -> Permit | None:
+        """The permit to create a demand's contract with; None if it needs none, or none is known that may help.
+
+        Raises `NodeUnreachable`, `RequestRefused`.
+        """
+        order, owner = demand.message, demand.signer
+        if not self._permits.has_any_of(owner):
+            return None
+        node, fee, cost = self._contracts.node, permit_fee(order), self.cost_of(order)[order.token]
+        functions = node.contract("XRT", order.token)
+        asked = (
+            functions.allowance(owner, self._contracts.factory),
+            functions.nonces(owner),
+            functions.DOMAIN_SEPARATOR(),
+        )
+        try:
+            answers = await node.call_all([(order.token, one.data) for one in asked], gas=TOKEN_GAS, most=_WORD)
+        except (Reverted, NoContracts):
+            return None
+        allowed, nonce, domain = answers
+        permit = self._permits.of(owner, domain)
+        if permit is None or allowed is None or nonce is None:
+            return None
+        if int.from_bytes(nonce) == permit.nonce:
+            return permit if fee or int.from_bytes(allowed) < cost else None
+        # Somebody has brought it to the token, so the allowance stands; it still says that its owner pays the fee.
+        return permit if fee and int.from_bytes(nonce) == permit.nonce + 1 else None
 
     async def shortages(self, orders: Sequence[Verified[Order]], *, fresh: bool = False) -> list[str]:
         """What each order's maker lacks to pay what the order costs it, as the contracts call it; empty if nothing.

@@ -761,7 +761,7 @@ class Settlement:
 
     async def _permit(self, match: Match) -> Permit | None:
         """The permit with which a match's liability would be created now."""
-        ask = partial(self._parts.chain.permits.needed_for, match.demand)
+        ask = partial(self._parts.chain.funds.permit_for, match.demand)
         return await self._parts.chain.retrying(ask, outages=self._parts.lookups)
 
     def note_permit(self, permit: Verified[Permit]) -> None:
@@ -805,7 +805,7 @@ class Settlement:
                 raise MatchWithdrawn("an order was withdrawn or replaced before its contract was created")
             await parts.store.keep_sent(parts.orders.sending(*match))
             try:
-                permit = await parts.chain.permits.needed_for(demand)
+                permit = await parts.chain.funds.permit_for(demand)
                 if fee and permit is None and not may_be_sent:
                     raise Reverted(NOT_PERMITTED, arguments=(demand.signer,))
                 create = partial(parts.chain.liabilities.create, parts.lighthouse, demand.message, offer.message)

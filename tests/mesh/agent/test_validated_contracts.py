@@ -315,6 +315,13 @@ async def test_a_report_of_a_stranger_to_the_jury_does_not_count(place: Place) -
         assert await contract.reports() == ()
 
 
+async def test_an_allowance_that_covers_the_price_alone_is_no_reason_to_leave_out_the_permit(place: Place) -> None:
+    person = place.chains["person"]
+    await person.tokens.approve(person.factory, 50)
+    async with asyncio.timeout(60), under_a_jury(place) as (_, _, _, _, contract):
+        assert (contract.liability.cost, contract.liability.validator_fee) == (5, 100)
+
+
 async def test_a_validator_without_code_is_refused_before_anything_is_signed(place: Place) -> None:
     async with place.agent("person", generation=5) as person:
         with raises_with(InputError, code="validator-without-code"):

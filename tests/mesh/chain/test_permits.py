@@ -10,10 +10,11 @@ from msgspec.structs import replace
 
 from mesh.chain import TransactionSender
 from mesh.chain._abi import encode
-from mesh.chain._permits import PER_OWNER
+from mesh.chain._permits import PER_OWNER, Permits
 from schemas import ZERO_ADDRESS, Permit, keccak256, verify_message
 from tests.contracts.suite import artifact
 from tests.support import orders
+from tests.support.clocks import SECOND, SetClock
 
 if TYPE_CHECKING:
     from mesh.chain import Account, Chain
@@ -76,7 +77,7 @@ async def test_a_copy_that_names_another_token_takes_no_permits_place(market: De
         for permit, cost in ((true, 1000), (other, 2000)):
             named = token if permit is true else chain.xrt
             demand = verify_message(orders.demand(signer=person.signer, token=named, cost=cost))
-            found = await chain.permits.needed_for(demand)
+            found = await chain.funds.permit_for(demand)
             assert found is not None
             assert found.signature == permit.signature
             assert "Allowance" not in (await chain.funds.shortages([demand]))[0]
@@ -88,6 +89,18 @@ async def test_permits_of_one_owner_are_bounded(market: DeployedMarket) -> None:
         assert [chain.permits.note(permit) for permit in made] == PER_OWNER * [True] + [False]
         assert chain.permits.note(permit_of(market.stranger, chain, domain=made[0].domain, nonce=1))
         assert len(chain.permits) == PER_OWNER
+
+
+async def test_a_permit_takes_the_place_of_one_that_is_expired(market: DeployedMarket) -> None:
+    clock = SetClock(time.time_ns())
+    async with market.chain() as chain:
+        permits = Permits(chain.permits._contracts, clock=clock)
+        assert permits.note(permit_of(market.stranger, chain, value=2000))
+        less = permit_of(market.stranger, chain, deadline=int(time.time()) + 7200)
+        assert not permits.note(less)
+        clock.pass_by(3601 * SECOND)
+        assert permits.note(less)
+        assert [*permits] == [less]
 
 
 @pytest.mark.parametrize("fields", [{"spender": "0x" + "11" * 20}, {"deadline": 1}])
