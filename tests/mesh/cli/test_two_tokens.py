@@ -90,12 +90,12 @@ class TwoTokens:
     def variables(self, role: str, **options: str) -> dict[str, str]:
         return self.site.variables(role, chain="base", confirmations="1", **options)
 
-    async def call(self, *words: str) -> Any:
-        return await asyncio.to_thread(aira, *words, **self.variables("person"))
+    async def call(self, *words: str, **options: str) -> Any:
+        return await asyncio.to_thread(aira, *words, **self.variables("person", **options))
 
-    async def demand(self, word: str, *options: str) -> Any:
+    async def demand(self, word: str, *words: str, **options: str) -> Any:
         job = ("--model", str(self.model), "--objective", str(self.site.job(word)))
-        return await self.call("demand", *job, *options)
+        return await self.call("demand", *job, *words, **options)
 
     async def balances(self, role: str) -> tuple[int, int]:
         """What an account has of XRT (wn) and USDC (millionths)."""
@@ -139,6 +139,34 @@ async def test_each_robot_is_paid_in_its_token_and_prices_are_compared_within_on
     assert "1 contract paid: 3.5 USDC" in listed.stdout
     spent = json.loads((await market.call("statement", "--json")).stdout)["sums"]
     assert {(one["symbol"], one["spent"]) for one in spent} == {("XRT", "5000000000"), ("USDC", "3500000")}
+
+
+@pytest.mark.parametrize("generation", ["3", "5"])
+async def test_a_person_without_ether_pays_in_both_tokens_by_permits(market: TwoTokens, generation: str) -> None:
+    """USDC's permits have another domain than XRT's, and two of one owner travel at a time."""
+    person = market.site.address("person")
+    orders = {"up": ("Lift 1", "5 XRT", "0.001 XRT"), "down": ("Lift 2", "3.50 USDC", "0.02 USDC")}
+    robot, rival, had = [await market.balances(role) for role in ("robot", "rival", "person")]
+    async with market.site.chain("person") as chain:
+        for token in (chain.xrt, USDC):
+            await chain.tokens.approve(chain.factory, 0, token=token)
+        await chain.node.request("anvil_setBalance", person, "0x0")
+        first, sent = await chain.block_number(), await chain.node.transaction_count(person, block="latest")
+        async with market.at_work():
+            done = await asyncio.gather(
+                *(
+                    market.demand(word, "--robot", name, "--cost", cost, "--permit-fee", fee, generation=generation)
+                    for word, (name, cost, fee) in orders.items()
+                )
+            )
+        assert [one.returncode for one in done] == [0, 0], [one.stdout + one.stderr for one in done]
+        for block in range(first, await chain.block_number() + 1):
+            assert await chain.node.request("eth_getBalance", person, hex(block)) == "0x0"
+        assert await chain.node.transaction_count(person, block="pending") == sent
+    five, half = 5 * 10**XRT.decimals, 7 * DOLLAR // 2
+    assert await market.balances("robot") == (robot[0] + five, 0)
+    assert await market.balances("rival") == (rival[0], half)
+    assert await market.balances("person") == (had[0] - five - 10**XRT.decimals // 1000, had[1] - half - DOLLAR // 50)
 
 
 async def test_a_token_that_only_calls_itself_usdc_is_shown_with_its_address(market: TwoTokens) -> None:
