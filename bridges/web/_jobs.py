@@ -13,6 +13,7 @@ from bridges.web._market import liability_json, result_json
 from bridges.web._robots import LastSeen, profile_json
 from mesh.agent.contracts import refusal
 from mesh.agent.jobs import ROBOT_STOPPED, STOPPED, read_reason
+from mesh.agent.trade import are_permits_carried
 from mesh.base.flood import BoundedDict
 from mesh.chain import NotOffered
 from mesh.errors import AiraError
@@ -203,14 +204,18 @@ class Views:
         }
 
     async def account(self, address: str) -> dict[str, Any]:
-        """Balances, allowances, the next nonce, orders and jobs of an account. Raises `ChainError`."""
+        """Balances, allowances, the next nonce, orders and jobs of an account; whether it may order by permits.
+
+        Raises `ChainError`.
+        """
         parts, chain, market = self._parts, self._parts.chain, self._market
-        eth, xrt, token, count, state = await asyncio.gather(
+        eth, xrt, token, count, state, are_carried = await asyncio.gather(
             chain.tokens.eth_balance(address),
             chain.tokens.balance_and_allowance(address, chain.factory),
             chain.tokens.balance_and_allowance(address, chain.factory, token=parts.token),
             chain.node.transaction_count(address),
             chain.lighthouses.get(parts.lighthouse),
+            are_permits_carried(parts.channel, chain, address),
         )
         is_counted = parts.settings.generation == 5
         nonce = str(await chain.liabilities.next_nonce(address)) if is_counted else None
@@ -225,6 +230,7 @@ class Views:
             "eth": str(eth),
             "xrt": {"balance": str(xrt[0]), "allowance": str(xrt[1])},
             "token": {"balance": str(token[0]), "allowance": str(token[1])},
+            "permits": parts.settings.contracts == "mesh" and are_carried,
             "nonce": nonce,
             "transactions": count,
             "stake": str(state.stakes.get(address, 0)),

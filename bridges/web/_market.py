@@ -40,6 +40,7 @@ from schemas import (
     InvalidMessage,
     Liability,
     Offer,
+    Permit,
     PlaybackPosition,
     ProgressKey,
     Result,
@@ -51,6 +52,7 @@ from schemas import (
     verify,
     verify_message,
 )
+from schemas.decoding import InvalidData, decode_json
 from schemas.rpc import OrderPair
 from schemas.signing import Decline, Refusal, Rejection
 from schemas.verdicts import ValidatorReport
@@ -569,6 +571,8 @@ class Sent(msgspec.Struct):
     next_at: float
     pair: OrderPair | None = None
     """With it, the message is for one robot alone, and goes to the providers only."""
+    permit: Permit | None = None
+    """It travels before the message, a demand. That of a pair is in the pair."""
 
 
 class OrderPublisher(Lifecycle):
@@ -594,25 +598,25 @@ class OrderPublisher(Lifecycle):
                     self._follow(order).withdrawn = order.state is OrderState.WITHDRAWN
 
     async def post(self, payload: bytes) -> SeenOrder:
-        """Check a signed message and publish it; returns the order that it is or withdraws.
+        """Check a signed message and publish it, or a permit and its demand; returns the order that it is or withdraws.
 
         Raises `InvalidMessage`, `UnsafeValidator`, `WebError`, `ChainError`.
         """
-        verified: Verified[Any] = await asyncio.to_thread(verify, payload)
+        verified, permit = await asyncio.to_thread(_posted, payload)
         message, key = verified.message, verified.hash.hex() + verified.signer
         is_new = key not in self._sent
         if is_new:
             self._check_place(verified.signer)
         match message:
             case Demand() | Offer():
-                await self._check(verified)
+                await self._check(verified, permit)
                 order = self._market.add(verified, posted=True)
             case Withdrawal(order=order_hash):
                 order = self._withdrawn(order_hash, verified.signer)
             case _:
                 raise unusable("kind", "only demands, offers and withdrawals are posted")
         if is_new:
-            self._sent[key] = Sent(message, verified.signer, Backoff(RESEND), time.monotonic())
+            self._sent[key] = Sent(message, verified.signer, Backoff(RESEND), time.monotonic(), permit=permit)
             self._send_due()
         self._market.changed(order, order.state(self._market.head))
         return order
@@ -623,12 +627,12 @@ class OrderPublisher(Lifecycle):
 
         Raises as `post`, and `InvalidMessage` for a pair that a provider would refuse.
         """
-        demand, offer = await asyncio.to_thread(_pair_of, pair)
+        demand, offer, permit = await asyncio.to_thread(_pair_of, pair)
         key = demand.hash.hex() + demand.signer
         if key in self._sent and (known := self._market.order(demand.hash.hex())) is not None:
             return known
         self._check_place(demand.signer)
-        await self._check(demand)
+        await self._check(demand, permit)
         order = self._market.add(demand, posted=True, robot=offer.signer)
         self._sent[key] = Sent(demand.message, demand.signer, Backoff(RESEND), time.monotonic(), pair)
         self._send_due()
@@ -709,8 +713,8 @@ class OrderPublisher(Lifecycle):
         self._market.changed(order, "withdrawn")
         return order
 
-    async def _check(self, verified: Verified[Any]) -> None:
-        """What a provider checks. Raises `WebError` with a reason that providers also give."""
+    async def _check(self, verified: Verified[Any], permit: Permit | None = None) -> None:
+        """What a provider checks, with a demand's permit. Raises `WebError` with a reason that providers also give."""
         order, parts, head = verified.message, self._parts, self._market.head
         if order.lighthouse != parts.lighthouse:
             raise unusable("lighthouse", f"the order names {order.lighthouse}, this market is {parts.lighthouse}")
@@ -723,9 +727,18 @@ class OrderPublisher(Lifecycle):
         liabilities = parts.chain.liabilities
         if await liabilities.is_used(order, order_hash=verified.hash, signer=verified.signer):
             raise unusable("used", "the order has become a contract, or was withdrawn", hint="sign a new one")
+        if permit is not None:
+            self._note(permit, verified)
         (shortage,) = await parts.chain.funds.shortages([verified], fresh=True)
         if shortage:
             raise unusable(shortage, "the account can't pay the order", hint=HINTS.get(shortage, ""))
+
+    def _note(self, permit: Permit, demand: Verified[Demand]) -> None:
+        """Remember a permit, which is published with its demand. Raises `WebError` if it is for something else."""
+        factory = self._parts.chain.factory
+        if (permit.owner, permit.token, permit.spender) != (demand.signer, demand.message.token, factory):
+            raise unusable("permit", "the permit is not the demand's maker's, or for another token or spender")
+        self._parts.chain.funds.note(permit)
 
     async def _send_again(self) -> None:
         while True:
@@ -739,6 +752,8 @@ class OrderPublisher(Lifecycle):
                 del self._sent[key]
             elif sent.next_at <= now and self._parts.network.connected:
                 if sent.pair is None:
+                    if sent.permit is not None:
+                        self._parts.channel.publish(sent.permit)
                     self._parts.channel.publish(sent.message)
                 else:
                     self._tasks.start(self._send_pair(sent.pair), f"pair {key[:64]}")
@@ -751,18 +766,32 @@ class OrderPublisher(Lifecycle):
         return order is not None and order.state(self._market.head) == "open"
 
 
-def _pair_of(pair: OrderPair) -> tuple[Verified[Demand], Verified[Offer]]:
-    """The demand and the offer of a pair. Raises `InvalidMessage`."""
+def _posted(payload: bytes) -> tuple[Verified[Any], Permit | None]:
+    """The message that is posted; of a list, its demand with its permit. Raises `InvalidMessage`."""
+    if not payload.lstrip().startswith(b"["):
+        return verify(payload), None
+    try:
+        texts = decode_json(payload, tuple[msgspec.Raw, msgspec.Raw])
+    except InvalidData as error:
+        raise InvalidMessage("not-json", str(error)) from None
+    permit, demand = (verify(bytes(text)) for text in texts)
+    if not isinstance(permit.message, Permit) or not isinstance(demand.message, Demand):
+        raise InvalidMessage("unknown-kind", "a list has a permit and its demand")
+    return demand, permit.message
+
+
+def _pair_of(pair: OrderPair) -> tuple[Verified[Demand], Verified[Offer], Permit | None]:
+    """The demand and the offer of a pair, and its permit. Raises `InvalidMessage`."""
     if not pair.is_signed:
         raise InvalidMessage("signature", "the pair is not signed by its maker")
     demand: Verified[Demand] = verify_message(pair.demand.message())
     offer: Verified[Offer] = verify_message(pair.offer.message())
     pair.check(demand, offer)
-    return demand, offer
+    return demand, offer, None if pair.permit is None else verify_message(pair.permit.message()).message
 
 
 HINTS: Final = {
-    "ERC20InsufficientAllowance": "approve the factory for the amount",
+    "ERC20InsufficientAllowance": "sign a permit for the amount, or approve the factory for it",
     "ERC20InsufficientBalance": "send the account the missing tokens, or order for less",
     "TokenUnreadable": "choose another token",
 }

@@ -63,6 +63,8 @@ if TYPE_CHECKING:
     from mesh.agent.contracts import ContractReports, JobAttempts, OnProgress
     from mesh.agent.ledger import StoredOrder
     from mesh.agent.orders import Terms
+    from mesh.chain import Chain
+    from mesh.network import Channel
     from schemas import Liability, Permit, Verified
 
 
@@ -202,6 +204,16 @@ class Order:
 
 UNCOVERED: Final = ("ERC20InsufficientAllowance", "FeeNotPermitted")
 """Rejections of an order whose allowance or permit is gone."""
+
+
+async def are_permits_carried(channel: Channel, chain: Chain, account: str) -> bool:
+    """Whether a provider here takes permits: those of 2018, behind a bridge, don't. Without ether, hope for one.
+
+    Raises `NodeUnreachable`, `RequestRefused`.
+    """
+    return bool(await channel.present("provider")) or not await chain.tokens.eth_balance(account)
+
+
 STOP_SECONDS: Final = 3.0
 """For which an agent that ends waits until the providers have confirmed that they use none of its offers."""
 
@@ -222,8 +234,9 @@ class Trader(Lifecycle):
         self._parts = parts
         self._chain = parts.chain
         self._address = parts.signer.address
+        are_carried = partial(are_permits_carried, parts.channel, parts.chain, self._address)
         self._allowances = Allowances(
-            parts.chain.tokens, parts.chain.factory, self._address, parts.chain.permits, self._carries_permits
+            parts.chain.tokens, parts.chain.factory, self._address, parts.chain.permits, are_carried
         )
         self._orders: dict[str, TradedOrder] = {}
         self.writer = TermsWriter(parts, self._orders)
@@ -465,10 +478,6 @@ class Trader(Lifecycle):
             await ensure(order, costs, permit=signed.token, always=permit_fee(signed) > 0)
         else:
             await ensure(order, costs)
-
-    async def _carries_permits(self) -> bool:
-        """Whether a provider here takes permits: those of 2018, behind a bridge, don't. Without ether, hope for one."""
-        return bool(await self._parts.channel.present("provider")) or not await self._chain.tokens.eth_balance()
 
     def _permit_for(self, demand: Demand) -> Permit | None:
         return self._chain.permits.own(demand.token)

@@ -12,7 +12,7 @@ import urllib.request
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from eth_account import Account
-from eth_account.messages import encode_defunct
+from eth_account.messages import encode_defunct, encode_typed_data
 from selenium import webdriver
 from selenium.common.exceptions import NoSuchElementException, StaleElementReferenceException, WebDriverException
 from selenium.webdriver.chrome.service import Service
@@ -81,6 +81,8 @@ class Wallet:
         self.chain_id = int(self.rpc("eth_chainId"), 16)
         self.rejects: set[str] = set()
         self.calls: list[str] = []
+        self.typed_data: list[dict[str, Any]] = []
+        """What it has signed by EIP-712."""
 
     def rpc(self, method: str, *params: Any) -> Any:
         """The node's answer."""
@@ -106,6 +108,10 @@ class Wallet:
             return None
         if method == "personal_sign":
             return "0x" + self.account.sign_message(encode_defunct(hexstr=params[0])).signature.hex().removeprefix("0x")
+        if method == "eth_signTypedData_v4":
+            self.typed_data.append(json.loads(params[1]))
+            signable = encode_typed_data(full_message=self.typed_data[-1])
+            return "0x" + self.account.sign_message(signable).signature.hex().removeprefix("0x")
         if method == "eth_sendTransaction":
             return self._send(params[0])
         return self.rpc(method, *params)

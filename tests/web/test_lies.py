@@ -12,7 +12,7 @@ import pytest
 from tests.support.objectives import objective
 from tests.web.browser import Browser
 from tests.web.conftest import HOSTILE
-from tests.web.steps import anybody, facts, fill_in, review
+from tests.web.steps import anybody, facts, fill_in, review, sign
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -91,15 +91,16 @@ def test_tokens_are_allowed_to_another_contract_only_after_a_warning(site: Site)
         browser.go()
         browser.connect()
         fill_in(browser, site)
-        review(browser)
+        sign(browser)
         browser.lie(r"v1\/market$", "body.factory = '0x' + '12'.repeat(20)")
         browser.lie(r"accounts\/0x\w+$", "body.token.allowance = body.xrt.allowance = '0'")
-        browser.driver.refresh()
         fill_in(browser, site)
+        browser.driver.refresh()
         browser.sees("another contract than the one that you allowed before")
-        assert not browser.all("#allow")
+        assert not browser.find("#order").is_enabled()
         browser.press("I know. Use the new contract")
-        assert "0x1212" in browser.find(".callout:has(#allow)").text
+        browser.click("#order:not([disabled])")
+        assert "0x1212" in browser.find("#permit").text
 
 
 def test_scripts_in_names_and_recordings_are_text(browser: Browser, site: Site, tmp_path: Path) -> None:

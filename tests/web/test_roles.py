@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.web.browser import Browser
-from tests.web.steps import facts, fill_in, order, sign
+from tests.web.steps import anybody, check, facts, fill_in, order, sign
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -87,10 +87,50 @@ def test_an_owner_sees_health_money_jobs_and_logs(browser: Browser, site: Site) 
     assert browser.violations() == []
 
 
+@pytest.mark.parametrize("is_private", [True, False], ids=["one robot", "anybody"])
+def test_a_person_without_ether_orders_and_the_job_is_paid(site: Site, pictures: Path, is_private: bool) -> None:
+    wallet, rich, market = site.poor_wallet(), site.wallet(), facts(site, "market")
+    first = int(rich.rpc("eth_blockNumber"), 16)
+    rich.give(wallet.address, token=market["token"]["address"], units=10**10)
+    with Browser(site.url, wallet) as browser:
+        browser.go()
+        browser.connect()
+        fill_in(browser, site)
+        if not is_private:
+            anybody(browser)
+        browser.click("#order:not([disabled])")
+        price = browser.find("dialog[open] strong").text
+        words = browser.find("#permit").text
+        assert f"lets the market's contract take up to {price} from your account until " in words
+        assert market["factory"] in words
+        check(browser, pictures / "permit.png")
+        wallet.rejects.add("eth_signTypedData_v4")
+        browser.click("#sign")
+        browser.sees("You rejected it in the wallet")
+        wallet.rejects.clear()
+        browser.click("#sign")
+        browser.sees("the robot was paid")
+    (job,) = facts(site, f"accounts/{wallet.address}")["liabilities"]
+    assert job["state"] == "paid"
+    domain, permit = (wallet.typed_data[-1][part] for part in ("domain", "message"))
+    assert (domain["verifyingContract"], domain["chainId"]) == (market["token"]["address"], market["chainId"])
+    assert (permit["spender"], permit["value"]) == (market["factory"], job["cost"])
+    assert not {"eth_sendTransaction", "eth_sendRawTransaction"} & set(wallet.calls)
+    account = facts(site, f"accounts/{wallet.address}")
+    assert (account["transactions"], int(account["token"]["balance"])) == (0, 10**10 - int(job["cost"]))
+    blocks = range(first, int(rich.rpc("eth_blockNumber"), 16) + 1)
+    assert {rich.rpc("eth_getBalance", wallet.address, hex(block)) for block in blocks} == {"0x0"}
+
+
+NO_PERMITS = r"accounts\/0x\w+$", "body.permits = false"
+"""A lie, after which the page takes the providers for some that take no permits."""
+
+
 def test_without_ether_for_gas_the_page_says_what_to_do(site: Site) -> None:
     wallet, rich = site.poor_wallet(), site.wallet()
     rich.give(wallet.address, token=facts(site, "market")["token"]["address"], units=10**10)
     with Browser(site.url, wallet) as browser:
+        browser.lie(*NO_PERMITS)
         browser.go()
         browser.connect()
         fill_in(browser, site)
@@ -108,6 +148,7 @@ def test_an_allowance_that_the_wallet_refuses_can_be_given_later(site: Site) -> 
     rich.give(wallet.address, wei=10**17)
     wallet.rejects.add("eth_sendTransaction")
     with Browser(site.url, wallet) as browser:
+        browser.lie(*NO_PERMITS)
         browser.go()
         browser.connect()
         fill_in(browser, site)

@@ -4,13 +4,16 @@ import { zeroAddress } from "viem";
 import type { Address, Hex } from "viem";
 import { ApiError, get, getExact, post, postText, query } from "./api";
 import type { Account } from "./app";
+import { calls, nonceOf } from "./contracts";
 import { canonicalSignature, encodeWire, orderFields, orderHash, randomNonce, recordHash, signerOf, withdrawalHash } from "./messages";
 import type { Demand } from "./messages";
+import { PermitRefused, nextPermit, permitFields, permitMessage, permitSigner, typedData } from "./permits";
+import type { Domain, Permit, SignedPermit } from "./permits";
 import { texts } from "./texts";
-import { ServerLies, checkAsked, checkOrder, ownOrders, rememberOrder } from "./trust";
+import { ServerLies, checkAsked, checkOrder, ownOrders, readerFor, rememberContract, rememberOrder } from "./trust";
 import { plain } from "./format";
 import type { AccountState, Market, Message, Model, Objective, Order, PostedOrder } from "./types";
-import { personalSign } from "./wallet";
+import { personalSign, signTypedData } from "./wallet";
 
 /** What a person has asked for, as the fields of the page have it. What is signed is made from it, and from nothing else. */
 export interface Wish {
@@ -50,6 +53,8 @@ export interface Prepared {
   /** What a wallet signs, with a deadline and a nonce of now; the server's account has its own. */
   demand?: Demand;
   hash?: Hex;
+  /** What the wallet signs besides, if the contracts may not take the cost yet. */
+  permit?: Permit;
 }
 
 const SHOWN = 50;
@@ -59,8 +64,21 @@ export function contractsOf(market: Market): string {
   return [market.chainId, market.factory, market.lighthouse.address, market.token.address, market.token.decimals, market.xrt.address].join();
 }
 
-/** Makes the objective, and the order that names it. */
-export async function prepare(wish: Wish, account: Account, shown: Market): Promise<Prepared> {
+/** What the contracts take of the market's token for an order: its cost, and its fee if that is in the same token. */
+export function priceOf({ cost, validator, validatorFee }: Pick<Wish, "cost" | "validator" | "validatorFee">, market: Market): bigint {
+  const isFeeInToken = validator === zeroAddress || market.token.address === market.xrt.address; // without a validator it is for a permit
+  return isFeeInToken ? cost + validatorFee : cost;
+}
+
+/** The same for an order and all others of the account that may still become contracts: an allowance is for all of them. */
+export function neededFor(wish: Wish, state: AccountState, market: Market): bigint {
+  const others = state.orders.map(({ order }) => order).filter((order) => order.kind === "demand" && order.token === market.token.address);
+  const fee = (order: Order) => BigInt(order.validatorFee ?? "0");
+  return others.reduce((sum, order) => sum + priceOf({ ...order, cost: BigInt(order.cost), validatorFee: fee(order) }, market), priceOf(wish, market));
+}
+
+/** Makes the objective, and the order that names it; with a permit if the token has such (`domain`) and it needs one. */
+export async function prepare(wish: Wish, account: Account, shown: Market, domain: Domain | null): Promise<Prepared> {
   const [objective, market, state] = await Promise.all([wish.objective(), get<Market>("market"), get<AccountState>(`accounts/${account.address}`), wish.confirm?.()]);
   if (contractsOf(market) !== contractsOf(shown)) throw new Error(texts.changedLookAgain);
   const isFile = objective.cid !== wish.model.cid && objective.summary.messages > 0;
@@ -82,7 +100,10 @@ export async function prepare(wish: Wish, account: Account, shown: Market): Prom
     nonce: state.nonce === null ? randomNonce() : BigInt(state.nonce),
     sender: state.nonce === null ? undefined : account.address,
   };
-  return { ...prepared, demand, hash: orderHash(demand) };
+  const needed = neededFor(wish, state, market);
+  const isShort = domain !== null && BigInt(state.token.allowance) < needed;
+  const permit = isShort ? await nextPermit(domain, account.address, market.factory, needed, readerFor(account, market).reader) : undefined;
+  return { ...prepared, demand, hash: orderHash(demand), permit };
 }
 
 /** A robot does not want the order. */
@@ -96,23 +117,47 @@ export class RobotDeclined extends Error {
 }
 
 /** Signs the hash of exactly these fields, and sends the demand if it is still wanted then. Returns its hash. */
-export async function signAndPost(demand: Demand, shown: Hex, robot: Address | "", account: Account, isWanted: () => boolean): Promise<string> {
-  if (account.kind !== "wallet") throw new Error(texts.needsWallet);
+export async function signAndPost({ demand, hash: shown, permit, draft: { robot }, account, market }: Prepared, isWanted: () => boolean): Promise<string> {
+  if (account.kind !== "wallet" || !demand) throw new Error(texts.needsWallet);
   const hash = orderHash(demand);
   if (hash !== shown) throw new ServerLies(texts.lieHash);
   const offer = robot ? await offerOf(demand, robot, account) : null;
+  const permitted = permit && (await signPermit(permit, account, market));
+  if (!isWanted()) throw new Error(texts.changedLookAgain);
   const signature = await signed(hash, account);
   if (!isWanted()) throw new Error(texts.changedLookAgain);
   if ((await signerOf(hash, signature)) !== account.address) throw new Error(texts.otherAccountSigned);
-  const wire = encodeWire({ ...demand, signature });
+  if (permitted) rememberContract(market);
+  const wire = wireOf({ ...demand, signature }, permitted);
   const own = hash.slice(2);
   // Before it is sent: what is signed may become a job, whatever the server answers. One for a robot is never published.
   rememberOrder({ hash: own, deadline: Number(demand.deadline), wire: robot ? "" : wire });
   const posted = robot
-    ? await signedRecord("pairs", "aira pair", account, { demand: orderFields(demand, signature), offer, maker: account.address })
+    ? await signedRecord("pairs", "aira pair", account, { demand: orderFields(demand, signature), offer, maker: account.address, permit: permitted && permitFields(permitted) })
     : await postText<PostedOrder>("orders", wire);
   if (posted.order.hash !== own) throw new ServerLies(texts.lieHash);
   return own;
+}
+
+/** Lets the wallet sign a permit. Throws `PermitRefused` if the token does not take it as the account's next one. */
+async function signPermit(permit: Permit, account: Account, market: Market): Promise<SignedPermit> {
+  if (account.kind !== "wallet") throw new Error(texts.needsWallet);
+  const { domain, owner, spender, value, nonce, deadline } = permit;
+  const { reader } = readerFor(account, market);
+  const signature = canonicalSignature(await signTypedData(account.wallet.provider, JSON.stringify(typedData(permit)), owner));
+  if ((await permitSigner(permit, `0x${signature}`)) !== owner) throw new Error(texts.otherAccountSigned);
+  try {
+    await reader(domain.verifyingContract, calls.permit(owner, spender, value, deadline, `0x${signature}`));
+  } catch {
+    if ((await nonceOf(reader, domain.verifyingContract, owner)) === nonce) throw new PermitRefused(texts.permitRefused);
+    throw new Error(texts.changedLookAgain); // another order has become a contract with the last permit
+  }
+  return permitMessage(permit, signature);
+}
+
+/** What is posted: a signed demand as it travels, after its permit if it has one. */
+function wireOf(demand: Record<string, unknown>, permit: SignedPermit | undefined): string {
+  return permit ? `[${encodeWire(permit)},${encodeWire(demand)}]` : encodeWire(demand);
 }
 
 /** A robot's offer for a demand that is for it alone, of which it gets no signature. */

@@ -175,7 +175,10 @@ export const texts = {
   ifStopped: "If you stop it",
   stopCosts: { refund: "You get the price back.", paid: "The robot is still paid.", "": "The robot decides whether it is paid; most give the price back." } as Record<string, string>,
   termsAsSigned: "The terms exactly as they are signed",
-  whatYouSignThrice: "Your wallet asks three times: for the robot's offer, for the order, and to bind the two. It shows only hashes; this browser made them from these terms.",
+  permit: (sum: string, until: string) =>
+    `You also sign a permit, so you send no transaction and need no ether. It lets the market's contract take up to ${sum} from your account until ${until}, for this order and your other open ones. The permit itself costs nothing.`,
+  permitFor: "The contract:",
+  permitRefused: "The token did not accept the permit, so nothing was sent. Allow the market to take the price by a transaction instead.",
   otherModel: "Another model, by its CID",
   modelCid: "CID of the model",
   modelCidHint: "46 characters that begin with Qm.",
@@ -255,7 +258,12 @@ export const texts = {
   whatYouOrderHint: "The local account of this server signs it and pays.",
   changedLookAgain: "Something changed meanwhile. Nothing was signed: review the order again.",
   whatYouSign: "This is what you sign",
-  whatYouSignHint: "Your wallet shows only the hash. This browser made the hash from the terms below: compare them.",
+  whatYouSignHow: (withPermit: boolean, forOne: boolean) => {
+    if (!withPermit && !forOne) return "Your wallet shows only the hash. This browser made the hash from the terms below: compare them.";
+    const asked = [forOne && "for the robot's offer", withPermit && "for the permit", "for the order", forOne && "to bind order and offer"].filter(Boolean);
+    const shown = withPermit ? "It shows the permit in full, and of the rest only hashes" : "It shows only hashes";
+    return `Your wallet asks ${["twice", "three times", "four times"][asked.length - 2]}: ${asked.slice(0, -1).join(", ")} and ${asked.at(-1)}. ${shown}; this browser made them from the terms below: compare them.`;
+  },
   sign: "Sign in the wallet",
   notNow: "Not now",
   hash: "Hash",

@@ -390,6 +390,8 @@ export interface AccountState {
   eth: string;
   xrt: { balance: string; allowance: string };
   token: { balance: string; allowance: string };
+  /** Whether it may sign a permit instead of sending an approval, where the token has permits. */
+  permits: boolean;
   nonce: string | null;
   transactions: number;
   stake: string;

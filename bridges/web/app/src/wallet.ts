@@ -66,6 +66,11 @@ export function personalSign(provider: Provider, hash: Hex, account: Address): P
   return ask(provider, "personal_sign", [hash, account]);
 }
 
+/** Signs typed data (EIP-712), which the wallet shows. */
+export function signTypedData(provider: Provider, data: string, account: Address): Promise<string> {
+  return ask(provider, "eth_signTypedData_v4", [account, data]);
+}
+
 export async function switchChain(provider: Provider, chainId: number): Promise<void> {
   try {
     await ask(provider, "wallet_switchEthereumChain", [{ chainId: toHex(chainId) }]);

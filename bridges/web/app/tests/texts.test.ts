@@ -5,7 +5,7 @@ import { transformSync } from "esbuild";
 import { texts } from "../src/texts";
 
 /** What people don't read, or is the same in all languages. */
-const NO_TEXT = /^(function |aira |Withdrawal\(|color-mix\(|\d+px |xMid)|^(AIRA|[KMGT]iB|AbortError|Content-(Type|Length)|X-Aira-Request)$/;
+const NO_TEXT = /^(function |aira |Withdrawal\(|color-mix\(|\d+px |xMid)|^(AIRA|[KMGT]iB|AbortError|Content-(Type|Length)|X-Aira-Request|Permit)$/;
 
 /** The texts in a source: a word with a capital, or two words that are no classes. */
 function textsIn(source: string): string[] {

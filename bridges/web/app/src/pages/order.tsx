@@ -2,15 +2,18 @@ import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { zeroAddress } from "viem";
 import type { Address } from "viem";
 import { post } from "../api";
+import type { Account } from "../app";
 import { forgetTyped, isUnreachable, useApp, useData, useReturn, useTyped, wordsOf } from "../app";
 import { calls } from "../contracts";
 import { amount, duration, ether, plain } from "../format";
 import { parseAmount } from "../numbers";
-import { RobotDeclined, blocksOf, contractsOf, orderLocally, prepare, signAndPost } from "../ordering";
+import { RobotDeclined, blocksOf, contractsOf, neededFor, orderLocally, prepare, priceOf, signAndPost } from "../ordering";
 import type { Prepared, Wish } from "../ordering";
+import { PermitRefused, domainOf, permitWords } from "../permits";
+import type { Domain } from "../permits";
 import { texts } from "../texts";
-import { allowedContract, rememberContract } from "../trust";
-import type { AccountState, Model, Quote } from "../types";
+import { allowedContract, readerFor, rememberContract } from "../trust";
+import type { AccountState, Market, Model, Quote } from "../types";
 import { Action, Copy, Dialog, Facts, Field, Name, NumberField, Picture, Problem, Show, Strange } from "../ui";
 import { inWords } from "../values";
 import { Fit, ObjectiveChoice, firstChoice, useObjective, withoutDescription } from "./objective";
@@ -179,6 +182,7 @@ export function OrderButton(props: { wish: Wish | null; declined?: (error: Robot
   const [review, setReview] = useState<Prepared | null>(null);
   const [error, setError] = useState<unknown>(null);
   const [known, setKnown] = useState(() => allowedContract(market));
+  const [refused, setRefused] = useState("");
   const { wish } = props;
   const latest = useRef({ wish, account, market });
   latest.current = { wish, account, market };
@@ -191,15 +195,20 @@ export function OrderButton(props: { wish: Wish | null; declined?: (error: Robot
     setReview(null);
     notify(texts.changedLookAgain, "bad");
   });
+  const wrongChain = account?.kind === "wallet" && account.chainId !== market.chainId;
+  const isShort = wish !== null && state.data !== null && BigInt(state.data.token.allowance) < neededFor(wish, state.data, market);
+  const domain = usePermits(state.data?.permits && !wrongChain && refused !== market.token.address ? account : null, market);
   if (!account) return null;
-  const needs = wish && state.data ? needsOf(wish, state.data, market.token.address === market.xrt.address) : [];
-  const wrongChain = account.kind === "wallet" && account.chainId !== market.chainId;
+  const needs = wish && state.data ? needsOf(wish, state.data, market) : [];
   const short = needs.filter((need) => need.missing > 0n);
-  const unallowed = account.kind === "wallet" && !wrongChain ? needs.filter((need) => need.missing <= 0n && need.unallowed) : [];
-  const blocked = !wish || !state.data || wrongChain || short.length > 0 || unallowed.length > 0;
+  // A permit takes the place of an allowance. Another contract than before needs the person's word for both.
+  const isOther = known !== null && known !== market.factory;
+  const asks = (need: Need) => need.missing <= 0n && (need.token === "token" && domain !== null ? isShort && isOther : need.unallowed);
+  const asked = account.kind === "wallet" && !wrongChain ? needs.filter(asks) : [];
+  const blocked = (isShort && domain === undefined) || !wish || !state.data || wrongChain || short.length > 0 || asked.length > 0;
   const open = async () => {
     setError(null);
-    const prepared = await prepare(wish!, account, market).catch((problem) => {
+    const prepared = await prepare(wish!, account, market, domain ?? null).catch((problem) => {
       reloadMarket();
       throw problem;
     });
@@ -236,17 +245,17 @@ export function OrderButton(props: { wish: Wish | null; declined?: (error: Robot
           {copyAddress}
         </div>
       ))}
-      {unallowed.map((need) => (
-        <div class={`callout ${known && known !== market.factory ? "warn" : ""}`} key={need.token}>
-          {BigInt(state.data!.eth) === 0n ? (
-            <>
-              <p>{texts.noGas(ether(state.data!.eth))}</p>
-              {copyAddress}
-            </>
-          ) : known && known !== market.factory ? (
+      {asked.map((need) => (
+        <div class={`callout ${isOther ? "warn" : ""}`} key={need.token}>
+          {isOther ? (
             <>
               <p>{texts.otherContract} <Name text={known} /> → <Name text={market.factory} /></p>
               <Action class="button quietly" run={async () => trust()}>{texts.useOtherContract}</Action>
+            </>
+          ) : BigInt(state.data!.eth) === 0n ? (
+            <>
+              <p>{texts.noGas(ether(state.data!.eth))}</p>
+              {copyAddress}
             </>
           ) : (
             <>
@@ -265,7 +274,7 @@ export function OrderButton(props: { wish: Wish | null; declined?: (error: Robot
       </p>
       {account.kind === "local" ? <p class="hint">{texts.localSigns}</p> : null}
       <Dialog title={account.kind === "local" ? texts.whatYouOrder : texts.whatYouSign} open={review !== null && isCurrent(review)} onClose={() => setReview(null)}>
-        {review ? <Review of={review} isWanted={() => opened.current === review && isCurrent(review)} close={() => setReview(null)} declined={props.declined} /> : null}
+        {review ? <Review of={review} isWanted={() => opened.current === review && isCurrent(review)} close={() => setReview(null)} declined={props.declined} refused={() => { setRefused(market.token.address); setReview(null); notify(texts.permitRefused, "bad"); }} /> : null}
       </Dialog>
     </div>
   );
@@ -279,24 +288,40 @@ interface Need {
   unallowed: boolean;
 }
 
-function needsOf(draft: Wish, state: AccountState, sameToken: boolean): Need[] {
+/** The domain of the market's token for permits of a wallet; null without a wallet or if the token has none, undefined until that is known. */
+function usePermits(account: Account | null, market: Market): Domain | null | undefined {
+  const token = market.token.address;
+  const signer = account?.kind === "wallet" ? account : null;
+  const [found, setFound] = useState<{ signer: Account; token: Address; domain: Domain | null } | null>(null);
+  useEffect(() => {
+    let current = true;
+    if (signer) domainOf(token, market.chainId, readerFor(signer, market).reader).then((domain) => current && setFound({ signer, token, domain }));
+    return () => {
+      current = false;
+    };
+  }, [signer, token, market.chainId]);
+  if (!signer) return null;
+  return found?.signer === signer && found.token === token ? found.domain : undefined;
+}
+
+function needsOf(draft: Wish, state: AccountState, market: Market): Need[] {
   const need = (token: "token" | "xrt", amount: bigint): Need => {
     const balance = BigInt(state[token].balance);
     return { token, amount, balance, missing: amount - balance, unallowed: BigInt(state[token].allowance) < amount };
   };
-  if (sameToken) return [need("token", draft.cost + draft.validatorFee)];
-  return [need("token", draft.cost), need("xrt", draft.validatorFee)];
+  const price = priceOf(draft, market);
+  return [need("token", price), need("xrt", draft.cost + draft.validatorFee - price)];
 }
 
 /** What is ordered in words, and on demand the terms exactly as they are signed, with the hash that the browser made. */
-function Review(props: { of: Prepared; isWanted: () => boolean; close: () => void; declined?: (error: RobotDeclined) => void }) {
+function Review(props: { of: Prepared; isWanted: () => boolean; close: () => void; declined?: (error: RobotDeclined) => void; refused: () => void }) {
   const { block, robotAt } = useApp();
-  const { draft, demand, hash, market, account, objective, wish } = props.of;
+  const { draft, demand, hash, permit, market, account, objective, wish } = props.of;
   const [error, setError] = useState("");
   const robot = draft.robot ? robotAt(draft.robot) : undefined;
   const sign = async () => {
     setError("");
-    const order = demand ? await signAndPost(demand, hash!, draft.robot, account, props.isWanted) : await orderLocally(draft, account.address, market);
+    const order = demand ? await signAndPost(props.of, props.isWanted) : await orderLocally(draft, account.address, market);
     props.close();
     forgetTyped();
     location.hash = `#/order/${order}`;
@@ -304,6 +329,7 @@ function Review(props: { of: Prepared; isWanted: () => boolean; close: () => voi
   const failed = (problem: unknown) => {
     setError(wordsOf(problem));
     if (problem instanceof RobotDeclined) props.declined?.(problem);
+    if (problem instanceof PermitRefused) props.refused();
   };
   const left = demand ? Number(demand.deadline) - block : draft.lifetime;
   return (
@@ -318,7 +344,8 @@ function Review(props: { of: Prepared; isWanted: () => boolean; close: () => voi
           [texts.validatorFee, draft.validatorFee ? amount(draft.validatorFee, market.xrt) : ""],
         ]}
       />
-      <p class="hint">{demand ? (draft.robot ? texts.whatYouSignThrice : texts.whatYouSignHint) : texts.whatYouOrderHint}</p>
+      {permit ? <p class="callout" id="permit">{permitWords(permit, market.token)} {texts.permitFor} <Name text={permit.spender} label={permit.spender} /></p> : null}
+      <p class="hint">{demand ? texts.whatYouSignHow(permit !== undefined, draft.robot !== "") : texts.whatYouOrderHint}</p>
       <details class="more" id="signed-terms" open={demand !== undefined}>
         <summary>{texts.termsAsSigned}</summary>
         <Facts
