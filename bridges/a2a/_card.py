@@ -96,12 +96,14 @@ def _new_key() -> bytes:
 
 
 class Card:
-    """The card of a door at a URL, with the models of the robots that are present, or of one `robot` (address)."""
+    """The card of a door, with the models of the robots that are present, or of one `robot` (address)."""
 
-    def __init__(self, signer: SignerClient, key: CardKey, url: str, *, robot: str = "") -> None:
+    url: str
+    """Where the door is: set once it listens."""
+
+    def __init__(self, signer: SignerClient, key: CardKey, *, robot: str = "") -> None:
         self._signer = signer
         self._key = key
-        self._url = url
         self._robot = robot
         self._card = AgentCard()
         self._made = -CARD_SECONDS
@@ -118,7 +120,7 @@ class Card:
                 except AiraError as error:
                     log.warning("the card lists no models: %s", error, extra=log_event("card-incomplete"))
                     robots = ()
-                self._card = self._key.sign(self._write(robots), self._url)
+                self._card = self._key.sign(self._write(robots), self.url)
             return self._card
 
     def _write(self, robots: tuple[FoundRobot, ...]) -> AgentCard:
@@ -127,10 +129,10 @@ class Card:
             name=f"AIRA mesh: {self._robot[:10]}" if self._robot else "AIRA mesh",
             description=f"Hires {what} for paid jobs, within a policy: quotes, contracts, recordings. {_HOW}",
             supported_interfaces=[
-                AgentInterface(url=f"{self._url}/", protocol_binding="JSONRPC", protocol_version="1.0"),
-                AgentInterface(url=f"{self._url}/rest", protocol_binding="HTTP+JSON", protocol_version="1.0"),
+                AgentInterface(url=f"{self.url}/", protocol_binding="JSONRPC", protocol_version="1.0"),
+                AgentInterface(url=f"{self.url}/rest", protocol_binding="HTTP+JSON", protocol_version="1.0"),
             ],
-            provider=AgentProvider(organization="AIRA mesh", url=self._url),
+            provider=AgentProvider(organization="AIRA mesh", url=self.url),
             version=__version__,
             capabilities=AgentCapabilities(streaming=True, push_notifications=True),
             security_schemes={

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from bridges.web.cli import listening
+from bridges.serving import listening, with_certificate
+from bridges.web.cli import token_in
 from mesh.base.background import Background
 from mesh.base.extras import needs_extra
 from mesh.cli.options import ADDRESS, FILE, with_settings
@@ -51,8 +52,7 @@ def served(function: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         click.option("--origin", "origins", multiple=True, metavar="ORIGIN", help="other site that may connect"),
         click.option("--token-file", type=FILE, help="file with the token that clients add to the address"),
-        click.option("--key", type=FILE, help="key of the certificate (PEM)"),
-        click.option("--certificate", type=FILE, help="certificate of this server for TLS (PEM)"),
+        with_certificate,
         click.option(
             "--listen", default="127.0.0.1:8765", show_default=True, metavar="HOST:PORT", help="address to listen on"
         ),
@@ -135,7 +135,8 @@ async def _serve(
         )
     from mesh.base.flood import Drops
 
-    chosen = FoxgloveOptions(**await asyncio.to_thread(listening, options), origins=options["origins"])
+    token = await asyncio.to_thread(token_in, options["token_file"])
+    chosen = FoxgloveOptions(**listening(options["listen"], options, token), origins=options["origins"])
     drops = Drops()
     async with (
         Telemetry(settings.metrics_listen) as telemetry,

@@ -26,7 +26,7 @@ from aiohttp import web
 from foxglove import Context, Schema, start_server
 from foxglove.websocket import Capability, ServerListener
 
-from bridges.web.access import ServerOptions, is_loopback, require_loopback, server_tls
+from bridges.serving import ServerOptions, is_loopback
 from mesh import foxglove
 from mesh.base.background import Background, call_in_loop
 from mesh.base.door import DoorLimits, network_of
@@ -60,11 +60,6 @@ class FoxgloveOptions(ServerOptions):
 
     origins: tuple[str, ...] = ()
     """Other sites than `APPS` that may connect."""
-
-    def check(self) -> None:
-        """Raise `ConfigurationError` for a server that other machines can reach without TLS and a token."""
-        if not (self.certificate and self.key and self.token):
-            require_loopback(self.host, "--certificate, --key and --token-file")
 
 
 CLIENTS: Final = 16
@@ -101,7 +96,7 @@ class FoxgloveFront(Lifecycle):
 
     async def _open(self, stack: AsyncExitStack) -> None:
         options = self._options
-        tls = await asyncio.to_thread(server_tls, options.certificate, options.key) if options.certificate else None
+        tls = await asyncio.to_thread(options.tls)
         self._http = await stack.enter_async_context(aiohttp.ClientSession())
         app = web.Application()
         app.router.add_route("*", "/{path:.*}", self._serve)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
 import logging
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,15 +15,15 @@ from mcp.server.auth.provider import AccessToken, TokenVerifier
 from mcp.server.auth.settings import AuthSettings
 from mcp.server.transport_security import TransportSecuritySettings
 
-from bridges.web.access import ServerOptions, require_loopback
+from bridges.serving import DoorOptions, guarded
 from mesh.base.log_context import log_event
-from mesh.base.private_files import SHORTEST_TOKEN
 from mesh.errors import ConfigurationError
-from mesh.signer.protocol import LARGEST_REQUEST
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
     from mcp.server.lowlevel import Server
+
+    from mesh.base.asgi_server import AsgiApplication
 
 log = logging.getLogger(__name__)
 
@@ -42,20 +41,20 @@ LARGEST_DOCUMENT: Final = 1 << 18
 
 
 @dataclass(frozen=True, kw_only=True)
-class HttpOptions(ServerOptions):
-    """Where the door listens, and who may use it: the holders of `token`, or those to whom `issuer` gave a token."""
+class McpOptions(DoorOptions):
+    """Where the door listens, and who may use it: the holders of `token`, or those to whom `issuer` gave one."""
 
-    names: tuple[str, ...] = ()
-    """Names besides its own address by which clients reach it."""
     issuer: str = ""
-    """The OAuth authorization server whose tokens for `url` are taken; then `token` is not."""
-    url: str = ""
-    """The door's URL as clients know it, the audience of their tokens."""
+    """The OAuth authorization server whose tokens for `url` are taken."""
+
+    @property
+    def has_login(self) -> bool:
+        """Whether clients log in."""
+        return bool(self.token or self.issuer)
 
     def check(self) -> None:
-        """Raise `ConfigurationError` for a server that other machines can reach without TLS, or one without a login."""
-        if not (self.certificate and self.key):
-            require_loopback(self.host, "--certificate and --key")
+        """Raise `ConfigurationError` for a door that is not protected, or whose tokens name no server."""
+        super().check()
         if self.issuer and not self.url:
             raise ConfigurationError(
                 "with --issuer the tokens must name this server",
@@ -64,46 +63,23 @@ class HttpOptions(ServerOptions):
             )
 
 
-def application(server: Server[Any], options: HttpOptions) -> Any:
+def application(server: Server[Any], options: McpOptions) -> AsgiApplication:
     """The ASGI application of the door."""
-    hosts = [f"{name}:*" for name in ("127.0.0.1", "localhost", "[::1]")]
-    for name in (options.host, *options.names):
-        shown = f"[{name}]" if ":" in name and not name.startswith("[") else name
-        hosts += [shown, f"{shown}:*"]
-    origins = [f"{scheme}://{host}" for scheme in ("http", "https") for host in hosts]
+    auth, verifier = None, None
     if options.issuer:
-        verifier: TokenVerifier = IssuedTokens(options.issuer, options.url)
+        verifier = IssuedTokens(options.issuer, options.url)
         auth = AuthSettings.model_validate(
             {"issuer_url": options.issuer, "resource_server_url": options.url, "validate_token_resource": True}
         )
-    else:
-        verifier = OneToken(options.token)
-        # Named by nothing that is served: there is no authorization server.
-        auth = AuthSettings.model_validate({"issuer_url": "http://localhost", "resource_server_url": None})
-    return server.streamable_http_app(
+    app = server.streamable_http_app(
         streamable_http_path=PATH,
-        max_request_body_size=LARGEST_REQUEST,
         max_sessions=MOST_SESSIONS,
-        transport_security=TransportSecuritySettings(allowed_hosts=hosts, allowed_origins=origins),
+        transport_security=TransportSecuritySettings(enable_dns_rebinding_protection=False),  # `guarded` has it
         host=options.host,
         auth=auth,
         token_verifier=verifier,
     )
-
-
-class OneToken(TokenVerifier):
-    """Takes the token of the private file, compared in constant time."""
-
-    def __init__(self, token: str) -> None:
-        if len(token) < SHORTEST_TOKEN:
-            raise ConfigurationError("the door needs a token", hint="give --token-file", code="token-too-short")
-        self._token = token.encode()
-
-    async def verify_token(self, token: str) -> AccessToken | None:
-        """The access that a token gives; None for a wrong one."""
-        if not hmac.compare_digest(self._token, token.encode(errors="replace")):
-            return None
-        return AccessToken(token="", client_id="owner", scopes=[])
+    return guarded(app, options)
 
 
 class IssuedTokens(TokenVerifier):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
-from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 import msgspec
 
+from bridges.serving import door_fields, door_socket, served_door, with_door
 from mesh.base.extras import needs_extra
 from mesh.cli.options import FILE, with_json, with_settings
 from mesh.cli.output import (
@@ -28,7 +28,7 @@ from mesh.errors import AiraError
 from mesh.role.running import run_until_stopped
 from mesh.settings import StorageSettings
 from mesh.signer.policy import InvalidPolicy, parse_policy, read_policy_file
-from mesh.signer.protocol import DOOR_SOCKET, OWNER_SOCKET, signer_folder
+from mesh.signer.protocol import OWNER_SOCKET, signer_folder
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -39,18 +39,9 @@ log = logging.getLogger(__name__)
 
 
 @click.group("mcp", invoke_without_command=True, short_help="let assistants hire robots, within your policy (MCP)")
-@click.option("--socket", type=click.Path(path_type=Path), help="door.sock of the signer [in its state folder]")
 @click.option("--http", metavar="HOST:PORT", help="serve streamable HTTP there instead of stdin and stdout")
-@click.option("--name", "names", multiple=True, metavar="HOST", help="another name of this server (may be repeated)")
-@click.option("--certificate", type=FILE, help="certificate of this server for HTTPS (PEM)")
-@click.option("--key", type=FILE, help="key of the certificate (PEM)")
-@click.option(
-    "--token-file",
-    type=FILE,
-    help="private file with the token of clients over HTTP, made if missing [data_dir/mcp-token]",
-)
-@click.option("--issuer", default="", metavar="URL", help="OAuth server whose tokens are taken instead")
-@click.option("--url", default="", metavar="URL", help="with --issuer: this server's URL as clients know it")
+@with_door("mcp")
+@click.option("--issuer", default="", metavar="URL", help="OAuth server whose tokens for --url are taken instead")
 @with_settings(StorageSettings, "log_level", "log_format")
 @click.pass_context
 def command(context: click.Context, /, settings: Settings, **options: Any) -> None:
@@ -68,8 +59,7 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
         from bridges.mcp._door import McpDoor
         from mesh.signer.client import SignerClient
 
-    socket = options["socket"] or signer_folder(settings) / DOOR_SOCKET
-    async with SignerClient(socket) as signer:
+    async with SignerClient(door_socket(settings, options)) as signer:
         server = McpDoor(signer).server
         if options["http"] is None:
             from bridges.mcp._stdio import serve_stdio
@@ -78,39 +68,14 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
                 click.echo("aira mcp speaks MCP on stdin and stdout; --http serves an address instead", err=True)
             await serve_stdio(server)
             return
-        from bridges.mcp._http import PATH, application
-        from bridges.web.access import server_tls
-        from mesh.base.asgi_server import AsgiServer
+        from bridges.mcp._http import PATH, McpOptions, application
 
-        chosen = await asyncio.to_thread(_http_options, settings, options)
-        chosen.check()
-        tls = server_tls(chosen.certificate, chosen.key) if chosen.certificate else None
-        app = application(server, chosen)
-        async with AsyncExitStack() as stack:
-            front = await stack.enter_async_context(AsgiServer(app, chosen.host, chosen.port, tls=tls, option="--http"))
-            url = f"{front.url}{PATH}"
-            announce(log, "mcp-started", f"mcp         {url}", url=url)
+        issuer = options["issuer"]
+        fields = await asyncio.to_thread(door_fields, "mcp", settings, options, has_token=not issuer)
+        chosen = McpOptions(**fields, issuer=issuer)
+        async with served_door(application(server, chosen), chosen) as url:
+            announce(log, "mcp-started", f"mcp         {url}{PATH}", url=f"{url}{PATH}")
             await asyncio.Event().wait()
-
-
-def _http_options(settings: Settings, options: dict[str, Any]) -> Any:
-    """The `HttpOptions`. Raises `InputError`, `ConfigurationError`."""
-    from bridges.mcp._http import HttpOptions
-    from mesh.base.private_files import private_token
-    from mesh.telemetry.metrics import listen_address
-
-    host, port = listen_address(options["http"])
-    path = options["token_file"] or settings.state_directory / "mcp-token"
-    return HttpOptions(
-        host=host,
-        port=port,
-        names=options["names"],
-        certificate=str(options["certificate"] or ""),
-        key=str(options["key"] or ""),
-        issuer=options["issuer"],
-        url=options["url"],
-        token="" if options["issuer"] else private_token(path),
-    )
 
 
 OWNER: Final = click.option(

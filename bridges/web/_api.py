@@ -14,6 +14,19 @@ from aiohttp import web
 from msgspec.structs import replace
 
 import mesh
+from bridges.web._access import (
+    FOREVER,
+    SANDBOX,
+    SENDER,
+    WebError,
+    address_in,
+    amount,
+    answer,
+    body_of,
+    cid_in,
+    number_in,
+    parse_text_cid,
+)
 from bridges.web._files import (
     MOST_MESSAGES,
     Files,
@@ -31,19 +44,6 @@ from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms
 from bridges.web._robots import Questions
 from bridges.web._stops import Stops
 from bridges.web._stream import Stream
-from bridges.web.access import (
-    FOREVER,
-    SANDBOX,
-    SENDER,
-    WebError,
-    address_in,
-    amount,
-    answer,
-    body_of,
-    cid_in,
-    number_in,
-    parse_text_cid,
-)
 from mesh.agent.orders import lifetime_of
 from mesh.base.background import Background
 from mesh.base.lifecycle import Lifecycle
@@ -65,7 +65,7 @@ from schemas.status import LEVELS
 if TYPE_CHECKING:
     from contextlib import AsyncExitStack
 
-    from bridges.web.access import Logins, WebOptions
+    from bridges.web._access import Logins, WebOptions
     from bridges.web.components import WebComponents
     from mesh.chain import Node
     from schemas.verdicts import ValidatorAnnouncement

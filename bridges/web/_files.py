@@ -16,7 +16,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from bridges.web.access import WebError
+from bridges.web._access import WebError
 from mesh.errors import ContentError
 from mesh.recording import (
     GENEROUS,

@@ -8,7 +8,7 @@ from bisect import bisect_right
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from bridges.web.access import WebError
+from bridges.web._access import WebError
 from mesh.agent.statement import read_statement
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.cli.statement import ENTRY_COLUMNS, csv_of, statement_json

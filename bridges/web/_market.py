@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from bridges.web.access import WebError, unusable
+from bridges.web._access import WebError, unusable
 from mesh.agent.contracts import is_about, verdict_words
 from mesh.agent.hiring import PROVIDERS, send_pair
 from mesh.agent.orders import OrderState

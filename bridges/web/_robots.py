@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from bridges.web.access import WebError
+from bridges.web._access import WebError
 from mesh.agent.hiring import asked_offer
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.errors import public_text

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from bridges.web.access import WebError
+from bridges.web._access import WebError
 from mesh.agent.contracts import send_stop
 from mesh.errors import ChainError
 from schemas import InvalidMessage

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from bridges.serving import listening, with_certificate
 from mesh.base.extras import needs_extra
 from mesh.cli.files import file_or_cid, model_named, require_readable
-from mesh.cli.options import AmountText, with_settings
+from mesh.cli.options import FILE, AmountText, with_settings
 from mesh.cli.output import announce
 from mesh.errors import InputError
 from mesh.role.running import open_when_ready, run_until_stopped, serve_on_each_chain, wait_for_files
@@ -24,20 +25,17 @@ from schemas import cid_of_file
 from schemas.decoding import InvalidData, decode_toml, text_of
 
 if TYPE_CHECKING:
-    from bridges.web.access import WebOptions
+    from bridges.web._access import WebOptions
     from mesh.amounts import Unit
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
 
-FILE = click.Path(dir_okay=False, path_type=Path)
-
 
 @click.command("web", short_help="serve the page: order work, watch it, judge it in a browser")
 @click.option("--listen", default="127.0.0.1:8585", show_default=True, metavar="HOST:PORT", help="address to listen on")
 @click.option("--name", "names", multiple=True, metavar="HOST", help="another name of this server (may be repeated)")
-@click.option("--certificate", type=FILE, help="certificate of this server for HTTPS (PEM)")
-@click.option("--key", type=FILE, help="key of the certificate (PEM)")
+@with_certificate
 @click.option(
     "--proxy",
     "proxies",
@@ -114,10 +112,10 @@ async def _serve(options: dict[str, Any], telemetry: Telemetry, settings: Settin
 
 def web_options(settings: Settings, options: dict[str, Any]) -> WebOptions:
     """The options as the server takes them. Raises `InputError`, `ConfigurationError`."""
-    from bridges.web.access import WebOptions
+    from bridges.web._access import WebOptions
 
     return WebOptions(
-        **listening(options),
+        **listening(options["listen"], options, token_in(options["token_file"])),
         names=options["names"],
         operator_token=token_in(options["operator_token_file"]),
         roster=settings.roster,
@@ -129,21 +127,6 @@ def web_options(settings: Settings, options: dict[str, Any]) -> WebOptions:
         explorer=options["explorer"] or settings.profile.explorer,
         from_block=options["from_block"],
     )
-
-
-def listening(options: dict[str, Any]) -> dict[str, Any]:
-    """The fields of `ServerOptions`, from options of the command line. Raises `InputError`, `ConfigurationError`."""
-    from mesh.telemetry.metrics import listen_address
-
-    host, port = listen_address(options["listen"])
-    certificate, key = (str(options[name] or "") for name in ("certificate", "key"))
-    return {
-        "host": host,
-        "port": port,
-        "token": token_in(options["token_file"]),
-        "certificate": certificate,
-        "key": key,
-    }
 
 
 def robot_of(options: dict[str, Any]) -> dict[str, Any] | None:

@@ -11,16 +11,16 @@ from urllib.parse import urlsplit
 
 from aiohttp import web
 
-from bridges.web._api import Api
-from bridges.web.access import (
+from bridges.serving import is_loopback
+from bridges.web._access import (
     SENDER,
     Logins,
     WebError,
     WebOptions,
     answer,
-    is_loopback,
     status_of,
 )
+from bridges.web._api import Api
 from bridges.web.components import opened
 from mesh.base.door import network_of
 from mesh.base.flood import Rate, RateLimiter

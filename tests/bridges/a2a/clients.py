@@ -18,6 +18,7 @@ from bridges.a2a._door import A2aDoor
 from bridges.a2a._http import application
 from bridges.a2a._push import Pusher
 from bridges.a2a._store import TaskStore
+from bridges.serving import DoorOptions
 from mesh.base.asgi_server import AsgiServer
 from mesh.base.door import DoorLimits
 from mesh.signer.client import SignerClient
@@ -88,6 +89,7 @@ async def serving(
     *,
     robot: str = "",
     push_anywhere: bool = False,
+    names: tuple[str, ...] = (),
     limits: DoorLimits = DoorLimits(),  # noqa: B008
 ) -> AsyncIterator[Served]:
     """The door of the signer on a socket, which keeps its state in a folder."""
@@ -98,12 +100,11 @@ async def serving(
         stack.callback(store.close)
         pusher = await stack.enter_async_context(Pusher(signer, store, anywhere=push_anywhere))
         door = A2aDoor(signer, store, pusher, robot=robot)
-        cards: list[Card] = []
-        app = application(door, lambda: cards[0], key, TOKEN)
+        card = Card(signer, key, robot=robot)
+        app = application(door, card, key, DoorOptions(token=TOKEN, names=names))
         server = await stack.enter_async_context(AsgiServer(app, "127.0.0.1", 0, limits=limits))
-        url = f"http://127.0.0.1:{server.port}"
-        cards.append(Card(signer, key, url, robot=robot))
-        yield Served(url, key, pusher)
+        card.url = server.url
+        yield Served(server.url, key, pusher)
 
 
 def request(data: dict[str, Any], *, message_id: str = "", context: str = "") -> SendMessageRequest:

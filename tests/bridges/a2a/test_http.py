@@ -16,8 +16,8 @@ from a2a.utils.errors import A2AError, InvalidParamsError
 from a2a.utils.signing import InvalidSignaturesError, create_signature_verifier
 
 from bridges.a2a._card import KEYS_PATH, CardKey, quoted
-from bridges.a2a._http import A2aOptions
 from bridges.a2a._push import PublicResolver, is_public
+from bridges.serving import DoorOptions
 from mesh.errors import ConfigurationError
 from mesh.signer.protocol import LARGEST_REQUEST, StrangersText
 from tests.bridges.a2a.clients import AUTHORIZED, TOKEN, request, sent, serving
@@ -47,6 +47,23 @@ async def test_without_the_token_nothing_is_served(tmp_path: Path, path: str, gi
         status, text = await asked(door.url + path, CALL, **headers)
     assert status == 401
     assert "Bearer" in text
+
+
+@pytest.mark.parametrize(
+    ("header", "value", "status"),
+    [
+        ("Host", "evil.example", 421),
+        ("Host", "127.0.0.1.evil.example:80", 421),
+        ("Origin", "http://evil.example", 403),
+        ("Origin", "null", 403),
+        ("Host", "robots.example", 200),
+        ("Origin", "http://localhost:3000", 200),
+    ],
+)
+async def test_pages_of_other_sites_reach_nothing(tmp_path: Path, header: str, value: str, status: int) -> None:
+    async with serving(NOWHERE, tmp_path, names=("robots.example",)) as door:
+        found, _ = await asked(door.url, CALL, **AUTHORIZED | {header: value})
+    assert found == status
 
 
 async def test_a_request_of_an_older_protocol_is_refused(tmp_path: Path) -> None:
@@ -174,10 +191,10 @@ def test_a_strangers_text_does_not_leave_its_quotation_marks() -> None:
 
 def test_other_machines_reach_the_door_over_tls_only() -> None:
     with pytest.raises(ConfigurationError):
-        A2aOptions(host="0.0.0.0", token=TOKEN).check()
+        DoorOptions(host="0.0.0.0", token=TOKEN).check()
     with pytest.raises(ConfigurationError):
-        A2aOptions(host="127.0.0.1").check()
-    A2aOptions(host="127.0.0.1", token=TOKEN).check()
+        DoorOptions(host="127.0.0.1").check()
+    DoorOptions(host="127.0.0.1", token=TOKEN).check()
 
 
 ELSEWHERE = [

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from bridges.mcp._door import McpDoor
-from bridges.mcp._http import PATH, HttpOptions, IssuedTokens, _document, application
+from bridges.mcp._http import PATH, IssuedTokens, McpOptions, _document, application
 from mesh.base.asgi_server import AsgiServer
 from mesh.base.door import DoorLimits
 from mesh.base.http_server import HttpServer
@@ -45,7 +45,7 @@ CALL = {
 
 
 @asynccontextmanager
-async def served(options: HttpOptions, *, limits: DoorLimits = DoorLimits()) -> AsyncIterator[str]:  # noqa: B008
+async def served(options: McpOptions, *, limits: DoorLimits = DoorLimits()) -> AsyncIterator[str]:  # noqa: B008
     """The door over HTTP, in this process, of a signer that does not run; its URL."""
     async with SignerClient(Path("/nowhere/door.sock")) as signer:
         app = application(McpDoor(signer).server, options)
@@ -64,7 +64,7 @@ async def posting(url: str, **headers: str) -> AsyncIterator[aiohttp.ClientRespo
 
 @pytest.mark.parametrize("version", [LATEST_MODERN_VERSION, LATEST_HANDSHAKE_VERSION])
 async def test_both_revisions_of_the_protocol_are_served(version: str) -> None:
-    async with served(HttpOptions(token=TOKEN)) as url, http_client(url, TOKEN, version) as client:
+    async with served(McpOptions(token=TOKEN)) as url, http_client(url, TOKEN, version) as client:
         assert client.protocol_version == version
         assert {tool.name for tool in (await client.list_tools()).tools} >= {"find_robots", "order", "verify"}
         result = await client.call_tool("balance", {})
@@ -81,13 +81,13 @@ async def test_both_revisions_of_the_protocol_are_served(version: str) -> None:
     ids=["none", "wrong", "no-bearer", "empty"],
 )
 async def test_without_the_token_nothing_is_served(headers: dict[str, str]) -> None:
-    async with served(HttpOptions(token=TOKEN)) as url, posting(url, **headers) as response:
+    async with served(McpOptions(token=TOKEN)) as url, posting(url, **headers) as response:
         assert response.status == 401
         assert "Bearer" in response.headers["WWW-Authenticate"]
 
 
 async def test_a_token_in_the_url_is_none() -> None:
-    async with served(HttpOptions(token=TOKEN)) as url, posting(f"{url}?access_token={TOKEN}") as response:
+    async with served(McpOptions(token=TOKEN)) as url, posting(f"{url}?access_token={TOKEN}") as response:
         assert response.status == 401
 
 
@@ -103,7 +103,7 @@ async def test_a_token_in_the_url_is_none() -> None:
     ],
 )
 async def test_pages_of_other_sites_reach_nothing(header: str, value: str, status: int) -> None:
-    options = HttpOptions(token=TOKEN, names=("robots.example",))
+    options = McpOptions(token=TOKEN, names=("robots.example",))
     async with (
         served(options) as url,
         posting(url, **{"Authorization": f"Bearer {TOKEN}", header: value}) as response,
@@ -112,7 +112,7 @@ async def test_pages_of_other_sites_reach_nothing(header: str, value: str, statu
 
 
 async def test_a_body_that_is_too_large_is_refused() -> None:
-    async with served(HttpOptions(token=TOKEN)) as url, aiohttp.ClientSession() as session:
+    async with served(McpOptions(token=TOKEN)) as url, aiohttp.ClientSession() as session:
         body = io.BytesIO(b" " * (LARGEST_REQUEST + 1))
         headers = HEADERS | {"Authorization": f"Bearer {TOKEN}"}
         async with session.post(url, data=body, headers=headers) as response:
@@ -121,7 +121,7 @@ async def test_a_body_that_is_too_large_is_refused() -> None:
 
 async def test_a_client_that_sends_nothing_is_ended() -> None:
     limits = DoorLimits(head=0.2)
-    async with served(HttpOptions(token=TOKEN), limits=limits) as url:
+    async with served(McpOptions(token=TOKEN), limits=limits) as url:
         host, port = url.removeprefix("http://").removesuffix(PATH).split(":")
         reader, writer = await asyncio.open_connection(host, int(port))
         writer.write(b"POST /mcp HTTP/1.1\r\nHost: 127.0.0.1\r\n")
@@ -133,7 +133,7 @@ async def test_a_client_that_sends_nothing_is_ended() -> None:
 
 async def test_connections_of_one_address_are_limited() -> None:
     limits = DoorLimits(per_address=4)
-    async with served(HttpOptions(token=TOKEN), limits=limits) as url:
+    async with served(McpOptions(token=TOKEN), limits=limits) as url:
         host, port = url.removeprefix("http://").removesuffix(PATH).split(":")
         silent = [await asyncio.open_connection(host, int(port)) for _ in range(8)]
         async with posting(url, Authorization=f"Bearer {TOKEN}") as response:
@@ -143,17 +143,17 @@ async def test_connections_of_one_address_are_limited() -> None:
 
 
 async def test_a_port_that_is_taken_is_an_error() -> None:
-    async with served(HttpOptions(token=TOKEN)) as url:
+    async with served(McpOptions(token=TOKEN)) as url:
         port = int(url.removesuffix(PATH).rpartition(":")[2])
         with pytest.raises(PortUnavailable) as caught:
-            async with served(HttpOptions(token=TOKEN, port=port)):
+            async with served(McpOptions(token=TOKEN, port=port)):
                 pass
         assert caught.value.port == port
 
 
 def test_other_machines_need_tls() -> None:
     with pytest.raises(ConfigurationError) as caught:
-        HttpOptions(host="0.0.0.0", token=TOKEN).check()
+        McpOptions(host="0.0.0.0", token=TOKEN).check()
     assert "--certificate" in caught.value.hint
 
 
@@ -229,7 +229,7 @@ async def authorization_server() -> AsyncIterator[AuthorizationServer]:
 
 
 async def test_tokens_of_the_authorization_server_are_taken() -> None:
-    async with authorization_server() as issuing, served(HttpOptions(issuer=issuing.issuer, url=AUDIENCE)) as url:
+    async with authorization_server() as issuing, served(McpOptions(issuer=issuing.issuer, url=AUDIENCE)) as url:
         for _ in range(3):
             async with posting(url, Authorization=f"Bearer {issuing.token()}") as response:
                 assert response.status == 200
@@ -242,7 +242,7 @@ async def test_tokens_of_the_authorization_server_are_taken() -> None:
 
 
 async def test_other_tokens_are_not_taken() -> None:
-    async with authorization_server() as issuing, served(HttpOptions(issuer=issuing.issuer, url=AUDIENCE)) as url:
+    async with authorization_server() as issuing, served(McpOptions(issuer=issuing.issuer, url=AUDIENCE)) as url:
         other = ec.generate_private_key(ec.SECP256R1())
         form, kind = serialization.Encoding.X962, serialization.PublicFormat.UncompressedPoint
         public = issuing.key.public_key().public_bytes(form, kind)

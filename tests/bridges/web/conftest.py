@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from aiohttp import ClientSession
 
-from bridges.web.access import WebOptions
+from bridges.web._access import WebOptions
 from bridges.web.components import opened
 from bridges.web.server import PageServer
 from tests.bridges.web.openapi import check, check_answer

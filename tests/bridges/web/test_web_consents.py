@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.web.access import WebOptions
+from bridges.web._access import WebOptions
 from mesh.errors import ConfigurationError
 from mesh.signer.client import SignerClient
 from mesh.signer.service import Signer

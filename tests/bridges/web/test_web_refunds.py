@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp import ClientSession
 
-from bridges.web.access import WebOptions
+from bridges.web._access import WebOptions
 from bridges.web.components import opened
 from bridges.web.server import PageServer
 from mesh.chain import DeploymentPlan

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from yarl import URL
 
-from bridges.web.access import WebOptions
+from bridges.web._access import WebOptions
 from mesh.errors import ConfigurationError
 from schemas import RpcKey
 from tests.bridges.web.conftest import OWN

@@ -6,18 +6,18 @@ A browser has a session after it gave a token; members of the site show their ce
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import logging
 import secrets
 import ssl
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar
 
 import msgspec
 from aiohttp import web
 
+from bridges.serving import ServerOptions, is_loopback
 from mesh.base.flood import BoundedDict
 from mesh.base.fresh_file import FreshFile
 from mesh.base.log_context import log_event
@@ -134,21 +134,10 @@ STATIC: Final = Path(__file__).with_name("static")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServerOptions:
-    """Where a server for people listens, and how it is protected."""
-
-    host: str = "127.0.0.1"
-    port: int = 0
-    token: str = field(default="", repr=False)
-    """What people log in with; empty: no login."""
-    certificate: str = ""
-    key: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
 class WebOptions(ServerOptions):
     """How the page is served."""
 
+    protection: ClassVar[str] = "--certificate, --key and --token-file or --roster"
     names: tuple[str, ...] = ()
     """Names besides its own address by which browsers reach it: `HOST` at any port, or `HOST:PORT`."""
     operator_token: str = field(default="", repr=False)
@@ -182,38 +171,12 @@ class WebOptions(ServerOptions):
                 hint="with --signer give --operator-token-file",
                 code="web-not-protected",
             )
-        if not (self.certificate and self.key and self.has_login):
-            require_loopback(self.host, "--certificate, --key and --token-file or --roster")
+        super().check()
 
     @property
     def has_login(self) -> bool:
         """Whether people, or operators only, can log in."""
         return bool(self.token or self.operator_token or self.roster)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a host."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def require_loopback(host: str, options: str) -> None:
-    """Raise `ConfigurationError` unless only this machine can reach a host; `options` would protect a server there."""
-    if not is_loopback(host):
-        raise ConfigurationError(
-            f"other machines can reach {host}: that needs TLS and a login",
-            hint=f"give {options}, or listen on 127.0.0.1",
-            code="web-not-protected",
-        )
-
-
-def server_tls(certificate: str, key: str) -> ssl.SSLContext:
-    """How a server proves who it is, by two files (PEM)."""
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-    context.load_cert_chain(Path(certificate).expanduser(), Path(key).expanduser())
-    return context
 
 
 log = logging.getLogger(__name__)
@@ -306,10 +269,8 @@ class Logins:
     def tls(self) -> ssl.SSLContext | None:
         """How the server proves who it is, and which certificates of browsers it takes; None without TLS."""
         options = self._options
-        if not options.certificate:
-            return None
-        context = server_tls(options.certificate, options.key)
-        if options.roster:
+        context = options.tls()
+        if context is not None and options.roster:
             context.load_verify_locations(Path(options.ca).expanduser())
             has_token = bool(options.token or options.operator_token)
             context.verify_mode = ssl.CERT_OPTIONAL if has_token else ssl.CERT_REQUIRED
