@@ -77,8 +77,6 @@ if TYPE_CHECKING:
     from mesh.signer.client import SignerClient
     from mesh.signer.protocol import Recording, SignerAnswer
 
-MOST_CALLS: Final = 32
-"""Operations of the signer at once, besides those that follow jobs."""
 MOST_FOLLOWED: Final = 64
 """Streams, and messages whose answer waits for the end of a job."""
 WAIT: Final = 25.0
@@ -96,7 +94,7 @@ CANCEL_WAIT: Final = 5.0
 """Seconds for which such a job may go on before the next attempt."""
 UNKNOWN: Final = frozenset({"invalid-request", "unknown-job"})
 """The codes of errors for a job that there is none of."""
-OUTAGES: Final = frozenset({"signer-unavailable", "too-many-requests"})
+OUTAGES: Final = frozenset({"signer-unavailable", "too-many-calls", "too-many-requests"})
 """The codes of errors after which who follows a job asks again."""
 
 
@@ -108,7 +106,7 @@ class A2aDoor(RequestHandler):
         self._store = store
         self._pusher = pusher
         self._robot = robot
-        self._calls = self._followed = 0
+        self._followed = 0
 
     @validate_request_params
     async def on_message_send(self, params: SendMessageRequest, context: ServerCallContext) -> Task | Message:
@@ -384,17 +382,10 @@ class A2aDoor(RequestHandler):
 
     async def _ask(self, operation: str, fields: Mapping[str, Any]) -> SignerAnswer:
         """Raises `A2AError` only."""
-        if self._calls >= MOST_CALLS:
-            raise InternalError(
-                "too many calls at once; wait for the answers to earlier ones", {"code": "too-many-calls"}
-            )
-        self._calls += 1
         try:
             return await self._signer.ask(operation, fields)
         except AiraError as error:
             raise error_of(error) from None
-        finally:
-            self._calls -= 1
 
 
 def error_of(error: AiraError) -> A2AError:

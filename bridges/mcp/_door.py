@@ -43,16 +43,12 @@ from mesh.signer.protocol import FoundRobots, Job, Jobs, SignerAnswer, SignerErr
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from mcp.server.context import ServerRequestContext
 
     from mesh.signer.client import SignerClient
 
 log = logging.getLogger(__name__)
 
-MOST_CALLS: Final = 64
-"""Calls in progress at once, over all clients of the door."""
 JSON: Final = "application/json"
 _ADDRESS: Final = re.compile(r"0x[0-9a-fA-F]{40}")
 _JOB: Final = re.compile(r"job-[0-9a-f]{16}")
@@ -105,7 +101,6 @@ class McpDoor:
 
     def __init__(self, signer: SignerClient) -> None:
         self._signer = signer
-        self._calls = 0
         self.server: Server[Any] = Server(
             "aira-mesh",
             version=__version__,
@@ -144,7 +139,7 @@ class McpDoor:
         if params.name not in TOOLS:
             raise MCPError(INVALID_PARAMS, "there is no such tool; tools/list has them")
         try:
-            answer = await self._ask(params.name, _arguments(params.arguments))
+            answer = await self._signer.ask(params.name, _arguments(params.arguments))
             if isinstance(answer, Job) and answer.consent is not None and params.name == "order":
                 asked = await self._ask_person(context, params, answer)
                 if isinstance(asked, InputRequiredResult):
@@ -156,18 +151,6 @@ class McpDoor:
             content=[TextContent(type="text", text=msgspec.json.encode(answer).decode())],
             structured_content=msgspec.to_builtins(answer),
         )
-
-    async def _ask(self, operation: str, fields: Mapping[str, Any]) -> SignerAnswer:
-        """Raises `AiraError` only."""
-        if self._calls >= MOST_CALLS:
-            raise AiraError(
-                "too many calls at once", hint="wait for the answers to earlier ones", code="too-many-calls"
-            )
-        self._calls += 1
-        try:
-            return await self._signer.ask(operation, fields)
-        finally:
-            self._calls -= 1
 
     async def _ask_person(
         self, context: ServerRequestContext[Any], params: CallToolRequestParams, job: Job
@@ -190,7 +173,7 @@ class McpDoor:
         if not isinstance(answer, ElicitResult) or answer.action == "cancel":
             return job
         allow = answer.action == "accept" and (answer.content or {}).get("allow") is True
-        answered = await self._ask("answer_consent", {"id": consent.id, "allow": allow})
+        answered = await self._signer.ask("answer_consent", {"id": consent.id, "allow": allow})
         assert isinstance(answered, Job)
         return answered
 
@@ -217,25 +200,25 @@ class McpDoor:
     async def _resource(self, uri: str) -> SignerAnswer:
         """What a URI names. Raises `AiraError`."""
         if uri == "aira://market":
-            return await self._ask("find_robots", {"limit": 50})
+            return await self._signer.ask("find_robots", {"limit": 50})
         if uri == "aira://jobs":
-            return await self._ask("jobs", {})
+            return await self._signer.ask("jobs", {})
         kind, _, name = uri.removeprefix("aira://").partition("/")
         if uri.startswith("aira://"):
             if kind == "robot" and _ADDRESS.fullmatch(name):
-                found = await self._ask("find_robots", {"text": name})
+                found = await self._signer.ask("find_robots", {"text": name})
                 assert isinstance(found, FoundRobots)
                 for robot in found.robots:
                     if robot.address.lower() == name.lower():
                         return robot
             if kind == "contract" and _ADDRESS.fullmatch(name):
-                listed = await self._ask("jobs", {"limit": 200})
+                listed = await self._signer.ask("jobs", {"limit": 200})
                 assert isinstance(listed, Jobs)
                 for job in listed.jobs:
                     if job.contract.lower() == name.lower():
                         return job
             if kind == "recording" and _JOB.fullmatch(name):
-                return await self._ask("recording", {"job_id": name})
+                return await self._signer.ask("recording", {"job_id": name})
         raise AiraError("there is no such resource", hint="resources/list has what there is", code="no-such-resource")
 
 

@@ -30,6 +30,12 @@ CHECKS: Final = 0.5
 """Seconds between two looks at who is late."""
 STALLED: Final = 30.0
 """Seconds in which a client must take something of what it is sent, or its connection ends (on Linux)."""
+BACKLOG: Final = 256
+"""Connections that wait to be accepted."""
+REFUSED: Final = 16
+"""Clients that are told at a time that there is no place for them; others are not."""
+REFUSAL_SECONDS: Final = 1.0
+"""For how long they may ask first: who is answered earlier may not hear it."""
 BREATH: Final = 0.2
 """Seconds until connections are accepted again when the process has no descriptor left."""
 
@@ -40,6 +46,9 @@ class HttpServer(Lifecycle):
     A connection counts from its first packet, so that the handshakes of TLS are bounded, too. Leaving finishes the
     requests in progress, and ends all connections. Entering raises `PortUnavailable`, whose hint names the `option` for
     the port.
+
+    It listens on `bound` instead of a port if that is given: a socket with an address, such as a path, which it closes.
+    A client without a place, because all others ask something, is sent `refusal`, which goes without TLS only.
     """
 
     title = "HTTP server"
@@ -48,8 +57,10 @@ class HttpServer(Lifecycle):
         self,
         app: web.Application,
         host: str,
-        port: int,
+        port: int = 0,
         *,
+        bound: socket.socket | None = None,
+        refusal: bytes = b"",
         tls: ssl.SSLContext | None = None,
         limits: DoorLimits = DoorLimits(),  # noqa: B008
         trusted: Collection[str] = (),
@@ -62,6 +73,9 @@ class HttpServer(Lifecycle):
         self._host = host
         self._tls = tls
         self._option = option
+        self._bound = bound
+        self._refusal = refusal
+        self._refused = 0
         self._door = Door(limits, trusted=trusted)
         self._tasks: set[asyncio.Task[None]] = set()
         self._guests: dict[asyncio.BaseTransport | None, Guest] = {}
@@ -100,6 +114,10 @@ class HttpServer(Lifecycle):
 
     async def _listen(self) -> list[socket.socket]:
         loop, listening = asyncio.get_running_loop(), list[socket.socket]()
+        if self._bound is not None:
+            self._bound.setblocking(False)
+            self._bound.listen(BACKLOG)
+            return [self._bound]
         try:
             places = await loop.getaddrinfo(self._host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             for family, kind, number, _, address in dict.fromkeys(places):
@@ -110,7 +128,7 @@ class HttpServer(Lifecycle):
                 if family == socket.AF_INET6:
                     one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
                 one.bind((address[0], self.port, *address[2:]))
-                one.listen(256)
+                one.listen(BACKLOG)
                 self.port = one.getsockname()[1]
         except (OSError, OverflowError, UnicodeError) as error:
             for one in listening:
@@ -128,7 +146,8 @@ class HttpServer(Lifecycle):
                 log.debug("can't accept a connection: %s", error)
                 await asyncio.sleep(BREATH)
                 continue
-            self._start(self._make(connection, str(address[0])), "connection")
+            # A path has no address of the client.
+            self._start(self._make(connection, str(address[0]) if address else ""), "connection")
 
     async def _make(self, connection: socket.socket, address: str) -> None:
         """Make the connection: with TLS that takes a handshake."""
@@ -137,11 +156,11 @@ class HttpServer(Lifecycle):
         assert server is not None
         guest = self._door.enter(address, task.cancel)
         if guest is None:
-            connection.close()
+            await self._refuse(connection)
             return
         timeout = None if self._tls is None else self._door.limits.head
         try:
-            if hasattr(socket, "TCP_USER_TIMEOUT"):
+            if hasattr(socket, "TCP_USER_TIMEOUT") and connection.family != socket.AF_UNIX:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED * 1000))
             await asyncio.get_running_loop().connect_accepted_socket(
                 lambda: _Watched(server(), guest, self), connection, ssl=self._tls, ssl_handshake_timeout=timeout
@@ -150,6 +169,24 @@ class HttpServer(Lifecycle):
             self._door.leave(guest)
             connection.close()
             log.debug("a client at %s did not connect: %s", address, error)
+
+    async def _refuse(self, connection: socket.socket) -> None:
+        """Close a connection for which there is no place, and say so where a few do not know it yet."""
+        loop = asyncio.get_running_loop()
+        self._refused += 1
+        try:
+            if self._refusal and self._refused <= REFUSED:
+                async with asyncio.timeout(REFUSAL_SECONDS):
+                    await loop.sock_recv(connection, 1 << 16)
+                    await loop.sock_sendall(connection, self._refusal)
+                    connection.shutdown(socket.SHUT_WR)
+                    while await loop.sock_recv(connection, 1 << 16):
+                        pass
+        except (OSError, TimeoutError) as error:
+            log.debug("a client that was refused did not hear it: %s", error)
+        finally:
+            self._refused -= 1
+            connection.close()
 
     async def _end_late(self) -> None:
         while True:

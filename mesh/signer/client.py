@@ -6,6 +6,7 @@ async with SignerClient(folder / "door.sock") as signer:
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 import aiohttp
@@ -16,8 +17,10 @@ from mesh.signer import protocol
 from mesh.signer.protocol import (
     DOOR,
     LARGEST_ANSWER,
+    LARGEST_REQUEST,
     OWNER,
     Message,
+    RequestTooLarge,
     SignerError,
     SignerUnavailable,
 )
@@ -34,21 +37,27 @@ CONNECT_SECONDS: Final = 5.0
 ANSWER_SECONDS: Final = 180.0
 """An order asks robots, and perhaps fetches an objective, before it is answered."""
 
+CALLS: Final = 64
+"""Calls in progress at once, besides …"""
+LOOKS: Final = 192
+"""… those that look at a job, and may wait for it to change."""
+
 
 class SignerClient:
     """Talks to the signer on a socket: `async with SignerClient(path) as signer`. Usable by many tasks at once.
 
     Each method raises a `SignerError` with the code and the hint of the signer's refusal, `SignerUnavailable` if it
-    does not answer, and `InputError` for a request that can't be one.
+    does not answer, `InputError` for a request that can't be one, and `AiraError` (`too-many-calls`) for one too many.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._session: aiohttp.ClientSession | None = None
+        self._in_progress: Counter[bool] = Counter()
 
     async def __aenter__(self) -> Self:
         timeout = aiohttp.ClientTimeout(total=ANSWER_SECONDS, sock_connect=CONNECT_SECONDS)
-        connector = aiohttp.UnixConnector(path=str(self._path), limit=64)
+        connector = aiohttp.UnixConnector(path=str(self._path), limit=0)
         self._session = aiohttp.ClientSession(connector=connector, timeout=timeout)
         return self
 
@@ -167,7 +176,18 @@ class SignerClient:
             body = msgspec.json.encode(msgspec.convert(fields, known.request))
         except (msgspec.ValidationError, TypeError, OverflowError, RecursionError) as error:
             raise InputError(f"not a request for {operation}: {error}"[:300], code="invalid-request") from None
-        status, data = await self._post(operation, body)
+        if len(body) > LARGEST_REQUEST:
+            raise RequestTooLarge
+        is_look = operation == "job"
+        if self._in_progress[is_look] >= (LOOKS if is_look else CALLS):
+            raise AiraError(
+                "too many calls at once", hint="wait for the answers to earlier ones", code="too-many-calls"
+            )
+        self._in_progress[is_look] += 1
+        try:
+            status, data = await self._post(operation, body)
+        finally:
+            self._in_progress[is_look] -= 1
         try:
             if status == 200:
                 return decode_json(data, known.answer)

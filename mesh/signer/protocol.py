@@ -645,3 +645,11 @@ class ErrorAnswer(SignerAnswer, frozen=True, kw_only=True):
     """The body of an answer that is an error."""
 
     error: SignerFailure
+
+
+class RequestTooLarge(SignerError, code="request-too-large"):
+    """A request has more bytes than `LARGEST_REQUEST`."""
+
+    def __init__(self) -> None:
+        hint = "put the messages into a file, and give its CID as the objective"
+        super().__init__(f"a request has at most {LARGEST_REQUEST} bytes", hint=hint)

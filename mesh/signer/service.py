@@ -23,6 +23,7 @@ from collections import Counter
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakValueDictionary
 
@@ -36,8 +37,10 @@ from mesh.agent.orders import MEASURED_BLOCKS, OrderState
 from mesh.amounts import ETH
 from mesh.base.background import Background
 from mesh.base.database import DISK_ERRORS
+from mesh.base.door import DoorLimits
 from mesh.base.file_locks import try_lock
 from mesh.base.flood import Rate, RateLimiter
+from mesh.base.http_server import HttpServer
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.base.private_files import make_private_folder, open_private
@@ -104,6 +107,8 @@ log = logging.getLogger(__name__)
 
 REQUESTS: Final = Rate(per_second=30.0, burst=300)
 """Requests on one socket."""
+CONNECTIONS: Final = MappingProxyType({protocol.DOOR_SOCKET: 512, protocol.OWNER_SOCKET: 64})
+"""Connections to each socket at once."""
 AT_A_TIME: Final = 16
 """Other requests that are worked on at a time, without those that only wait for a job to change."""
 AT_ONCE: Final = frozenset({"stop_job", "withdraw", *OWNER})
@@ -217,11 +222,8 @@ class Signer(Lifecycle):
             )
 
     async def _serve(self, stack: AsyncExitStack, name: str, operations: Mapping[str, protocol.Operation]) -> None:
-        limiter = RateLimiter(per_sender=REQUESTS)
         app = web.Application(client_max_size=protocol.LARGEST_REQUEST)
-        app.router.add_post("/v1/{operation}", partial(self._answer, operations, limiter))
-        runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
-        await runner.setup()
+        app.router.add_post("/v1/{operation}", partial(self._answer, operations, RateLimiter(per_sender=REQUESTS)))
         path = self.folder / name
         path.unlink(missing_ok=True)  # of an earlier run: the folder is locked
         listening = socket.socket(socket.AF_UNIX)
@@ -238,9 +240,10 @@ class Signer(Lifecycle):
         finally:
             os.umask(before)
         stack.callback(partial(path.unlink, missing_ok=True))
-        listening.setblocking(False)
-        stack.push_async_callback(runner.cleanup)  # before the socket is closed
-        await web.SockSite(runner, listening).start()
+        at_once = CONNECTIONS[name]
+        limits = DoorLimits(connections=at_once, per_address=at_once)
+        server = HttpServer(app, "", bound=listening, refusal=_refusal_of(at_once), limits=limits)
+        await stack.enter_async_context(server)
 
     async def _answer(
         self, operations: Mapping[str, protocol.Operation], limiter: RateLimiter, request: web.Request
@@ -262,6 +265,8 @@ class Signer(Lifecycle):
             found = await self._work_on(name, asked)
         except AiraError as error:
             return _answered(protocol.ErrorAnswer(error=failure_of(error)), status=400)
+        except web.HTTPRequestEntityTooLarge:
+            return _answered(protocol.ErrorAnswer(error=failure_of(protocol.RequestTooLarge())), status=413)
         except web.HTTPException:
             raise
         except Exception:
@@ -1160,6 +1165,18 @@ def _require(decision: Decision | None) -> None:
 
 def _refusal(decision: Decision) -> SignerError:
     return SignerError(decision.why, hint=decision.next, code=decision.code)
+
+
+def _refusal_of(connections: int) -> bytes:
+    """What a client is sent for whom a socket has no place."""
+    said = SignerError(
+        f"{connections} connections to this socket ask something already",
+        hint="end programs that wait for the signer, or wait a moment and ask again with the same key",
+        code="too-many-connections",
+    )
+    body = msgspec.json.encode(protocol.ErrorAnswer(error=failure_of(said)))
+    head = f"HTTP/1.1 503 Service Unavailable\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n"
+    return head.encode() + b"Connection: close\r\n\r\n" + body
 
 
 def _answered(answer: protocol.SignerAnswer, *, status: int = 200) -> web.Response:
