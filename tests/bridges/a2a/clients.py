@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import uuid
+from asyncio.subprocess import PIPE
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,7 @@ from mesh.signer.client import SignerClient
 from tests.support.commands import AIRA
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import AsyncIterator
     from pathlib import Path
 
@@ -42,8 +44,10 @@ class Reached:
     url: str
 
     @asynccontextmanager
-    async def client(self, *, streaming: bool = True, binding: str = "JSONRPC") -> AsyncIterator[Client]:
-        async with httpx.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"}, timeout=90) as http:
+    async def client(
+        self, *, streaming: bool = True, binding: str = "JSONRPC", verify: ssl.SSLContext | bool = True
+    ) -> AsyncIterator[Client]:
+        async with httpx.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"}, timeout=90, verify=verify) as http:
             config = ClientConfig(httpx_client=http, streaming=streaming, supported_protocol_bindings=[binding])
             yield await ClientFactory(config).create_from_url(self.url)
 
@@ -66,20 +70,19 @@ def token_file(state: Path) -> Path:
 
 
 @asynccontextmanager
-async def process(socket: Path, state: Path) -> AsyncIterator[Reached]:
-    """`aira a2a` in a process of its own, which is killed in the end."""
-    command = [*AIRA, "a2a", "--http", "127.0.0.1:0", "--socket", str(socket), "--data-dir", str(state)]
-    door = await asyncio.create_subprocess_exec(
-        *command, "--token-file", str(token_file(state)), stdout=asyncio.subprocess.PIPE
-    )
+async def process(socket: Path, state: Path, *options: str, door: str = "a2a") -> AsyncIterator[Reached]:
+    """`aira a2a`, or another door, in a process of its own, which is killed in the end."""
+    where = ("--http", "127.0.0.1:0", "--socket", str(socket), "--data-dir", str(state))
+    token = ("--token-file", str(token_file(state)))
+    process = await asyncio.create_subprocess_exec(*AIRA, door, *where, *token, *options, stdout=PIPE)
     try:
-        assert door.stdout is not None
+        assert process.stdout is not None
         async with asyncio.timeout(60):
-            line = await door.stdout.readline()
+            line = await process.stdout.readline()
         yield Reached(line.decode().split()[-1])
     finally:
-        door.kill()
-        await door.wait()
+        process.kill()
+        await process.wait()
 
 
 @asynccontextmanager

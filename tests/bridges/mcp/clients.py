@@ -13,6 +13,7 @@ from mcp_types.version import LATEST_HANDSHAKE_VERSION
 from tests.support.commands import AIRA
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import AsyncIterator
     from pathlib import Path
 
@@ -23,9 +24,11 @@ def _mode(version: str) -> str:
 
 
 @asynccontextmanager
-async def http_client(url: str, token: str, version: str, **options: Any) -> AsyncIterator[Client]:
+async def http_client(
+    url: str, token: str, version: str, *, verify: ssl.SSLContext | bool = True, **options: Any
+) -> AsyncIterator[Client]:
     headers = {"Authorization": f"Bearer {token}"}
-    async with httpx2.AsyncClient(headers=headers, timeout=60) as http:
+    async with httpx2.AsyncClient(headers=headers, timeout=60, verify=verify) as http:
         transport = streamable_http_client(url, http_client=http)
         async with Client(transport, mode=_mode(version), **options) as client:
             yield client
