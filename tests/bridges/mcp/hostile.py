@@ -14,6 +14,14 @@ class Attempt(NamedTuple):
     arguments: dict[str, Any]
 
 
+class Story(NamedTuple):
+    """An attack that is more than a call, what comes of it, and its test below `tests`."""
+
+    tried: str
+    said: str
+    test: str
+
+
 def value(**fields: Any) -> dict[str, Any]:
     """An order of one message with other fields."""
     return {"messages": [{"topic": "/count", "value": {"count": 1, "mode": "fine"} | fields}]}
@@ -101,29 +109,144 @@ URIS: Final = (
 )
 """Resources that there are not."""
 
-STORIES: Final = {
-    "the same order ten times at once": "one job, one contract",
-    "the same key for another order": "`idempotency-conflict`",
-    "twenty orders at once, over two doors, for more than the hour's budget": "as many as the budget has",
-    "more jobs at a time than allowed": "`too-many-jobs`",
-    "a yes that nobody gave, in the answer of a form that was not asked": "`needs-consent` stays",
-    "a yes to a consent that was answered": "`consent-used`",
-    "a yes to another order's consent": "that order only",
-    "the owner's operations on the door's socket": "`unknown-operation`",
-    "instructions in the robot's name and sentence, the model, its topics and choices": "marked as data",
-    "instructions, escape codes and turned letters in a failed job's words": "marked, and cleaned",
-    "instructions in a recording": "marked, and cleaned",
-    "texts of strangers in the descriptions of tools": "these never change",
-    "an HTTP request without the token, or with a wrong one": "401",
-    "a token of another server, of another issuer, over, forged or unsigned": "401",
-    "a page of another site (DNS rebinding by `Host`, or `Origin`)": "421, 403",
-    "a body of more than 1 MiB": "413",
-    "a connection that sends nothing": "is ended",
-    "a message of more than 2 MiB, or none at all, on stdin": "is skipped",
-    "a token file that others can read, or a link": "`token-file-unusable`",
-    "a page without a login that answers consents": "`operators-only`",
-}
-"""Attacks that are more than a call, and what comes of them; each has a test of its own."""
+STORIES: Final = (
+    Story(
+        "the same order ten times at once",
+        "one job, one contract",
+        "bridges.mcp.test_mcp_hostile.test_the_same_order_ten_times_at_once_is_one_job",
+    ),
+    Story(
+        "the same key for another order",
+        "`idempotency-conflict`",
+        "bridges.mcp.test_mcp_hostile.test_the_same_order_ten_times_at_once_is_one_job",
+    ),
+    Story(
+        "twenty orders at once, over two doors, for more than the hour's budget",
+        "as many as the budget has",
+        "bridges.mcp.test_mcp_hostile.test_orders_at_once_over_two_doors_stay_within_the_budget",
+    ),
+    Story(
+        "more jobs at a time than allowed",
+        "`too-many-jobs`",
+        "bridges.mcp.test_mcp_hostile.test_no_more_jobs_at_a_time_than_allowed",
+    ),
+    Story(
+        "a yes that nobody gave, in the answer of a form that was not asked",
+        "`needs-consent` stays",
+        "bridges.mcp.test_mcp_hostile.test_a_yes_that_nobody_gave_is_none",
+    ),
+    Story(
+        "a yes to a consent that was answered",
+        "`consent-used`",
+        "bridges.mcp.test_mcp_hostile.test_a_yes_that_nobody_gave_is_none",
+    ),
+    Story(
+        "a yes to another order's consent",
+        "that order only",
+        "bridges.mcp.test_mcp_consents.test_the_owner_allows_one_order_and_only_that",
+    ),
+    Story("a yes that comes too late", "`expired`", "mesh.signer.test_hostile.test_a_consent_expires"),
+    Story(
+        "an order that was changed after it was shown",
+        "is not approved",
+        "mesh.signer.test_hostile.test_an_order_that_was_changed_after_it_was_shown_is_not_approved",
+    ),
+    Story(
+        "the owner's operations on the door's socket",
+        "`unknown-operation`",
+        "bridges.mcp.test_mcp_hostile.test_a_yes_that_nobody_gave_is_none",
+    ),
+    Story(
+        "a clock that is set back",
+        "frees no budget",
+        "mesh.signer.test_hostile.test_a_clock_that_is_set_back_frees_no_budget",
+    ),
+    Story(
+        "another policy in the file",
+        "counts once the owner says so",
+        "mesh.signer.test_hostile.test_a_policy_that_was_swapped_counts_only_when_the_owner_says_so",
+    ),
+    Story(
+        "a policy that others may write, or a link to one",
+        "`policy-unsafe`",
+        "mesh.signer.test_policy.test_a_file_that_others_could_have_written_is_refused",
+    ),
+    Story(
+        "an entry of the log that was changed, removed or added",
+        "`log-broken`",
+        "mesh.signer.test_signer_log.test_what_was_changed_is_found",
+    ),
+    Story(
+        "a second signer with the same folder",
+        "`signer-running`",
+        "mesh.signer.test_signer.test_a_second_signer_in_one_folder_refuses",
+    ),
+    Story(
+        "a flood of requests to the signer",
+        "`too-many-requests`",
+        "mesh.signer.test_hostile.test_a_flood_of_requests_is_refused",
+    ),
+    Story(
+        "a flood of connections to the signer",
+        "`too-many-connections`",
+        "mesh.signer.test_signer_limits.test_one_connection_too_many_is_told_so_and_the_others_go_on",
+    ),
+    Story(
+        "instructions in the robot's name and sentence, the model, its topics and choices",
+        "marked as data",
+        "bridges.mcp.test_mcp_hostile.test_texts_of_strangers_are_marked_wherever_they_stand",
+    ),
+    Story(
+        "instructions, escape codes and turned letters in a failed job's words",
+        "marked, and cleaned",
+        "bridges.mcp.test_mcp_hostile.test_texts_of_strangers_are_marked_wherever_they_stand",
+    ),
+    Story(
+        "instructions in a recording",
+        "marked, and cleaned",
+        "bridges.mcp.test_mcp_hostile.test_texts_of_strangers_are_marked_wherever_they_stand",
+    ),
+    Story(
+        "texts of strangers in the descriptions of tools",
+        "these never change",
+        "bridges.mcp.test_mcp_hostile.test_texts_of_strangers_are_marked_wherever_they_stand",
+    ),
+    Story(
+        "an HTTP request without the token, or with a wrong one",
+        "401",
+        "bridges.mcp.test_http.test_without_the_token_nothing_is_served",
+    ),
+    Story(
+        "a token of another server, of another issuer, over, forged or unsigned",
+        "401",
+        "bridges.mcp.test_http.test_other_tokens_are_not_taken",
+    ),
+    Story(
+        "a page of another site (DNS rebinding by `Host`, or `Origin`)",
+        "421, 403",
+        "bridges.mcp.test_http.test_pages_of_other_sites_reach_nothing",
+    ),
+    Story("a body of more than 1 MiB", "413", "bridges.mcp.test_http.test_a_body_that_is_too_large_is_refused"),
+    Story(
+        "a connection that sends nothing", "is ended", "bridges.mcp.test_http.test_a_client_that_sends_nothing_is_ended"
+    ),
+    Story(
+        "a message of more than 2 MiB, or none at all, on stdin",
+        "is skipped",
+        "bridges.mcp.test_stdio.test_what_is_no_message_ends_nothing",
+    ),
+    Story(
+        "a token file that others can read, or a link",
+        "`token-file-unusable`",
+        "bridges.mcp.test_http.test_a_token_file_that_is_not_private_is_refused",
+    ),
+    Story(
+        "a page without a login that answers consents",
+        "`operators-only`",
+        "bridges.web.test_web_consents.test_only_operators_who_logged_in_see_and_answer_them",
+    ),
+)
+"""Attacks that are more than a call, and what comes of them."""
 
 
 def table() -> str:
@@ -131,7 +254,7 @@ def table() -> str:
     rows = [(one.tried, f"`{one.code}`") for one in CALLS]
     rows += [(f"the tool `{name}`", "there is none") for name in HIDDEN_TOOLS]
     rows += [(f"the resource `{uri}`", "`no-such-resource`") for uri in URIS]
-    rows += list(STORIES.items())
+    rows += [(one.tried, one.said) for one in STORIES]
     return "\n".join(
         ["| what is tried | what comes of it |", "|---|---|", *(f"| {tried} | {said} |" for tried, said in rows)]
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import unicodedata
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from mcp_types import ElicitResult
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from mesh.signer.protocol import SignerError
-from tests.bridges.mcp.hostile import CALLS, HIDDEN_TOOLS, STORIES, URIS, Attempt, table
+from tests.bridges.mcp.hostile import CALLS, HIDDEN_TOOLS, STORIES, URIS, Attempt, Story, table
 from tests.bridges.mcp.world import INJECTION, PRICE, World, content, ended
 from tests.support.market import Place, founded
 from tests.support.routers import EmbeddedRouter
@@ -233,3 +234,9 @@ async def test_at_the_end_the_log_holds(world: World) -> None:
 async def test_the_guide_has_the_cases() -> None:
     assert table() in GUIDE.read_text(encoding="utf-8")
     assert len(CALLS) + len(HIDDEN_TOOLS) + len(URIS) + len(STORIES) >= 60
+
+
+@pytest.mark.parametrize("story", STORIES, ids=[one.tried for one in STORIES])
+async def test_each_story_of_the_guide_has_its_test(story: Story) -> None:
+    module, _, name = story.test.rpartition(".")
+    assert callable(getattr(import_module(f"tests.{module}"), name))
