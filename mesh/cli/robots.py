@@ -15,7 +15,7 @@ from mesh.cli.options import CHAIN_SETTINGS, with_json, with_settings, with_time
 from mesh.cli.output import format_duration, plural, print_json, print_line, print_table
 from mesh.errors import ChainError
 from mesh.settings import NetworkSettings
-from schemas.address import is_ens_name, parse_address
+from schemas.address import is_ens_name, parse_address, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -38,8 +38,8 @@ async def command(settings: Settings, model: str | None, timeout: float, as_json
     costs, and how its latest contracts ended.
 
     Names, places and prices are the owners' words: anybody may choose any name, so the address says who it is. The
-    record counts the contracts of about a week, the 500 latest, that paid the robot or were refunded; it needs the
-    chain's node, and is left out without one.
+    record counts the contracts of about a week, the 500 latest, that paid the robot or were refunded, also under its
+    earlier addresses, which follow; it needs the chain's node, and is left out without one.
     """
     from mesh.role.composition import watching
 
@@ -112,7 +112,7 @@ def reads(robot: Robot) -> str:
 
 
 def record_of(robot: Robot) -> str:
-    """How a robot's latest contracts ended, for people."""
-    if robot.paid is None or robot.refunded is None:
-        return "unknown"
-    return f"{robot.paid:,} paid, {robot.refunded:,} refunded"
+    """How a robot's latest contracts ended, and under which earlier addresses, for people."""
+    known = robot.paid is not None and robot.refunded is not None
+    record = f"{robot.paid:,} paid, {robot.refunded:,} refunded" if known else "unknown"
+    return f"{record}, formerly {', '.join(map(shortened, robot.formerly))}" if robot.formerly else record

@@ -78,6 +78,9 @@ def test_what_a_robot_is_doing_is_said_in_words() -> None:
     assert doing(robot(state="working", queue=1, wait=90)) == "working, 1 job waits, about 90 s"
     assert doing(robot(state="stopped", queue=2)) == "stopped, 2 jobs wait"
     assert record_of(robot(paid=1_200, refunded=0)) == "1,200 paid, 0 refunded"
+    earlier = ("0x" + "1" * 40, "0x" + "2" * 40)
+    moved = robot(paid=3, refunded=1, formerly=earlier)
+    assert record_of(moved) == "3 paid, 1 refunded, formerly 0x1111…1111, 0x2222…2222"
 
 
 async def test_status_shows_the_names_of_robots(place: Place, capsys: pytest.CaptureFixture[str]) -> None:

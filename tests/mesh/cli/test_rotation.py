@@ -14,6 +14,7 @@ from mesh.chain import Account, KeyfileError
 from mesh.errors import ConfigurationError
 from mesh.network import Endpoints, Network
 from schemas import ProfileKey, cid_of_bytes
+from schemas.address import shortened
 from tests.mesh.cli.site import MODEL, QUICK_RESEND, Site
 from tests.support.commands import aira, refused, run
 from tests.support.development import ServedChain, serve_embedded
@@ -159,6 +160,8 @@ async def test_a_robot_with_a_running_job_and_an_open_offer_moves(site: Site, tm
         (seen,) = await person.robots()
         assert (seen.name, seen.address, seen.formerly) == ("Lift 1", new.address, (old,))
         assert (seen.paid, seen.refunded) == (1, 0), "the record of the old key counts"
+        listed = await asyncio.to_thread(aira, "robots", **site.variables("person"))
+        assert f"1 paid, 0 refunded, formerly {shortened(old)}" in listed.stdout
         assert moved.parts.store.has(recording), "others may still fetch it"
         assert moved.runtime.rules.closed() is None, "it takes jobs again"
 
