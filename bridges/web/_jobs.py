@@ -20,12 +20,13 @@ from mesh.errors import AiraError
 from mesh.telemetry.metrics import is_healthy
 from mesh.validator.verification import Claim, JobFiles, Verdict, check_end, verify
 from mesh.watching import present, statuses
+from mesh.watching.robots import accounts_of
 from schemas import ZERO_ADDRESS, encode, parse_cid
 from schemas.decoding import decode_json
 from schemas.status import BridgeStatus, Status
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from bridges.web._files import Files
     from bridges.web._market import Market, SeenJob, SeenOrder
@@ -297,7 +298,10 @@ class Views:
         profiles = {robot.address: robot for robot in robots}
         self._last_seen.saw(robots)
         away = await self._last_seen.away({peer.address for peer in peers if peer.role == "agent"})
+        accounts = accounts_of([*robots, *(robot for robot, _ in away.values() if robot is not None)])
         records = records_of(list(market.jobs.values()), parts.token)
+        records |= {robot: _together(records[one] for one in own if one in records) for robot, own in accounts.items()}
+        replaced = {address for robot in robots for address in accounts[robot.address][1:]}
         offers, models = self._offers(), self._models()
         listed = []
         for peer, status in found.items():
@@ -313,6 +317,7 @@ class Views:
         gone = [
             {"since": since} | _robot_json(address, profile, models.get(address, set()), records)
             for address, (profile, since) in away.items()
+            if address not in replaced
         ]
         alerts = alerts_of({peer.address: status for peer, status in found.items()}, parts.chain_head.head)
         return {"agents": listed, "away": gone, "unlisted": max(0, len(peers) - AGENTS), "alerts": alerts}
@@ -386,6 +391,14 @@ def _robot_json(
         "models": sorted(models | own),
         "record": records.get(address, AccountRecord()).json(),
     }
+
+
+def _together(records: Iterable[AccountRecord]) -> AccountRecord:
+    total = AccountRecord()
+    for record in records:
+        for name in AccountRecord.__struct_fields__:
+            setattr(total, name, getattr(total, name) + getattr(record, name))
+    return total
 
 
 def records_of(jobs: list[SeenJob], token: str) -> dict[str, AccountRecord]:

@@ -23,7 +23,7 @@ from schemas.address import shortened
 from schemas.profiles import LARGEST_PROFILE, Profile, ProfileState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping
 
     import zenoh
 
@@ -100,6 +100,18 @@ def robot_of(profile: Profile) -> Robot:
     return Robot(address=profile.agent, formerly=profile.predecessors, **shown)
 
 
+def accounts_of(robots: Collection[Robot]) -> dict[str, list[str]]:
+    """By address of each robot, the accounts whose jobs count as its own.
+
+    These are its address and its earlier ones, but none at which another one of `robots` is or was.
+    """
+    claims = Counter(address for robot in robots for address in (robot.address, *robot.formerly))
+    return {
+        robot.address: [robot.address, *(address for address in robot.formerly if claims[address] == 1)]
+        for robot in robots
+    }
+
+
 def labelled(address: str, name: str) -> str:
     """A robot for people: its name with the short address, or the full address if it has no name."""
     return f"{name} ({shortened(address)})" if name else address
@@ -143,10 +155,9 @@ class RobotDirectory:
             outcomes = await chain.liabilities.outcomes(blocks=COUNTED_BLOCKS, most=COUNTED)
             self._outcomes = outcomes, time.monotonic() + KEPT
         known, counted = list(robots), []
-        claims = Counter(address for robot in known for address in (robot.address, *robot.formerly))
+        accounts = accounts_of(known)
         for robot in known:
-            own = [robot.address, *(address for address in robot.formerly if claims[address] == 1)]
-            ends = [outcomes.get(address, (0, 0)) for address in own]
+            ends = [outcomes.get(address, (0, 0)) for address in accounts[robot.address]]
             paid, refunded = (sum(numbers) for numbers in zip(*ends, strict=True))
             counted.append(msgspec.structs.replace(robot, paid=paid, refunded=refunded))
         return counted

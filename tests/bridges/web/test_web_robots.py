@@ -6,15 +6,19 @@ import asyncio
 import json
 import secrets
 import time
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec.structs import replace
 
 from bridges.web import _robots
-from mesh import Demand, Verified
+from mesh import Agent, Demand, Verified
 from mesh.agent.errors import Declined
+from mesh.chain import Account
+from mesh.role.handover import keep_handover
 from schemas import ZERO_ADDRESS, message_hash
+from schemas.profiles import Handover
 from schemas.rpc import AcceptDemand, OrderPair, SendDemand, SendOffer
 from tests.bridges.web.test_page_server import DATA
 from tests.mesh.agent.test_hiring import another, listening
@@ -25,6 +29,8 @@ from tests.support.objectives import objective
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     import pytest
 
     from tests.support.market import Place
@@ -81,6 +87,19 @@ async def test_robots_present_themselves_and_say_what_they_want(place: Place, se
         await browser.post("quotes", {"model": "no CID", "objective": "neither"}, status=400)
 
 
+@asynccontextmanager
+async def moved(place: Place) -> AsyncIterator[Agent]:
+    """The robot at work with a key that took over."""
+    account, settings = Account(secrets.token_bytes(32)), place.settings("moved", **NAMED)
+    handover = Handover(agent=place.address("robot"), successor=account.address, time=1)
+    keep_handover(settings.state_directory, handover.signed_by(place.market.accounts["robot"].signer))
+    async with (
+        place.chain_of(account, place.founded.generation) as chain,
+        working(Agent(MODEL, settings=settings, account=account, chain=chain)) as successor,
+    ):
+        yield successor
+
+
 async def test_robots_that_have_left_are_known_as_away(
     place: Place, serve: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,6 +140,16 @@ async def test_robots_that_have_left_are_known_as_away(
 
             (away,) = await until_found(known, what="the robot of the contract")
             assert (away["address"], away["profile"], away["record"]["done"]) == (place.address("robot"), None, done)
+            async with moved(place) as successor:
+
+                async def come() -> Any:
+                    await asyncio.sleep(0.5)  # the server answers as it did for some seconds, and only so many requests
+                    return [one for one in (await later.get("agents"))["agents"] if one["profile"]]
+
+                (here,) = await until_found(come, what="the robot with its new key")
+                assert (here["address"], here["profile"]["formerly"]) == (successor.address, [place.address("robot")])
+                assert here["record"]["done"] == done
+                assert await known() == []
             monkeypatch.setattr(_robots, "AWAY_SECONDS", -3600.0)
             monkeypatch.setattr(later.server.api._views, "_agents", None)
             assert await known() == []

@@ -119,6 +119,7 @@ export const texts = {
   readLast: "What it read last",
   latestJobs: "Latest jobs",
   lastSeen: "Last heard",
+  formerly: "Earlier addresses",
   yourRobot: "Is this your robot? Log in to manage it",
   operatorTokenHint: "It is in the operators' token file of the server.",
   forOwner: "For its owner",

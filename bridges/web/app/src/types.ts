@@ -151,6 +151,8 @@ export interface Profile {
   wait: number;
   readings: Record<string, string>;
   time: number;
+  /** The addresses that it had before, by messages that they signed. */
+  formerly?: Address[];
 }
 
 /** What a robot wants for an objective; with a `code`, why it does not want it. */

@@ -57,6 +57,7 @@ function RobotView({ robot }: { robot: Agent }) {
         <Facts
           of={[
             [texts.address, <Name text={robot.address} label={robot.address} href={`#/account/${robot.address}`} />],
+            [texts.formerly, profile?.formerly?.map((before) => <Name text={before} label={before} href={`#/account/${before}`} />)],
             [texts.model, cid ? <Name text={cid} label={cid} /> : ""],
             [texts.successIs, description?.success ? <Strange text={description.success} /> : ""],
             [texts.lastSeen, profile ? clock(profile.time) : ""],
