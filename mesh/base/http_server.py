@@ -17,7 +17,7 @@ from mesh.errors import PortUnavailable
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Awaitable, Callable, Collection, Coroutine
+    from collections.abc import Awaitable, Callable, Collection
     from contextlib import AsyncExitStack
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -96,21 +96,21 @@ class HttpServer(Lifecycle):
         listening = await self._listen()
         stack.push_async_callback(self._stop, listening)
         for one in listening:
-            self._start(self._accept(one), "listener")
+            self._watch(one)
+
+    def _watch(self, listening: socket.socket) -> None:
+        if listening.fileno() >= 0:
+            asyncio.get_running_loop().add_reader(listening, self._accept, listening)
 
     async def _stop(self, listening: list[socket.socket]) -> None:
         """Accept no more connections; those that are made stay."""
+        for one in listening:
+            asyncio.get_running_loop().remove_reader(one)
+            one.close()
         while self._tasks:
             for task in self._tasks:
                 task.cancel()
             await asyncio.wait(self._tasks)
-        for one in listening:
-            one.close()
-
-    def _start(self, work: Coroutine[Any, Any, None], name: str) -> None:
-        task = asyncio.get_running_loop().create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
 
     async def _listen(self) -> list[socket.socket]:
         loop, listening = asyncio.get_running_loop(), list[socket.socket]()
@@ -137,17 +137,25 @@ class HttpServer(Lifecycle):
             raise PortUnavailable(self._host, self.port, why, option=self._option) from None
         return listening
 
-    async def _accept(self, listening: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                connection, address = await loop.sock_accept(listening)
-            except OSError as error:  # such as too many open files
-                log.debug("can't accept a connection: %s", error)
-                await asyncio.sleep(BREATH)
-                continue
-            # A path has no address of the client.
-            self._start(self._make(connection, str(address[0]) if address else ""), "connection")
+    def _accept(self, listening: socket.socket) -> None:
+        """Accept a connection: at once, because an `await` that is cancelled would lose it."""
+        try:
+            connection, address = listening.accept()
+        except (BlockingIOError, ConnectionAbortedError):
+            return
+        except OSError as error:  # such as too many open files
+            log.debug("can't accept a connection: %s", error)
+            loop = asyncio.get_running_loop()
+            loop.remove_reader(listening)
+            loop.call_later(BREATH, self._watch, listening)
+            return
+        connection.setblocking(False)
+        # A path has no address of the client.
+        making = self._make(connection, str(address[0]) if address else "")
+        task = asyncio.get_running_loop().create_task(making, name="connection")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(lambda done: connection.close() if done.cancelled() else None)  # before it began
 
     async def _make(self, connection: socket.socket, address: str) -> None:
         """Make the connection: with TLS that takes a handshake."""

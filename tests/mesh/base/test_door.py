@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
+import socket
 import ssl
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
@@ -279,6 +281,19 @@ async def test_leaving_ends_all_connections_and_frees_the_port() -> None:
     writer.close()
     async with HttpServer(web.Application(), HOST, port) as again:
         assert again.port == port
+
+
+async def test_leaving_closes_connections_that_are_only_just_made() -> None:
+    """Whatever is left open raises a `ResourceWarning`, which is an error in tests."""
+    for turns in range(40):
+        async with AsyncExitStack() as stack, HttpServer(web.Application(), HOST, 0) as server:
+            for _ in range(5):
+                client = stack.enter_context(socket.socket())
+                client.setblocking(False)
+                client.connect_ex((HOST, server.port))
+            for _ in range(turns % 8):
+                await asyncio.sleep(0)
+        gc.collect()
 
 
 async def test_requests_that_are_none_leave_no_traceback_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
