@@ -7,6 +7,7 @@ import logging
 import shlex
 from contextlib import AsyncExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,8 +17,8 @@ from mesh.base.extras import PackageMissing
 from mesh.cli.files import require_readable
 from mesh.cli.options import BLOCK_TIME, PATH, PORT, with_json, with_settings
 from mesh.cli.output import announce, print_json
-from mesh.dev.page import PAGE_PORT, free_page_port, page_server
-from mesh.errors import ConfigurationError
+from mesh.dev.page import PAGE_PORT, page_server
+from mesh.errors import ConfigurationError, PortUnavailable
 from mesh.role.running import run_until_stopped
 from mesh.settings import Settings, TelemetrySettings
 from mesh.telemetry.serving import Telemetry
@@ -137,13 +138,18 @@ class MarketPage(NamedTuple):
             metrics_listen="",
             enable_executor=False,
         )
-        port = free_page_port(self.port)
         chain = await stack.enter_async_context(served.market.chain(served.url, "person"))
         agent = None
         if self.has_account:
             account = served.market.accounts["person"]
             agent = await stack.enter_async_context(Agent(settings=own, account=account, chain=chain))
-        return await stack.enter_async_context(serve(own, port=port, chain=chain, agent=agent)), ""
+        served_at = partial(serve, own, chain=chain, agent=agent)
+        try:
+            return await stack.enter_async_context(served_at(port=PAGE_PORT if self.port is None else self.port)), ""
+        except PortUnavailable:
+            if self.port is not None:
+                raise
+            return await stack.enter_async_context(served_at(port=0)), ""
 
 
 async def serve_market(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import socket
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import pytest
@@ -10,6 +12,7 @@ from click.testing import CliRunner
 
 from mesh.chain import Node
 from mesh.cli import main
+from mesh.dev.page import PAGE_PORT
 from tests.mesh.cli.served_chain import columns
 from tests.support.commands import AIRA, Serving, aira, refused
 from tests.support.peers import require
@@ -52,6 +55,16 @@ def test_a_state_file_without_anvil_is_one_clear_line(tmp_path: Path) -> None:
     options = ["--engine", "embedded", "--state", str(tmp_path / "chain.json")]
     done = CliRunner().invoke(main, ["up", "--listen", f"tcp/127.0.0.1:{free_port()}", *options])
     refused(done, "anvil-missing", "--state")
+
+
+def test_the_page_is_at_a_free_port_if_the_usual_one_is_taken(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        with suppress(OSError):  # by another market on this machine
+            taken.bind(("127.0.0.1", PAGE_PORT))
+        with up(tmp_path, "--engine", "embedded") as server:
+            page = columns(server.log())["page"]
+    assert page.startswith("http://127.0.0.1:")
+    assert not page.endswith(f":{PAGE_PORT}")
 
 
 def test_it_prints_where_it_listens_and_how_to_use_it(tmp_path: Path) -> None:

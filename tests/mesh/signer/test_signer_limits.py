@@ -52,12 +52,13 @@ async def connected(path: Path, stack: AsyncExitStack) -> tuple[asyncio.StreamRe
 async def test_one_connection_too_many_is_told_so_and_the_others_go_on(person: Person, driver: Driver) -> None:
     person.allow(driver.model)
     driver.released.clear()
-    async with person.at_work() as (door, owner, _), asyncio.TaskGroup() as tasks:
+    async with person.at_work() as (door, owner, signer), asyncio.TaskGroup() as tasks:
         job = await door.order(model=driver.model, messages=[GOOD], cost="4 XRT", idempotency_key="k")
         looks = [
             tasks.create_task(door.job(job.job_id, revision=job.revision, wait_seconds=30)) for _ in range(CONNECTIONS)
         ]
-        await until(lambda: door._in_progress[True] == CONNECTIONS)
+        waiting = asyncio.Event()
+        await until(lambda: len(signer._changed.get(job.job_id, waiting)._waiters) == CONNECTIONS, what="all looks")
         for _ in range(3):
             with pytest.raises(SignerError) as caught:
                 await door.balance()
