@@ -203,6 +203,7 @@ async def measure(seconds: int) -> dict[str, Any]:
     """Run it on a market of its own."""
     async with AsyncExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
+        os.environ["TMPDIR"] = folder  # what Chromium leaves goes with it
         endpoint, _ = stack.enter_context(router())
         served = await stack.enter_async_context(
             serve_chain(Settings(data_dir=folder), host="127.0.0.1", port=0, block_time=1.0, anvil=installed_anvil())
