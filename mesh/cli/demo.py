@@ -34,15 +34,12 @@ def command(
 
     with needs_extra("demo", "the demo"):
         from mesh.dev.demo import Demo, JsonNarrator, TextNarrator
-        from mesh.dev.page import free_page_port, page_server
+        from mesh.dev.page import page_server
 
-    port = None
-    if web:
-        page_server()  # what is missing is said before anything is done
-        port = free_page_port(web_port)
+    page = page_server(web_port) if web else None  # what is missing is said before anything is done
     narrator = JsonNarrator() if as_json else TextNarrator()
     with TemporaryDirectory(prefix="aira-demo-") as folder:
         demo = Demo(
-            Path(folder), objective=objective, generation=int(generation), out=out, narrator=narrator, page=port
+            Path(folder), objective=objective, generation=int(generation), out=out, narrator=narrator, page=page
         )
         run_to_end(demo.run, interrupted=0 if web else INTERRUPTED)

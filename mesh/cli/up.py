@@ -7,7 +7,6 @@ import logging
 import shlex
 from contextlib import AsyncExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +17,7 @@ from mesh.cli.files import require_readable
 from mesh.cli.options import BLOCK_TIME, PATH, PORT, with_json, with_settings
 from mesh.cli.output import announce, print_json
 from mesh.dev.page import PAGE_PORT, page_server
-from mesh.errors import ConfigurationError, PortUnavailable
+from mesh.errors import ConfigurationError
 from mesh.role.running import run_until_stopped
 from mesh.settings import Settings, TelemetrySettings
 from mesh.telemetry.serving import Telemetry
@@ -127,7 +126,7 @@ class MarketPage(NamedTuple):
         from mesh.agent.agent import Agent
 
         try:
-            serve = page_server()
+            serve = page_server(self.port)
         except PackageMissing as error:
             return "", f"none: {error}; {error.hint}"
         own = replace(
@@ -143,13 +142,7 @@ class MarketPage(NamedTuple):
         if self.has_account:
             account = served.market.accounts["person"]
             agent = await stack.enter_async_context(Agent(settings=own, account=account, chain=chain))
-        served_at = partial(serve, own, chain=chain, agent=agent)
-        try:
-            return await stack.enter_async_context(served_at(port=PAGE_PORT if self.port is None else self.port)), ""
-        except PortUnavailable:
-            if self.port is not None:
-                raise
-            return await stack.enter_async_context(served_at(port=0)), ""
+        return await stack.enter_async_context(serve(own, chain=chain, agent=agent)), ""
 
 
 async def serve_market(

@@ -24,7 +24,6 @@ from mesh.base.background import Background
 from mesh.chain import XRT
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import ROLES, DevelopmentMarket, deploy_market
-from mesh.dev.page import page_server
 from mesh.errors import ConfigurationError, InputError, RemoteError
 from mesh.market.provider import Provider, ProviderOptions
 from mesh.network import Endpoints, Network, free_endpoint
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     from mesh.agent.contracts import Contract, Outcome
     from mesh.agent.handlers import Job
     from mesh.chain.rpc import Transport
+    from mesh.dev.page import ServePage
     from mesh.market.book import Match
     from mesh.recording import Objective
     from schemas import Liability
@@ -191,7 +191,7 @@ class Demo:
 
     `folder` is for its files; the caller removes it once the event loop and its threads have ended. `objective` is a
     file (None: three blinks), `generation` that of the messages, `out` the folder that keeps objective and recording
-    (None: nowhere). With `page`, a port, the market's page is served, and `run` continues until it is cancelled.
+    (None: nowhere). With `page` the market's page is served, and `run` continues until it is cancelled.
     """
 
     def __init__(
@@ -203,7 +203,7 @@ class Demo:
         out: Path | None,
         narrator: Narrator,
         timeout: float = TIMEOUT,
-        page: int | None = None,
+        page: ServePage | None = None,
     ) -> None:
         self._folder = folder
         self._path = objective
@@ -225,7 +225,10 @@ class Demo:
         try:
             async with AsyncExitStack() as stack:
                 await self._open(stack)
-                url = "" if self._page is None else await self._open_page(stack, self._page)
+                url, person = "", self._person
+                if self._page is not None:  # from before the job on, so that it sees each step
+                    served = self._page(person.settings, chain=person.parts.chain, agent=person)
+                    url = await stack.enter_async_context(served)
                 contract = await self._do_job(objective, started)
                 if url:
                     shown = f"{url}/#/job/{contract.address}"
@@ -311,13 +314,6 @@ class Demo:
             await agent.add(model)
         self._report_account(role, agent.address, agent.parts.network.id)
         return agent
-
-    async def _open_page(self, stack: AsyncExitStack, port: int) -> str:
-        """Serve the page for the person, from before the job on so that it sees each step; its address."""
-        serve, person = page_server(), self._person
-        return await stack.enter_async_context(
-            serve(person.settings, port=port, chain=person.parts.chain, agent=person)
-        )
 
     def _report_account(self, role: str, address: str, zid: str) -> None:
         self._narrator.event(role, "account", f"account {address}, Zenoh id {zid}", address=address, zid=zid)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Protocol
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from mesh.base.extras import PackageMissing, needs_extra
 from mesh.base.plugins import entry_points
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
     from contextlib import AbstractAsyncContextManager
 
     from mesh.agent.agent import Agent
@@ -20,35 +23,45 @@ PAGE_PORT: Final = 8585
 
 
 class ServePage(Protocol):
-    """What the entry point names."""
+    """A page that can be served."""
 
     def __call__(
-        self, settings: Settings, *, port: int, chain: Chain | None = None, agent: Agent | None = None
+        self, settings: Settings, *, chain: Chain | None = None, agent: Agent | None = None
     ) -> AbstractAsyncContextManager[str]:
-        """Serve the page on this machine; gives its address. Port 0 is a free one.
+        """Serve the page on this machine; gives its address. Raises `PortUnavailable`.
 
         It uses `chain` (open), or that of the settings, and orders for `agent` (open), if one is given.
         """
 
 
-def page_server() -> ServePage:
-    """The installed page. Raises `PackageMissing` if there is none, or if it lacks a package."""
+def page_server(port: int | None) -> ServePage:
+    """The installed page, to be served at a port; 0 is a free one, and None is `PAGE_PORT`, or a free one if that is
+    taken.
+
+    Raises `PackageMissing` if there is no page, or if it lacks a package, and `PortUnavailable` for a port that is
+    given and taken.
+    """
     entry = next(iter(entry_points(ENTRY_POINTS).values()), None)
     if entry is None:
         raise PackageMissing("bridges", extra="web", user="the page")
     with needs_extra("web", "the page"):
-        found: ServePage = entry.load()
-    return found
-
-
-def free_page_port(port: int | None) -> int:
-    """The port for a page; for None `PAGE_PORT`, or a free one if that is taken. Raises `PortUnavailable`."""
+        serve = entry.load()
+    if port is None:
+        return partial(_at_the_usual_port, serve)
     from mesh.dev.anvil import check_port
+
+    return partial(serve, port=check_port("127.0.0.1", port))
+
+
+@asynccontextmanager
+async def _at_the_usual_port(
+    serve: Callable[..., AbstractAsyncContextManager[str]], settings: Settings, **uses: Any
+) -> AsyncIterator[str]:
     from mesh.errors import PortUnavailable
 
-    try:
-        return check_port("127.0.0.1", PAGE_PORT if port is None else port)
-    except PortUnavailable:
-        if port is not None:
-            raise
-        return check_port("127.0.0.1", 0)
+    async with AsyncExitStack() as stack:
+        try:
+            url = await stack.enter_async_context(serve(settings, port=PAGE_PORT, **uses))
+        except PortUnavailable:
+            url = await stack.enter_async_context(serve(settings, port=0, **uses))
+        yield url
