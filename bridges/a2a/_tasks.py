@@ -1,8 +1,12 @@
-"""The jobs of a signer as tasks of A2A, and the requests in messages as operations of a signer. Pure: no I/O."""
+"""The jobs of a signer as tasks of A2A, and the requests in messages as operations of a signer. Pure: no I/O.
+
+Fields are in camelCase here, as everywhere in A2A: a signer's `job_id` is `jobId`.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import re
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from uuid import uuid4
@@ -10,8 +14,8 @@ from uuid import uuid4
 import msgspec
 from a2a.types import Artifact, Message, Part, Role, Task, TaskState, TaskStatus
 from a2a.utils.errors import ContentTypeNotSupportedError, InvalidParamsError
-from google.protobuf.json_format import MessageToDict, ParseDict, ParseError
-from google.protobuf.struct_pb2 import Struct, Value
+from google.protobuf.json_format import MessageToDict, ParseDict
+from google.protobuf.struct_pb2 import Value
 
 from schemas.decoding import InvalidData, decode_json
 
@@ -25,6 +29,9 @@ LONGEST_ID: Final = 200
 MOST_PARTS: Final = 8
 LARGEST_WHOLE: Final = 2**53
 """From here on a number of JSON loses digits, so whole numbers are written as text."""
+MEDIA_TYPES: Final = frozenset({"", "application/json", "text/plain"})
+"""What parts of messages may say that they are."""
+MCAP: Final = "application/x-mcap"
 READING: Final = frozenset(
     {"find_robots", "describe_model", "quote", "recording", "verify", "balance", "statement", "jobs"}
 )
@@ -67,6 +74,8 @@ def wanted_of(message: Message) -> Wanted | None:
         raise InvalidParamsError(f"a message has 1 to {MOST_PARTS} parts here")
     found: list[dict[str, Any]] = []
     for part in message.parts:
+        if part.media_type.partition(";")[0].strip().lower() not in MEDIA_TYPES:
+            raise ContentTypeNotSupportedError("send application/json")
         match part.WhichOneof("content"):
             case "data":
                 value = _whole(MessageToDict(part.data))
@@ -90,7 +99,7 @@ def wanted_of(message: Message) -> Wanted | None:
     operation = str(fields.pop("operation", "order" if "cost" in fields else "quote"))
     if operation not in READING | {"order"}:
         raise InvalidParamsError(f"no such operation; there are order, {', '.join(sorted(READING))}")
-    return Wanted(operation, fields)
+    return Wanted(operation, {_snake(name): value for name, value in fields.items()})
 
 
 def key_of(message: Message) -> str:
@@ -110,7 +119,7 @@ def task_of(job: Job, context: str, recording: Recording | None = None) -> Task:
     task = Task(id=job.job_id, context_id=context, status=status_of(job, context))
     if job.result:
         task.artifacts.append(artifact_of(job, recording))
-    ParseDict({"job": _exact(msgspec.to_builtins(job))}, task.metadata)
+    ParseDict({"job": _shown(msgspec.to_builtins(job))}, task.metadata)
     return task
 
 
@@ -132,31 +141,23 @@ def status_of(job: Job, context: str) -> TaskStatus:
 
 
 def artifact_of(job: Job, recording: Recording | None = None) -> Artifact:
-    """The recording of a job: its CID, its contract, and what it has if that was read."""
+    """The recording of a job: what it has if that was read, with the last value of each topic, and the file itself."""
     content = {"cid": job.result, "contract": job.contract, "robot": job.robot, "objective": job.objective}
     if recording is not None:
         content["recording"] = msgspec.to_builtins(recording)
     return Artifact(
         artifact_id=job.result,
         name="recording",
-        description="the recording (MCAP) of the job, by its CID; read it with the operation `recording`",
-        parts=[data_part(content)],
+        description="what the robot recorded, and the file (MCAP) by its CID; the operation `recording` reads more",
+        parts=[data_part(content), Part(url=f"ipfs://{job.result}", filename=f"{job.result}.mcap", media_type=MCAP)],
     )
 
 
 def data_part(value: Any) -> Part:
     """A data part with a value of JSON."""
     part = Part(media_type="application/json")
-    part.data.CopyFrom(ParseDict(_exact(value), Value()))
+    part.data.CopyFrom(ParseDict(_shown(value), Value()))
     return part
-
-
-def struct_of(value: Mapping[str, Any]) -> Struct:
-    """An object of JSON. Raises `InvalidParamsError`."""
-    try:
-        return ParseDict(_exact(value), Struct())
-    except ParseError as error:
-        raise InvalidParamsError(str(error)[:200]) from None
 
 
 def changed(job: Job) -> datetime:
@@ -165,14 +166,23 @@ def changed(job: Job) -> datetime:
     return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
 
 
-def _exact(value: Any) -> Any:
+def _shown(value: Any) -> Any:
+    """An answer of a signer, whose keys are fields, in JSON of A2A."""
     if isinstance(value, dict):
-        return {name: _exact(each) for name, each in value.items()}
+        return {_camel(name): _shown(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_exact(each) for each in value]
+        return [_shown(each) for each in value]
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= LARGEST_WHOLE:
         return str(value)
     return value
+
+
+def _camel(name: str) -> str:
+    return re.sub("_([a-z])", lambda found: found[1].upper(), name)
+
+
+def _snake(name: str) -> str:
+    return re.sub("[A-Z]", lambda found: f"_{found[0].lower()}", name)
 
 
 def _whole(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -26,6 +27,12 @@ if TYPE_CHECKING:
 
 LONGEST_TEXT: Final = 300
 """Characters of a stranger's text."""
+LONGEST_VALUE: Final = 4096
+"""Characters of a value."""
+LARGEST_VALUE: Final = 65_536
+"""Bytes of a latest or last value that is shown."""
+MOST_TOPICS: Final = 256
+"""Topics of a recording that are listed."""
 LONGEST_NAME: Final = 64
 """Characters of a name, a unit or a choice in a model."""
 _HIDDEN: Final = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
@@ -137,38 +144,44 @@ def _fields(
     )
 
 
-def value_text(message: Played, author: str) -> tuple[StrangersText, bool]:
+def value_text(message: Played, author: str, longest: int = LONGEST_VALUE) -> tuple[StrangersText, bool]:
     """The value of a message in JSON, and whether it was shortened."""
     value, is_cut = shown_value(message)
     text = value if is_cut and isinstance(value, str) else msgspec.json.encode(value).decode()
-    shown = strangers(text, author, 4096)
-    return shown, is_cut or len(text) > 4096
+    return strangers(text, author, longest), is_cut or len(text) > longest
 
 
 def recorded(objective: Objective, cid: str, author: str, asked: protocol.ReadRecording) -> protocol.Recording:
     """What a recording has. Blocks on the disk."""
-    topics: dict[tuple[str, str], int] = {}
+    topics: Counter[tuple[str, str]] = Counter()
+    last: dict[tuple[str, str], Played | None] = {}
     values: list[protocol.RecordedValue] = []
     count = 0
     for message in objective.messages():
         place = message.topic, message.type.zenoh_encoding
-        topics[place] = topics.get(place, 0) + 1 if place in topics or len(topics) < 256 else 1
+        if place in topics or len(topics) < MOST_TOPICS:
+            topics[place] += 1
+            last[place] = message if len(message.payload) <= LARGEST_VALUE else None
         if asked.topic and message.topic == asked.topic:
             if asked.first <= count < asked.first + asked.limit:
                 text, is_cut = value_text(message, author)
                 moment = time_text(message.log_time_ns / 1e9)
                 values.append(protocol.RecordedValue(time=moment, value=text, is_shortened=is_cut))
             count += 1
-    listed = [] if asked.topic else list(topics.items())
     return protocol.Recording(
         cid=cid,
         duration_seconds=objective.duration_ns / 1e9,
         messages=objective.count,
-        topics=tuple(
+        topics=()
+        if asked.topic
+        else tuple(
             protocol.RecordedTopic(
-                topic=strangers(topic, author), encoding=strangers(encoding, author), messages=number
+                topic=strangers(place[0], author),
+                encoding=strangers(place[1], author),
+                messages=topics[place],
+                last=None if message is None else value_text(message, author, LONGEST_TEXT)[0],
             )
-            for (topic, encoding), number in listed
+            for place, message in last.items()
         ),
         values=tuple(values),
         more=max(0, count - asked.first - len(values)),

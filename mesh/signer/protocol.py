@@ -383,6 +383,8 @@ class RecordedTopic(SignerAnswer, frozen=True, kw_only=True):
     topic: StrangersText
     encoding: StrangersText
     messages: int
+    last: StrangersText | None
+    """The last value in JSON, shortened if it is long; None for a very large one."""
 
 
 class RecordedValue(SignerAnswer, frozen=True, kw_only=True):

@@ -62,6 +62,7 @@ from mesh.role.database import LedgerUnusable
 from mesh.role.program import RESEND
 from mesh.signer import protocol
 from mesh.signer._answers import (
+    LARGEST_VALUE,
     amount,
     described_model,
     found_robot,
@@ -125,8 +126,6 @@ MOST_MESSAGES: Final = 10_000
 """Messages of an order: those of a file may be more than a request holds."""
 LATEST_TOPICS: Final = 16
 """Topics of a job whose latest values are kept."""
-LARGEST_VALUE: Final = 65_536
-"""Bytes of a value that is shown while a job runs."""
 CHOICES: Final = ("cheapest", "first")
 ORDER_EXPIRED: Final = SignerFailure(code="order-expired", message="no contract was made in time", next="order again")
 

@@ -27,11 +27,13 @@ from tests.support.commands import AIRA
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
     from a2a.client import Client
     from a2a.types import Task
+
+    from mesh.base.asgi_server import AsgiApplication
 
 TOKEN = "a token of a private file"
 AUTHORIZED = {"Authorization": f"Bearer {TOKEN}", "A2A-Version": "1.0", "Content-Type": "application/json"}
@@ -94,8 +96,10 @@ async def serving(
     push_anywhere: bool = False,
     names: tuple[str, ...] = (),
     limits: DoorLimits = DoorLimits(),  # noqa: B008
+    port: int = 0,
+    wrap: Callable[[AsgiApplication], AsgiApplication] = lambda app: app,
 ) -> AsyncIterator[Served]:
-    """The door of the signer on a socket, which keeps its state in a folder."""
+    """The door of the signer on a socket, which keeps its state in a folder; `wrap` stands before it."""
     async with AsyncExitStack() as stack:
         signer = await stack.enter_async_context(SignerClient(socket))
         key, store = CardKey(state / "key.pem"), TaskStore(state / "a2a.sqlite")
@@ -105,7 +109,7 @@ async def serving(
         door = A2aDoor(signer, store, pusher, robot=robot)
         card = Card(signer, key, robot=robot)
         app = application(door, card, key, DoorOptions(token=TOKEN, names=names))
-        server = await stack.enter_async_context(AsgiServer(app, "127.0.0.1", 0, limits=limits))
+        server = await stack.enter_async_context(AsgiServer(wrap(app), "127.0.0.1", port, limits=limits))
         card.url = server.url
         yield Served(server.url, key, pusher)
 

@@ -12,7 +12,7 @@ import aiohttp
 import jwt
 import pytest
 from a2a.types import TaskPushNotificationConfig
-from a2a.utils.errors import A2AError, InvalidParamsError
+from a2a.utils.errors import A2AError, ContentTypeNotSupportedError, InvalidParamsError
 from a2a.utils.signing import InvalidSignaturesError, create_signature_verifier
 
 from bridges.a2a._card import KEYS_PATH, CardKey, quoted
@@ -140,6 +140,19 @@ async def test_requests_that_are_none_are_refused_before_the_signer(
     async with serving(NOWHERE, tmp_path) as door, door.client() as client:
         with pytest.raises(InvalidParamsError, match=why):
             await sent(client, request(data))
+
+
+@pytest.mark.parametrize("kind", ["application/x-unknown", "text/html; charset=utf-8", "image/png"])
+@pytest.mark.parametrize("binding", ["JSONRPC", "HTTP+JSON"])
+async def test_parts_of_other_types_are_not_supported(tmp_path: Path, kind: str, binding: str) -> None:
+    typed = request({"operation": "balance"})
+    typed.message.parts[0].media_type = kind
+    file = request({})
+    file.message.parts[0].raw = b"file"
+    async with serving(NOWHERE, tmp_path) as door, door.client(binding=binding) as client:
+        for one in (typed, file):
+            with pytest.raises(ContentTypeNotSupportedError):
+                await sent(client, one)
 
 
 async def test_prose_is_answered_with_what_can_be_said(tmp_path: Path) -> None:
