@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import sys
 import tempfile
 import time
@@ -21,20 +20,25 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import httpx2
-from mcp import Client, StdioServerParameters
-from mcp.client.streamable_http import streamable_http_client
+from mcp_types.version import LATEST_MODERN_VERSION
 
 from common import arguments, router, show
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for the doors of the tests
+
 from mesh import Agent, Settings
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import deploy_market
 from mesh.signer.client import SignerClient
 from mesh.signer.service import Signer
 from schemas import cid_of_bytes
+from tests.bridges.mcp.clients import http_client, stdio_client
+from tests.support.doors import TOKEN, door_process
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
+
+    from mcp import Client
 
 MODEL: Final = cid_of_bytes(b"what the robot of the benchmark can do")
 POLICY: Final = """\
@@ -146,30 +150,19 @@ def memory(pid: int) -> int:
 async def over_stdio(socket: Path, folder: Path) -> AsyncIterator[tuple[Client, int]]:
     """A door that the client starts, and its process id."""
     pid = folder / "pid"
-    command = [sys.executable, "-m", "mesh", "mcp", "--socket", str(socket), "--log-level", "error"]
-    wrapped = ["-c", 'echo $$ > "$0" && exec "$@"', str(pid), *command]
-    async with Client(StdioServerParameters(command="sh", args=wrapped)) as client:
+    options = ("--socket", str(socket), "--log-level", "error")
+    async with stdio_client(*options, version=LATEST_MODERN_VERSION, pid_file=pid) as client:
         yield client, int(pid.read_text())
 
 
 @asynccontextmanager
 async def over_http(socket: Path, folder: Path) -> AsyncIterator[tuple[Client, int]]:
     """A door that listens, and its process id."""
-    command = [sys.executable, "-m", "mesh", "mcp", "--socket", str(socket), "--http", "127.0.0.1:0"]
-    options = {"AIRA_LOG_LEVEL": "error", "AIRA_DATA_DIR": str(folder / "http"), "PYTHONUNBUFFERED": "1"}
-    door = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE, env=os.environ | options)
-    assert door.stdout is not None
-    try:
-        url = (await door.stdout.readline()).split()[-1].decode()
-        token = (folder / "http" / "mcp-token").read_text().strip()
-        async with (
-            httpx2.AsyncClient(headers={"Authorization": f"Bearer {token}"}, timeout=60) as http,
-            Client(streamable_http_client(url, http_client=http)) as client,
-        ):
-            yield client, door.pid
-    finally:
-        door.terminate()
-        await door.wait()
+    async with (
+        door_process("mcp", socket, folder / "http", "--log-level", "error") as door,
+        http_client(door.url, TOKEN, LATEST_MODERN_VERSION) as client,
+    ):
+        yield client, door.pid
 
 
 if __name__ == "__main__":

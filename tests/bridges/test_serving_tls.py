@@ -15,11 +15,12 @@ from a2a.utils.signing import create_signature_verifier
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from bridges.a2a._card import KEYS_PATH
-from tests.bridges.a2a.clients import TOKEN, process, request, sent
+from tests.bridges.a2a.clients import process, request, sent
 from tests.bridges.mcp.clients import http_client
 from tests.bridges.mcp.world import content, ended
 from tests.mesh.signer.conftest import driver, folder, person
 from tests.mesh.signer.signers import GOOD
+from tests.support.doors import TOKEN, door_process
 from tests.support.sites import Site
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ async def test_a_model_orders_over_tls(person: Person, driver: Driver, site: Sit
     person.allow(driver.model)
     async with (
         person.at_work() as (_, _, signer),
-        process(signer.door, person.folder / "m", *certified(site), door="mcp") as door,
+        door_process("mcp", signer.door, person.folder / "m", *certified(site)) as door,
     ):
         assert door.url.startswith("https://127.0.0.1:")
         async with http_client(door.url, TOKEN, version, verify=trusting(site)) as client:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import uuid
-from asyncio.subprocess import PIPE
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import httpx
@@ -23,19 +22,20 @@ from bridges.serving import DoorOptions
 from mesh.base.asgi_server import AsgiServer
 from mesh.base.door import DoorLimits
 from mesh.signer.client import SignerClient
-from tests.support.commands import AIRA
+from tests.support.doors import TOKEN, door_process
 
 if TYPE_CHECKING:
     import ssl
     from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
 
     from a2a.client import Client
     from a2a.types import Task
 
     from mesh.base.asgi_server import AsgiApplication
 
-TOKEN = "a token of a private file"
+NOWHERE = Path("/nowhere/door.sock")
+"""Where no signer is."""
+CALL = {"jsonrpc": "2.0", "id": 1, "method": "GetTask", "params": {"id": "job-0000000000000000"}}
 AUTHORIZED = {"Authorization": f"Bearer {TOKEN}", "A2A-Version": "1.0", "Content-Type": "application/json"}
 
 
@@ -62,29 +62,11 @@ class Served(Reached):
     pusher: Pusher
 
 
-def token_file(state: Path) -> Path:
-    """The private file with the token, in a folder for a door's state."""
-    state.mkdir(mode=0o700, exist_ok=True)
-    path = state / "token"
-    path.write_text(TOKEN)
-    path.chmod(0o600)
-    return path
-
-
 @asynccontextmanager
-async def process(socket: Path, state: Path, *options: str, door: str = "a2a") -> AsyncIterator[Reached]:
-    """`aira a2a`, or another door, in a process of its own, which is killed in the end."""
-    where = ("--http", "127.0.0.1:0", "--socket", str(socket), "--data-dir", str(state))
-    token = ("--token-file", str(token_file(state)))
-    process = await asyncio.create_subprocess_exec(*AIRA, door, *where, *token, *options, stdout=PIPE)
-    try:
-        assert process.stdout is not None
-        async with asyncio.timeout(60):
-            line = await process.stdout.readline()
-        yield Reached(line.decode().split()[-1])
-    finally:
-        process.kill()
-        await process.wait()
+async def process(socket: Path, state: Path, *options: str) -> AsyncIterator[Reached]:
+    """`aira a2a` in a process of its own, which is killed in the end."""
+    async with door_process("a2a", socket, state, *options) as door:
+        yield Reached(door.url)
 
 
 @asynccontextmanager

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from mesh.testing import Market
-from tests.bridges.a2a.clients import TOKEN, serving
+from tests.bridges.a2a.clients import serving
 from tests.mesh.signer.signers import GOOD, LIMITS, Driver, Person, short_folder
+from tests.support.doors import TOKEN
 
 if TYPE_CHECKING:
     from mesh.base.asgi_server import AsgiApplication, Message, Receive, Send

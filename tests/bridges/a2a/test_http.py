@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import stat
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import aiohttp
@@ -19,14 +18,14 @@ from bridges.a2a._card import KEYS_PATH, CardKey, quoted
 from bridges.a2a._push import PublicResolver, is_public
 from bridges.serving import DoorOptions
 from mesh.errors import ConfigurationError
-from mesh.signer.protocol import LARGEST_REQUEST, StrangersText
-from tests.bridges.a2a.clients import AUTHORIZED, TOKEN, request, sent, serving
+from mesh.signer.protocol import StrangersText
+from tests.bridges.a2a.clients import AUTHORIZED, CALL, NOWHERE, request, sent, serving
+from tests.support.doors import TOKEN
 
 if TYPE_CHECKING:
-    from a2a.types import AgentCard
+    from pathlib import Path
 
-NOWHERE = Path("/nowhere/door.sock")
-CALL = {"jsonrpc": "2.0", "id": 1, "method": "GetTask", "params": {"id": "job-0000000000000000"}}
+    from a2a.types import AgentCard
 
 
 async def asked(url: str, body: Any, **headers: str) -> tuple[int, str]:
@@ -49,23 +48,6 @@ async def test_without_the_token_nothing_is_served(tmp_path: Path, path: str, gi
     assert "Bearer" in text
 
 
-@pytest.mark.parametrize(
-    ("header", "value", "status"),
-    [
-        ("Host", "evil.example", 421),
-        ("Host", "127.0.0.1.evil.example:80", 421),
-        ("Origin", "http://evil.example", 403),
-        ("Origin", "null", 403),
-        ("Host", "robots.example", 200),
-        ("Origin", "http://localhost:3000", 200),
-    ],
-)
-async def test_pages_of_other_sites_reach_nothing(tmp_path: Path, header: str, value: str, status: int) -> None:
-    async with serving(NOWHERE, tmp_path, names=("robots.example",)) as door:
-        found, _ = await asked(door.url, CALL, **AUTHORIZED | {header: value})
-    assert found == status
-
-
 async def test_a_request_of_an_older_protocol_is_refused(tmp_path: Path) -> None:
     async with serving(NOWHERE, tmp_path) as door:
         status, text = await asked(door.url, CALL, Authorization=AUTHORIZED["Authorization"])
@@ -77,13 +59,6 @@ async def test_what_is_not_sent_as_json_is_of_a_type_that_is_not_supported(tmp_p
     async with serving(NOWHERE, tmp_path) as door:
         status, text = await asked(door.url, CALL, **headers)
     assert (status, json.loads(text)["error"]["code"]) == (200, -32005)
-
-
-@pytest.mark.parametrize("body", [b" " * (LARGEST_REQUEST + 1)])
-async def test_a_body_that_is_too_large_is_refused(tmp_path: Path, body: bytes) -> None:
-    async with serving(NOWHERE, tmp_path) as door:
-        status, _ = await asked(door.url, body, **AUTHORIZED)
-    assert status == 413
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import io
 import json
 import stat
 import time
 from contextlib import asynccontextmanager, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import aiohttp
@@ -19,38 +17,18 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
-from bridges.mcp._door import McpDoor
-from bridges.mcp._http import PATH, IssuedTokens, McpOptions, _document, application
-from mesh.base.asgi_server import AsgiServer
+from bridges.mcp._http import PATH, IssuedTokens, McpOptions, _document
 from mesh.base.door import DoorLimits
 from mesh.base.http_server import HttpServer
 from mesh.base.private_files import private_token
 from mesh.errors import ConfigurationError, PortUnavailable
-from mesh.signer.client import SignerClient
-from mesh.signer.protocol import LARGEST_REQUEST
-from tests.bridges.mcp.clients import http_client
+from tests.bridges.mcp.clients import CALL, HEADERS, http_client, served
+from tests.support.doors import TOKEN
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
-
-TOKEN = "a token of a private file"
-HEADERS = {"Content-Type": "application/json", "Accept": "application/json, text/event-stream"}
-CALL = {
-    "jsonrpc": "2.0",
-    "id": 1,
-    "method": "initialize",
-    "params": {"protocolVersion": "2025-11-25", "capabilities": {}, "clientInfo": {"name": "test", "version": "1"}},
-}
-
-
-@asynccontextmanager
-async def served(options: McpOptions, *, limits: DoorLimits = DoorLimits()) -> AsyncIterator[str]:  # noqa: B008
-    """The door over HTTP, in this process, of a signer that does not run; its URL."""
-    async with SignerClient(Path("/nowhere/door.sock")) as signer:
-        app = application(McpDoor(signer).server, options)
-        async with AsgiServer(app, options.host, options.port, limits=limits) as server:
-            yield f"http://127.0.0.1:{server.port}{PATH}"
+    from pathlib import Path
 
 
 @asynccontextmanager
@@ -89,34 +67,6 @@ async def test_without_the_token_nothing_is_served(headers: dict[str, str]) -> N
 async def test_a_token_in_the_url_is_none() -> None:
     async with served(McpOptions(token=TOKEN)) as url, posting(f"{url}?access_token={TOKEN}") as response:
         assert response.status == 401
-
-
-@pytest.mark.parametrize(
-    ("header", "value", "status"),
-    [
-        ("Host", "evil.example", 421),
-        ("Host", "127.0.0.1.evil.example:80", 421),
-        ("Origin", "http://evil.example", 403),
-        ("Origin", "null", 403),
-        ("Host", "robots.example", 200),
-        ("Origin", "http://localhost:3000", 200),
-    ],
-)
-async def test_pages_of_other_sites_reach_nothing(header: str, value: str, status: int) -> None:
-    options = McpOptions(token=TOKEN, names=("robots.example",))
-    async with (
-        served(options) as url,
-        posting(url, **{"Authorization": f"Bearer {TOKEN}", header: value}) as response,
-    ):
-        assert response.status == status
-
-
-async def test_a_body_that_is_too_large_is_refused() -> None:
-    async with served(McpOptions(token=TOKEN)) as url, aiohttp.ClientSession() as session:
-        body = io.BytesIO(b" " * (LARGEST_REQUEST + 1))
-        headers = HEADERS | {"Authorization": f"Bearer {TOKEN}"}
-        async with session.post(url, data=body, headers=headers) as response:
-            assert response.status == 413
 
 
 async def test_a_client_that_sends_nothing_is_ended() -> None:
