@@ -17,6 +17,7 @@ from a2a.utils.errors import ContentTypeNotSupportedError, InvalidParamsError
 from google.protobuf.json_format import MessageToDict, ParseDict
 from google.protobuf.struct_pb2 import Value
 
+from mesh.signer.protocol import DOOR
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
@@ -99,7 +100,11 @@ def wanted_of(message: Message) -> Wanted | None:
     operation = str(fields.pop("operation", "order" if "cost" in fields else "quote"))
     if operation not in READING | {"order"}:
         raise InvalidParamsError(f"no such operation; there are order, {', '.join(sorted(READING))}")
-    return Wanted(operation, {_snake(name): value for name, value in fields.items()})
+    known = {_camel(name): name for name in DOOR[operation].request.__struct_fields__ if name != "idempotency_key"}
+    for name in fields:
+        if name not in known:
+            raise InvalidParamsError(f"{operation} has no such field; there are {', '.join(known)}"[:500])
+    return Wanted(operation, {known[name]: value for name, value in fields.items()})
 
 
 def key_of(message: Message) -> str:
@@ -127,7 +132,7 @@ def status_of(job: Job, context: str) -> TaskStatus:
     """The status of a job's task, with what to do about it."""
     state, said = STATES[job.state]
     if job.consent is not None:
-        said += f"; {job.consent.why}: {job.consent.command} (until {job.consent.expires})"
+        said += f"; {job.consent.why}: `{job.consent.command}` allows it, until {job.consent.expires}"
     if job.error is not None:
         said += f"; {job.error.code}: {job.error.message}" + (f"; {job.error.next}" if job.error.next else "")
     part = Part(text=said)
@@ -179,10 +184,6 @@ def _shown(value: Any) -> Any:
 
 def _camel(name: str) -> str:
     return re.sub("_([a-z])", lambda found: found[1].upper(), name)
-
-
-def _snake(name: str) -> str:
-    return re.sub("[A-Z]", lambda found: f"_{found[0].lower()}", name)
 
 
 def _whole(value: Any) -> Any:

@@ -11,8 +11,10 @@ import click
 
 from bridges.serving import DoorOptions, door_fields, door_socket, served_door, with_door
 from mesh.base.extras import needs_extra
+from mesh.base.private_files import held_alone
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
+from mesh.errors import ConfigurationError
 from mesh.role.running import run_until_stopped
 from mesh.settings import StorageSettings
 
@@ -52,7 +54,13 @@ async def _serve(settings: Settings, options: dict[str, Any]) -> None:
     chosen = DoorOptions(**await asyncio.to_thread(door_fields, "a2a", settings, options))
     key = await asyncio.to_thread(CardKey, state / "a2a-card-key.pem")
     store = TaskStore(state / "a2a.sqlite")
+    running = ConfigurationError(
+        "another `aira a2a` runs with this data folder",
+        hint="stop that one, or name another folder with --data-dir, and the signer's with --socket",
+        code="door-running",
+    )
     async with AsyncExitStack() as stack:
+        stack.enter_context(held_alone(state / "a2a.lock", running))
         signer = await stack.enter_async_context(SignerClient(door_socket(settings, options)))
         store.open()
         stack.callback(store.close)

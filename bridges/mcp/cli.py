@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -24,11 +25,11 @@ from mesh.cli.output import (
     print_result,
     printable,
 )
-from mesh.errors import AiraError
+from mesh.errors import AiraError, InputError
 from mesh.role.running import run_until_stopped
 from mesh.settings import StorageSettings
 from mesh.signer.policy import InvalidPolicy, parse_policy, read_policy_file
-from mesh.signer.protocol import OWNER_SOCKET, signer_folder
+from mesh.signer.protocol import CONSENT_ID, OWNER_SOCKET, signer_folder
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -95,7 +96,7 @@ async def approve(settings: Settings, socket: Path | None, consent: str | None, 
         if consent is None:
             _print_consents(await signer.consents(), as_json=as_json)
         else:
-            job = await signer.approve(consent)
+            job = await signer.approve(_consent_id(consent))
             print_result(msgspec.to_builtins(job), f"allowed: {job.job_id} is {job.state}", as_json=as_json)
 
 
@@ -107,7 +108,7 @@ async def approve(settings: Settings, socket: Path | None, consent: str | None, 
 async def deny(settings: Settings, socket: Path | None, consent: str, as_json: bool) -> None:
     """Refuse the order with ID. Nothing was signed for it, and nothing will be."""
     async with _owner(settings, socket) as signer:
-        job = await signer.deny(consent)
+        job = await signer.deny(_consent_id(consent))
     print_result(msgspec.to_builtins(job), f"denied: {job.job_id}", as_json=as_json)
 
 
@@ -125,7 +126,8 @@ async def show_log(settings: Settings, socket: Path | None, verify: bool, limit:
     async with _owner(settings, socket) as signer:
         if verify:
             checked = await signer.verify_log()
-            words = f"{checked.entries:,} entries, all signed by {checked.signer} and in order"
+            count = "1 entry" if checked.entries == 1 else f"{checked.entries:,} entries"
+            words = f"{count}, all signed by {checked.signer} and in order"
             if not checked.holds:
                 raise AiraError(f"the log does not hold: {checked.fault}", code="log-broken")
             print_result(msgspec.to_builtins(checked), words, as_json=as_json)
@@ -153,6 +155,7 @@ def check(file: Path, as_json: bool) -> None:
     except InvalidPolicy as error:
         for fault in error.faults[1:]:
             click.echo(printable(fault), err=True)
+        error.hint = ""  # it names this command
         raise
     result = {"file": str(file), "hash": found.hash, "rules": len(found.rules)}
     print_result(result, f"{file} holds {plural(len(found.rules), 'rule')}, no mistakes", as_json=as_json)
@@ -184,6 +187,17 @@ def _owner(settings: Settings, socket: Path | None) -> SignerClient:
         from mesh.signer.client import SignerClient
 
     return SignerClient(socket or signer_folder(settings) / OWNER_SOCKET)
+
+
+def _consent_id(given: str) -> str:
+    """The id of a consent. Raises `InputError`."""
+    if not re.fullmatch(CONSENT_ID, given):
+        raise InputError(
+            f"{given[:80]!a} is not the id of an order that waits",
+            hint="`aira mcp approve` lists them",
+            code="invalid-request",
+        )
+    return given
 
 
 def _print_words(digest: str, words: tuple[str, ...], *, as_json: bool) -> None:

@@ -11,11 +11,14 @@ import stat
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final
 
+from mesh.base.file_locks import try_lock
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from mesh.errors import AiraError
 
 PRIVATE_FILE: Final = 0o600
 PRIVATE_FOLDER: Final = 0o700
@@ -54,6 +57,18 @@ def open_private(path: Path | str, flags: int) -> int:
     if status.st_mode & _OTHERS and status.st_uid == os.geteuid() and stat.S_ISREG(status.st_mode):
         os.fchmod(descriptor, stat.S_IMODE(status.st_mode) & ~_OTHERS)
     return descriptor
+
+
+@contextmanager
+def held_alone(path: Path, otherwise: AiraError) -> Iterator[None]:
+    """Hold a private file, made if missing, alone of all processes. Raises `otherwise` if another has it."""
+    descriptor = open_private(path, os.O_RDWR | os.O_CREAT)
+    try:
+        if not try_lock(descriptor):
+            raise otherwise
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def make_private_database(path: Path) -> None:

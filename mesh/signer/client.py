@@ -214,9 +214,10 @@ class SignerClient:
                     raise SignerUnavailable("what answers on the socket is no signer: its answer is too long")
                 return response.status, data
         except (TimeoutError, aiohttp.ClientError, OSError) as error:
+            is_there = not isinstance(error, aiohttp.ClientConnectorError)
             raise SignerUnavailable(
-                f"the signer does not answer: {type(error).__name__}",
-                hint="start it with `aira signer`; ask again for an order with the same key",
+                "the signer did not answer in time, or ended meanwhile" if is_there else "no signer runs here",
+                hint="start `aira signer`, with the same --data-dir; then ask again, for an order with the same key",
             ) from None
 
 

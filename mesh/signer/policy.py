@@ -159,7 +159,7 @@ class Policy:
             return _refused("too-expensive", why, f"order for less; {owner}")
         if spending.jobs >= self.jobs_at_a_time:
             why = f"{spending.jobs} jobs are open, as many as the policy allows at a time"
-            return _refused("too-many-jobs", why, "wait for one to end, or stop one")
+            return _refused("too-many-jobs", why, "wait for one to end, or stop or withdraw one")
         for code, spent, most, period in (
             ("hour-budget-spent", spending.hour, self.per_hour, "hour"),
             ("day-budget-spent", spending.day, self.per_day, "24 hours"),
@@ -311,6 +311,8 @@ class _Reader:
     def __init__(self, unit: Unit) -> None:
         self.unit = unit
         self.faults: list[TomlFault] = []
+        self.misspelt: set[str] = set()
+        """The keys that unknown ones were likely meant to be."""
 
     def read(self, table: dict[str, Any], digest: str) -> Policy | None:
         """The policy; None if there are mistakes."""
@@ -351,7 +353,8 @@ class _Reader:
     def _known(self, table: Mapping[str, Any], known: tuple[str, ...], path: tuple[str | int, ...]) -> None:
         for key in table:
             if key not in known:
-                near = nearest(key, known)
+                if near := nearest(key, known):
+                    self.misspelt.add(near)
                 said = f"unknown: {key!a}" + (f"; did you mean {near}?" if near else f"; there is {_any_of(known)}")
                 self._fault((*path, key), said)
 
@@ -370,6 +373,8 @@ class _Reader:
     def _amount(self, table: dict[str, Any], path: tuple[str, ...]) -> int:
         name = path[-1]
         if name not in table:
+            if name in self.misspelt:
+                return 0  # that was said
             self._fault(path, f'{name} is missing: as in {name} = "5 XRT"')
             return 0
         value = table[name]

@@ -40,7 +40,8 @@ def signer_folder(settings: Settings) -> Path:
 
 Name: TypeAlias = Annotated[str, Meta(max_length=200)]
 JobId: TypeAlias = Annotated[str, Meta(pattern=r"^job-[0-9a-f]{16}$")]
-ConsentId: TypeAlias = Annotated[str, Meta(pattern=r"^consent-[0-9a-f]{16}$")]
+CONSENT_ID: Final = r"^consent-[0-9a-f]{16}$"
+ConsentId: TypeAlias = Annotated[str, Meta(pattern=CONSENT_ID)]
 Key: TypeAlias = Annotated[str, Meta(min_length=1, max_length=128)]
 Note: TypeAlias = Annotated[str, Meta(max_length=500)]
 

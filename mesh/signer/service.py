@@ -38,12 +38,11 @@ from mesh.amounts import ETH
 from mesh.base.background import Background
 from mesh.base.database import DISK_ERRORS
 from mesh.base.door import DoorLimits
-from mesh.base.file_locks import try_lock
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.http_server import HttpServer
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
-from mesh.base.private_files import make_private_folder, open_private
+from mesh.base.private_files import held_alone, make_private_folder
 from mesh.base.retry import Backoff
 from mesh.chain import InsufficientTokens
 from mesh.errors import (
@@ -81,6 +80,7 @@ from schemas import parse_address, parse_cid, parse_key
 from schemas.address import keccak256
 from schemas.cid import is_cid
 from schemas.decoding import InvalidData, decode_json
+from schemas.errors import InvalidCid
 from schemas.keys import LiabilityTopicKey, job_selector
 from schemas.messages import lasting_hash
 from schemas.model import InvalidDescription
@@ -127,7 +127,10 @@ MOST_MESSAGES: Final = 10_000
 LATEST_TOPICS: Final = 16
 """Topics of a job whose latest values are kept."""
 CHOICES: Final = ("cheapest", "first")
-ORDER_EXPIRED: Final = SignerFailure(code="order-expired", message="no contract was made in time", next="order again")
+AGAIN: Final = "order again, with a new key"
+ORDER_EXPIRED: Final = SignerFailure(
+    code="order-expired", message="no contract was made in time", next=f"{AGAIN}, perhaps for more"
+)
 
 
 class Signer(Lifecycle):
@@ -183,7 +186,12 @@ class Signer(Lifecycle):
     async def _open(self, stack: AsyncExitStack) -> None:
         data = await asyncio.to_thread(read_policy_file, self._policy_path)
         await asyncio.to_thread(make_private_folder, self.folder)
-        self._lock_folder(stack)
+        running = ConfigurationError(
+            "another signer runs with this data folder",
+            hint="one account has one signer; stop the other one",
+            code="signer-running",
+        )
+        stack.enter_context(held_alone(self.folder / "lock", running))
         await stack.enter_async_context(self.agent)
         parts = self.agent.parts
         self._unit = await parts.chain.tokens.unit(self.settings.erc20_token)
@@ -209,16 +217,6 @@ class Signer(Lifecycle):
             self._expire_later(consent)
         for name, operations in ((protocol.DOOR_SOCKET, DOOR), (protocol.OWNER_SOCKET, OWNER)):
             await self._serve(stack, name, operations)
-
-    def _lock_folder(self, stack: AsyncExitStack) -> None:
-        descriptor = open_private(self.folder / "lock", os.O_RDWR | os.O_CREAT)
-        stack.callback(os.close, descriptor)
-        if not try_lock(descriptor):
-            raise ConfigurationError(
-                "another signer runs with this data folder",
-                hint="one account has one signer; stop the other one",
-                code="signer-running",
-            )
 
     async def _serve(self, stack: AsyncExitStack, name: str, operations: Mapping[str, protocol.Operation]) -> None:
         app = web.Application(client_max_size=protocol.LARGEST_REQUEST)
@@ -374,7 +372,7 @@ class Signer(Lifecycle):
         await self.agent.runtime.require_fit(objective, model)
         description = await self._description(model)
         if policy is not self.policy:
-            raise SignerError("the policy was changed meanwhile", hint="order again", code="policy-changed")
+            raise SignerError("the policy was changed meanwhile", hint="ask again", code="policy-changed")
         # From here on until it is written down nothing else happens in this process.
         now = self.budget.now()
         decision = policy.decide(cost, self.budget.spending(), now)
@@ -585,10 +583,7 @@ class Signer(Lifecycle):
         try:
             contract = await order.contract(on_progress=partial(self._heard, job.id))
         except OrderExpired:
-            said = SignerFailure(
-                code="order-expired", message="no contract was made in time", next="order again, or for more"
-            )
-            await self._end(self._current(job), "expired", hold=BudgetHold.NONE, error=said)
+            await self._end(self._current(job), "expired", hold=BudgetHold.NONE, error=ORDER_EXPIRED)
         except OrderClosed as error:
             if error.liability:
                 await self._accepted(job, await self.agent.contract(error.liability))
@@ -666,13 +661,13 @@ class Signer(Lifecycle):
         if outcome.success:
             await self._end(job, "done", result=outcome.result)
             return
+        is_stopped = job.stopped_why is not None or outcome.code == STOPPED
         said = SignerFailure(
             code=_word(outcome.code) or "failed",
-            message="the job failed, and its cost came back",
-            next="see the recording" if outcome.result else "order it again, perhaps from another robot",
+            message=f"the job {'was stopped' if is_stopped else 'failed'}, and its cost came back",
+            next="see the recording" if outcome.result else f"{AGAIN}, perhaps from another robot",
             from_strangers=strangers(outcome.reason, f"robot {job.robot}") if outcome.reason else None,
         )
-        is_stopped = job.stopped_why is not None or outcome.code == STOPPED
         await self._end(job, "stopped" if is_stopped else "refunded", result=outcome.result, error=said)
 
     async def _end(self, job: KeptJob, state: protocol.JobState, **changes: Any) -> None:
@@ -928,10 +923,14 @@ class Signer(Lifecycle):
             raise SignerError(
                 "no order waits for this consent", hint="`aira mcp approve` lists them", code="consent-unknown"
             )
+        hint = f"the program must {AGAIN}"
+        if consent.answer == "void" and (error := self._known(consent.job).error) is not None:
+            raise SignerError(error.message, hint=hint, code=error.code)
         if consent.answer:
-            raise SignerError("this consent was answered before", hint="each is used once", code="consent-used")
+            was = {"yes": "allowed", "no": "denied"}.get(consent.answer, "taken back")
+            raise SignerError(f"the order was {was} before", hint="each consent is used once", code="consent-used")
         if self.budget.now() >= consent.expires:
-            raise SignerError("this consent has expired", hint="let it be ordered again", code="consent-expired")
+            raise SignerError("nobody allowed the order in time", hint=hint, code="consent-expired")
         return consent
 
     def _expire_later(self, consent: ConsentRecord) -> None:
@@ -944,7 +943,7 @@ class Signer(Lifecycle):
                 continue
             job = self._known(consent.job)
             self.log.add("consent-expired", job=job.id, consent=consent.id)
-            said = SignerFailure(code="consent-expired", message="nobody allowed the order in time", next="order again")
+            said = SignerFailure(code="consent-expired", message="nobody allowed the order in time", next=AGAIN)
             self._put(job, msgspec.structs.replace(consent, answer="void"), state="expired", error=said)
 
     def _consent_digest(self, job: KeptJob, consent: str) -> str:
@@ -987,7 +986,7 @@ class Signer(Lifecycle):
         self.budget.trust_clock()
         self.since = self.budget.now()
         self.log.add("policy-used", policy=self.policy.hash)
-        said = SignerFailure(code="policy-changed", message="the owner changed the policy", next="order again")
+        said = SignerFailure(code="policy-changed", message="the owner changed the policy", next=AGAIN)
         for consent in self.budget.consents():
             job = self._known(consent.job)
             self._put(job, msgspec.structs.replace(consent, answer="void"), state="denied", error=said)
@@ -1039,9 +1038,11 @@ class Signer(Lifecycle):
 
     async def _model(self, named: str) -> str:
         """The CID of a model that is named by its CID or name."""
-        cid = await self.agent.chain.names.model(named)
-        parse_cid(cid)
-        return cid
+        try:
+            return await self.agent.chain.names.model(named)
+        except InvalidCid as error:
+            why = f"{plain(named, 64)!r} is no model's CID or name"
+            raise SignerError(why, hint="find_robots has the CIDs", code=error.code) from None
 
     async def _description(self, model: str) -> ModelDescription | None:
         with suppress(InvalidDescription):
@@ -1119,7 +1120,7 @@ def no_robot(declined: list[tuple[str, str, str]]) -> SignerFailure:
     return SignerFailure(
         code="no-robot-fits",
         message=f"no robot takes the job ({codes or 'none of this model answers'})",
-        next=f"see quote; {named}order for more, or from another robot",
+        next=f"see quote; {named}order for more, or from another robot, with a new key",
         from_strangers=said,
     )
 

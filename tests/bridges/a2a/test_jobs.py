@@ -29,12 +29,15 @@ from google.protobuf.json_format import MessageToDict
 
 from mesh.agent.hiring import Hiring
 from mesh.base.http_server import HttpServer
-from tests.bridges.a2a.clients import Served, job_of, process, request, sent, serving
+from mesh.errors import ConfigurationError
+from tests.bridges.a2a.clients import NOWHERE, Served, job_of, process, request, sent, serving
 from tests.mesh.signer.signers import GOOD
+from tests.support.commands import aira, refused
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+    from pathlib import Path
 
     from mesh.signer.client import SignerClient
     from tests.mesh.signer.signers import Driver, Person
@@ -230,6 +233,13 @@ async def test_a_task_is_found_again_when_the_door_was_killed(person: Person, dr
             assert last.status_update.status.state == TaskState.TASK_STATE_COMPLETED
     assert len(driver.begun) == 1
     assert await person.spent() == 10**9
+
+
+async def test_a_second_door_with_the_same_state_does_not_start(tmp_path: Path) -> None:
+    state = tmp_path / "a2a"
+    async with process(NOWHERE, state):
+        done = await asyncio.to_thread(aira, "a2a", "--http", "127.0.0.1:0", "--data-dir", state)
+    refused(done, ConfigurationError, code="door-running")
 
 
 async def release_and_read(driver: Driver, stream: AsyncIterator[StreamResponse]) -> list[StreamResponse]:

@@ -224,9 +224,9 @@ STORIES: Final = (
     Story(
         "a page of another site (DNS rebinding by `Host`, or `Origin`)",
         "421, 403",
-        "bridges.mcp.test_http.test_pages_of_other_sites_reach_nothing",
+        "bridges.test_serving.test_pages_of_other_sites_reach_nothing",
     ),
-    Story("a body of more than 1 MiB", "413", "bridges.mcp.test_http.test_a_body_that_is_too_large_is_refused"),
+    Story("a body of more than 1 MiB", "413", "bridges.test_serving.test_a_body_that_is_too_large_is_refused"),
     Story(
         "a connection that sends nothing", "is ended", "bridges.mcp.test_http.test_a_client_that_sends_nothing_is_ended"
     ),

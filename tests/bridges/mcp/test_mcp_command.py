@@ -57,6 +57,8 @@ def test_all_mistakes_of_a_policy_are_listed(policy: Path) -> None:
     assert done.returncode == 2
     assert "policy.toml:2:" in done.stderr
     assert "did you mean per_day?" in done.stderr
+    assert "per_day is missing" not in done.stderr, "that was said"
+    assert "policy check" not in done.stderr, "it is this command"
 
 
 def test_a_policy_that_others_can_write_is_refused(policy: Path) -> None:
@@ -73,8 +75,14 @@ def test_without_a_signer_the_error_says_how_to_start_it(tmp_path: Path, words: 
     done = invoke("mcp", *words, "--data-dir", tmp_path)
     assert done.returncode == 1
     assert done.stdout == ""
-    assert "[signer-unavailable]" in done.stderr
+    assert "no signer runs here [signer-unavailable]" in done.stderr
     assert "aira signer" in done.stderr
+
+
+@pytest.mark.parametrize("words", [("approve", "job-0123456789abcdef"), ("deny", "12345")], ids=" ".join)
+def test_what_is_no_consent_is_said_to_be_none(tmp_path: Path, words: tuple[str, ...]) -> None:
+    done = invoke("mcp", *words, "--data-dir", tmp_path)
+    assert "aira mcp approve" in refused(done, "invalid-request", words[1], exit_code=2)
 
 
 def test_whether_a_program_may_bring_the_yes_is_explained(policy: Path) -> None:

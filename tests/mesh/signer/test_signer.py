@@ -86,14 +86,14 @@ async def test_a_consent_is_for_one_order_is_used_once_and_not_given_by_a_door(p
         assert (await door.job(job.job_id)).state == "needs-consent"
         approved = await owner.approve(job.consent.id)
         assert approved.state == "ordering"
-        with pytest.raises(SignerError) as caught:
+        with pytest.raises(SignerError, match="allowed before") as caught:
             await owner.approve(job.consent.id)
         assert caught.value.code == "consent-used"
         assert (await ended(door, approved)).state == "done"
         other = await door.order(**order, idempotency_key="dearer")
         assert other.consent is not None
         assert (await owner.deny(other.consent.id)).state == "denied"
-        with pytest.raises(SignerError) as caught:
+        with pytest.raises(SignerError, match="denied before") as caught:
             await owner.approve(other.consent.id)
         assert caught.value.code == "consent-used"
     assert len(driver.begun) == 1
@@ -152,7 +152,10 @@ async def test_a_robot_that_says_much_does_not_keep_others_from_being_heard(pers
         driver.released.set()
         for _ in range(AT_A_TIME):
             signer._places.release()
-        assert (await ended(door, job)).state == "stopped"
+        job = await ended(door, job)
+        assert job.state == "stopped"
+        assert job.error is not None
+        assert job.error.message == "the job was stopped, and its cost came back"
 
 
 async def test_many_orders_are_too_many_and_one_that_was_made_is_still_answered(
@@ -169,6 +172,14 @@ async def test_many_orders_are_too_many_and_one_that_was_made_is_still_answered(
             assert caught.value.code == code
         assert (await door.order(**order, cost="4 XRT", idempotency_key="k")).job_id == job.job_id
         assert [one.event for one in (await owner.log()).entries] == ["started", "consent-needed", "refused"]
+
+
+async def test_a_model_is_named_by_its_cid(person: Person, driver: Driver) -> None:
+    person.allow(driver.model)
+    async with person.at_work() as (door, _, _):
+        with pytest.raises(SignerError, match="'Rover' is no model's CID or name") as caught:
+            await door.describe_model("Rover")
+    assert (caught.value.code, caught.value.hint) == ("invalid-cid", "find_robots has the CIDs")
 
 
 async def test_strangers_text_is_marked_and_made_harmless(person: Person, driver: Driver) -> None:
@@ -225,6 +236,6 @@ async def test_an_order_that_waits_for_a_yes_can_be_taken_back(person: Person, d
         job = await door.order(model=driver.model, messages=[GOOD], cost="4 XRT", idempotency_key="k")
         assert job.consent is not None
         assert (await door.withdraw(job.job_id)).state == "withdrawn"
-        with pytest.raises(SignerError) as caught:
+        with pytest.raises(SignerError, match="taken back") as caught:
             await owner.approve(job.consent.id)
         assert caught.value.code == "consent-used"
