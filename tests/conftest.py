@@ -18,8 +18,11 @@ from tests.support.ports import hold_unreachable_ports
 from tests.support.routers import EmbeddedRouter, Zenohd
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import AsyncIterator, Iterator
+    from pathlib import Path
 
+    from mesh.testing import MarketChain
+    from tests.support.market import Place
 
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
@@ -103,6 +106,15 @@ def router() -> Iterator[EmbeddedRouter]:
     """A Zenoh router inside this process."""
     with EmbeddedRouter() as running:
         yield running
+
+
+@pytest.fixture
+async def place(market_chain: MarketChain, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
+    """A place of this test's own, for tests that need the parts of a market; `market` is the fixture of the kit."""
+    from tests.support.market import Place
+
+    async with Place(market_chain, router.endpoint, tmp_path) as opened:
+        yield opened
 
 
 @pytest.fixture

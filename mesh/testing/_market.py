@@ -20,7 +20,7 @@ from mesh.base.background import Background
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.base.retry import RetryPolicy
-from mesh.chain import XRT, Account, Chain, Timing
+from mesh.chain import XRT, Account, Chain, DeploymentPlan, Timing
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import PLAN, STAKE, DevelopmentMarket, deploy_market
 from mesh.errors import ClosedError, ContentError, InputError, PortUnavailable, RemoteError
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
     from mesh.agent.agent import DemandTerms, Messages
     from mesh.agent.contracts import Contract
+    from mesh.market import Match
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +53,8 @@ RESEND: Final = RetryPolicy(initial=0.1, ceiling=0.5)
 """Of messages without effect: everyone is near."""
 ALLOWANCE: Final = 1_000 * XRT
 """What everyone starts with, wn."""
+OF_PROVIDER: Final = 10**6 * XRT
+"""What the provider of all markets of a chain has for its stakes, wn; the rest is for everyone."""
 ETHER: Final = 100 * 10**18
 """What everyone starts with for gas, wei."""
 FREE_CONTRACTS: Final = 10**6
@@ -110,13 +113,16 @@ class MarketChain(Lifecycle):
     """An Ethereum node in this process with the contracts: `async with MarketChain() as chain`, then `Market(chain)`.
 
     It takes a second or two to make, so share one among the markets of a run. It is not bound to an event loop. A block
-    is mined for each transaction, and none in between.
+    is mined for each transaction, and none in between. `plan` has the rules of its contracts, as after how many blocks
+    a job that nobody ends is refunded; `node` is another node, not yet open.
     """
 
     title = "market chain"
 
-    def __init__(self) -> None:
-        self.node = EmbeddedChain()
+    def __init__(self, plan: DeploymentPlan = PLAN, *, node: EmbeddedChain | None = None) -> None:
+        self.node = node or EmbeddedChain()
+        self.plan: Final = dataclasses.replace(plan, initial_supply=10**9 * XRT)
+        """The rules of its contracts."""
         self.line: Final = _NodeLine(self.node)
         """The way of all programs to it."""
         self._market: DevelopmentMarket | None = None
@@ -131,10 +137,9 @@ class MarketChain(Lifecycle):
 
     async def _open(self, stack: AsyncExitStack) -> None:
         await stack.enter_async_context(self.node)
-        plan = dataclasses.replace(PLAN, initial_supply=10**9 * XRT)
-        self._market = await deploy_market(self.node.provider, self.node.funded_keys, plan=plan)
+        self._market = await deploy_market(self.node.provider, self.node.funded_keys, plan=self.plan)
         async with self.chain(self.market.accounts["provider"]) as chain:
-            await chain.tokens.transfer(self._bank.address, plan.initial_supply // 2)
+            await chain.tokens.transfer(self._bank.address, self.plan.initial_supply - OF_PROVIDER)
 
     def chain(self, account: Account) -> Chain:
         """The chain for an account, not yet open."""
@@ -198,8 +203,9 @@ class Market(Lifecycle):
         """Where it can be reached with Zenoh, as in `tcp/127.0.0.1:7447`."""
         self._first = await _block_number(self.chain.node)
         provider = await enter(self.chain.chain(self.chain.market.accounts["provider"]))
+        plan = self.chain.plan
         made = await provider.lighthouses.create(
-            minimal_stake=PLAN.minimal_stake, timeout_blocks=PLAN.timeout_blocks, name=self.chain.new_name()
+            minimal_stake=plan.minimal_stake, timeout_blocks=plan.timeout_blocks, name=self.chain.new_name()
         )
         self.lighthouse = f"{made.name}.lighthouse.3.robonomics.eth"
         """The ENS name of its lighthouse, which is new."""
@@ -212,10 +218,7 @@ class Market(Lifecycle):
         self.clock = MarketClock(self.mine, self._running)
         """The clock of the jobs here, and of the chain: `await market.clock.advance(20)`."""
         stack.enter_context(self.clock.running())
-        options = ProviderOptions(free_contracts=FREE_CONTRACTS)
-        working = await enter(Provider(network.session, provider, self.lighthouse, options))
-        tasks = await enter(Background())
-        tasks.start(working.run(), "provider of the market")
+        await enter(working_provider(network.session, provider, self.lighthouse, free_contracts=FREE_CONTRACTS))
         self._stack_of_people = await enter(AsyncExitStack())
 
     def _closed(self) -> None:
@@ -227,16 +230,7 @@ class Market(Lifecycle):
         return dataclasses.replace(Settings(), **self._place(folder), **changes)
 
     def _place(self, folder: str) -> dict[str, Any]:
-        """The settings that make a program one of this market."""
-        return {
-            "connect": (self.endpoint,),
-            "data_dir": str(self._folder / folder),
-            "lighthouse_contract": self.lighthouse,
-            "ens_contract": self.chain.market.deployment.ens,
-            "poll_interval": TIMING.poll_interval,
-            "playback": "at-once",
-            **dict.fromkeys(ELSEWHERE, ""),
-        }
+        return place_of(self.endpoint, self._folder / folder, self.lighthouse, ens=self.chain.market.deployment.ens)
 
     async def person(self) -> Agent:
         """A new customer with 1,000 XRT, at work until the market closes."""
@@ -466,6 +460,35 @@ ELSEWHERE: Final = (
     "xrt_contract",
 )
 """Settings that would lead out of the market: accounts, names and ports of elsewhere."""
+
+
+def place_of(endpoint: str, folder: Path, lighthouse: str, *, ens: str) -> dict[str, Any]:
+    """The settings that make a program one of a market."""
+    return {
+        "connect": (endpoint,),
+        "data_dir": str(folder),
+        "lighthouse_contract": lighthouse,
+        "ens_contract": ens,
+        "poll_interval": TIMING.poll_interval,
+        "playback": "at-once",
+        **dict.fromkeys(ELSEWHERE, ""),
+    }
+
+
+@asynccontextmanager
+async def working_provider(
+    session: zenoh.Session,
+    chain: Chain,
+    lighthouse: str,
+    *,
+    matched: Callable[[Match], None] = lambda match: None,
+    **options: Any,
+) -> AsyncIterator[Provider]:
+    """A provider of a lighthouse at work, with these `ProviderOptions`; `matched` is told of each match."""
+    provider = Provider(session, chain, lighthouse, ProviderOptions(**options), matched=matched)
+    async with provider, Background() as tasks:
+        tasks.start(provider.run(), "provider of the market")
+        yield provider
 
 
 class _Host:

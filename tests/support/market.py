@@ -1,6 +1,7 @@
-"""A market for tests: founded once, on an embedded chain; each test has its own router, provider, agents and folders.
+"""A place in a market for tests that need its parts one by one; `mesh.testing.Market` has them all at work.
 
-Accounts and the chain are shared by all tests of a run, so tests compare balances before and after.
+It stands on the kit's chain. Its accounts, its lighthouse and that chain are shared by all tests of a run, so tests
+compare balances before and after. Each test has its own router, provider, agents and folders.
 """
 
 from __future__ import annotations
@@ -11,71 +12,59 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-import pytest
-
 from mesh.agent.agent import Agent
-from mesh.base.background import Background
-from mesh.base.retry import RetryPolicy
-from mesh.chain import Chain, Timing
-from mesh.dev import EmbeddedChain
-from mesh.dev.development import DevelopmentMarket, deploy_market
-from mesh.market.provider import Provider, ProviderOptions
+from mesh.chain import Account, Chain, Timing
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
+from mesh.testing._market import RESEND, TIMING, place_of, working_provider
 from schemas import Offer, cid_of_bytes
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from mesh.agent.contracts import Contract
     from mesh.agent.ledger import Phase
-    from mesh.chain import Account
+    from mesh.dev.development import DevelopmentMarket
+    from mesh.market.provider import Provider
+    from mesh.testing import MarketChain
     from schemas import Demand, Verified
-    from tests.support.routers import EmbeddedRouter
 
 MODEL = cid_of_bytes(b"what the robots of the tests can do")
-QUICK_RESEND = RetryPolicy(initial=0.1, ceiling=0.5)
-QUICK = Timing(poll_interval=0.03, receipt_interval=0.01, metrics_age=0.0)
 
 
 @dataclass(frozen=True)
-class Founded:
-    """A chain in a thread of its own, which any event loop may use, and the market on it."""
+class ForeignChain:
+    """A market on a node that the kit does not make: anvil, or the original contracts."""
 
-    node: EmbeddedChain
+    node: Any
     market: DevelopmentMarket
     contracts: Literal["mesh", "original"] = "mesh"
     generation: Literal[3, 5] = 3
 
 
-@pytest.fixture(scope="session")
-def founded() -> Iterator[Founded]:
-    """A market on an embedded chain, for the whole run."""
-    with asyncio.Runner() as runner:
-        stack = AsyncExitStack()
-        node = runner.run(stack.enter_async_context(EmbeddedChain()))
-        try:
-            yield Founded(node, runner.run(deploy_market(node.provider, node.funded_keys)))
-        finally:
-            runner.run(stack.aclose())
-
-
 class Place:
-    """Where a test's agents meet. `async with Place(founded, endpoint, folder) as place`.
+    """Where a test's agents meet. `async with Place(chain, endpoint, folder) as place`.
 
     `node` is the address by which they reach the chain, if not directly.
     """
 
     def __init__(
-        self, founded: Founded, endpoint: str, folder: Path, *, node: str = "", timing: Timing = QUICK
+        self,
+        chain: MarketChain | ForeignChain,
+        endpoint: str,
+        folder: Path,
+        *,
+        node: str = "",
+        timing: Timing = TIMING,
     ) -> None:
-        self.founded = founded
+        foreign = chain if isinstance(chain, ForeignChain) else ForeignChain(chain.node, chain.market)
+        self.generation, self.contracts = foreign.generation, foreign.contracts
         self._url = node
         self._timing = timing
-        self.node = founded.node
-        self.market = founded.market
+        self.node = foreign.node
+        self.market = foreign.market
         self.endpoint = endpoint
         self.folder = folder
         self.chains: dict[str, Chain] = {}
@@ -91,17 +80,17 @@ class Place:
 
     def chain(self, role: str) -> Chain:
         """The chain for an account, not yet open."""
-        return self.chain_of(self.market.accounts[role], self.founded.generation)
+        return self.chain_of(self.market.accounts[role], self.generation)
 
-    def chain_of(self, account: Account, generation: Literal[3, 5]) -> Chain:
+    def chain_of(self, account: Account, generation: Literal[3, 5], *, timing: Timing | None = None) -> Chain:
         """The chain for any account in a generation, not yet open."""
         return Chain(
             self._url or self.node.provider,
             account=account,
             ens=self.market.deployment.ens,
             generation=generation,
-            contracts=self.founded.contracts,
-            timing=self._timing,
+            contracts=self.contracts,
+            timing=timing or self._timing,
         )
 
     def address(self, role: str) -> str:
@@ -114,25 +103,31 @@ class Place:
 
     def settings(self, role: str, **options: Any) -> Settings:
         """Settings of an agent of that role, `options` changed. Objectives are played at once."""
-        settings = Settings(
-            connect=(self.endpoint,),
-            data_dir=str(self.folder / role),
-            lighthouse_contract=self.market.deployment.lighthouse_name,
-            ens_contract=self.market.deployment.ens,
-            generation=self.founded.generation,
-            contracts=self.founded.contracts,
-            poll_interval=QUICK.poll_interval,
-            playback="at-once",
-            fetch_timeout=5.0,
-            answer_timeout=60.0,
-        )
-        return dataclasses.replace(settings, **options)
+        deployment = self.market.deployment
+        given = place_of(self.endpoint, self.folder / role, deployment.lighthouse_name, ens=deployment.ens)
+        ours = {
+            "generation": self.generation,
+            "contracts": self.contracts,
+            "fetch_timeout": 5.0,
+            "answer_timeout": 60.0,
+        }
+        return dataclasses.replace(Settings(), **(given | ours | options))
 
     def agent(self, role: str, model: str | Path = MODEL, **options: Any) -> Agent:
         """An agent of that role, not yet running; handlers can be added. Always with the same memory."""
         settings = self.settings(role, **options)
         account, chain = self.market.accounts[role], self.chains[role]
-        return Agent(model, settings=settings, account=account, chain=chain, resend=QUICK_RESEND)
+        return Agent(model, settings=settings, account=account, chain=chain, resend=RESEND)
+
+    @asynccontextmanager
+    async def another(
+        self, key: int | bytes, *, timing: Timing | None = None, generation: Literal[0, 3, 5] = 0, **options: Any
+    ) -> AsyncIterator[Agent]:
+        """An agent with another account, by the number of its key or that key, not yet running."""
+        account = Account(self.node.funded_keys[key] if isinstance(key, int) else key)
+        settings = self.settings(account.address, generation=generation or self.generation, **options)
+        async with self.chain_of(account, settings.generation, timing=timing) as chain:
+            yield Agent(MODEL, settings=settings, account=account, chain=chain, resend=RESEND)
 
     @asynccontextmanager
     async def provider(self, *, seconds: float = 180, **options: Any) -> AsyncIterator[Provider]:
@@ -140,15 +135,10 @@ class Place:
         async with (
             asyncio.timeout(seconds),
             Network(Endpoints(connect=(self.endpoint,))) as network,
-            Provider(
-                network.session,
-                self.chains["provider"],
-                self.market.deployment.lighthouse_name,
-                ProviderOptions(**options),
+            working_provider(
+                network.session, self.chains["provider"], self.market.deployment.lighthouse_name, **options
             ) as provider,
-            Background() as tasks,
         ):
-            tasks.start(provider.run(), "provider of the test")
             yield provider
 
     @asynccontextmanager
@@ -202,10 +192,3 @@ async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
         return job is not None and job.phase is phase
 
     await until_found(reached, what=phase)
-
-
-@pytest.fixture
-async def place(founded: Founded, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
-    """A market's place of this test's own."""
-    async with Place(founded, router.endpoint, tmp_path) as open_place:
-        yield open_place

@@ -9,13 +9,10 @@ import pytest
 
 from bridges.foxglove.server import FoxgloveFront, FoxgloveOptions, FoxgloveServer
 from mesh.base.flood import Drops
-from tests.support.market import founded, place
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from contextlib import AbstractAsyncContextManager
-
-__all__ = ["founded", "place"]
 
 
 @pytest.fixture

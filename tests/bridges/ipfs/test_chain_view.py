@@ -13,14 +13,12 @@ from mesh.base.retry import RetryPolicy
 from mesh.chain import Chain, Timing
 from mesh.dev import JsonRpcServer
 from mesh.errors import ChainError
-from tests.support.market import founded, place
 from tests.support.ports import free_port
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
 
 SECONDS = 60.0
 UNKNOWN = "nobody.lighthouse.3.robonomics.eth"

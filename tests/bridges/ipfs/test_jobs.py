@@ -16,7 +16,7 @@ from mesh.dev.development import ROLES
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, Result, decode
 from tests.bridges.ipfs.legacy import LegacyTrader
-from tests.support.market import MODEL, Place, founded, offering, place
+from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from schemas import Liability
     from tests.bridges.ipfs.conftest import Swarm
 
-__all__ = ["founded", "place"]
 
 SECONDS = 90.0
 COST = 321

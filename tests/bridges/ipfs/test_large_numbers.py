@@ -11,14 +11,12 @@ from mesh.base.background import Background
 from mesh.network import Endpoints, Network
 from schemas import parse_address
 from tests.bridges.ipfs.replays import OldDaemon
-from tests.support.market import MODEL, Place, founded, place
+from tests.support.market import MODEL, Place
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from mesh.agent.contracts import Progress
-
-__all__ = ["founded", "place"]
 
 
 async def test_the_maker_of_a_demand_that_is_not_passed_on_is_told(place: Place) -> None:

@@ -19,12 +19,12 @@ from bridges.ipfs.service import IpfsBridge
 from mesh.base.background import Background
 from mesh.content import Exchange, Store
 from mesh.dev import JsonRpcServer
-from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
+from mesh.testing._market import working_provider
 from schemas import Demand, Empty, String, cid_of_bytes, cid_of_file, decode, encode
 from tests.bridges.ipfs.legacy import LegacyClient
 from tests.bridges.ros1.conftest import ros, rosmaster
-from tests.support.market import MODEL, founded, offering, place
+from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.peers import require
 from tests.support.waiting import until
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from tests.support.ipfs import JsIpfs
     from tests.support.market import Place
 
-__all__ = ["founded", "place", "ros", "rosmaster"]
+__all__ = ["ros", "rosmaster"]
 
 SCRIPTS: Final = Path(__file__).parent / "legacy_pages"
 
@@ -87,13 +87,11 @@ async def test_a_legacy_page_orders_a_job_without_ipfs(place: Place, client: str
     content = b64encode(objective(("/blink", None))).decode()
     async with (
         Network(Endpoints(connect=(place.endpoint,))) as network,
-        Provider(network.session, place.chains["provider"], lighthouse) as provider,
+        working_provider(network.session, place.chains["provider"], lighthouse),
         robot,
         served(place) as api,
         JsonRpcServer(place.node.provider) as node,
-        Background() as tasks,
     ):
-        tasks.start(provider.run(), "provider of the test")
         found = await run(place, client, node.url, place.market.deployment.ens, api.url, MODEL, content)
     assert found["offer"] == place.address("robot")
     assert found["result"] == found["result message"]
@@ -119,14 +117,13 @@ async def test_a_legacy_page_orders_a_job_on_js_ipfs(
     async with (
         Network(Endpoints(connect=(place.endpoint,))) as network,
         IpfsBridge(network, settings, chain=lambda: place.chain("provider")) as bridge,
-        Provider(network.session, place.chains["provider"], lighthouse) as provider,
+        working_provider(network.session, place.chains["provider"], lighthouse),
         robot,
         JsonRpcServer(place.node.provider) as node,
         LegacyClient(js_ipfs.api) as daemon,
         Background() as tasks,
     ):
         tasks.start(bridge.run(), "bridge of the test")
-        tasks.start(provider.run(), "provider of the test")
         await until(lambda: bridge.channels[0].status().state in ("alone", "connected"))
         ens = place.market.deployment.ens
         ipfs = js_ipfs.swarm_address if has_node else js_ipfs.api
@@ -155,13 +152,11 @@ async def test_a_legacy_page_orders_with_a_bag_and_gets_a_bag(
     before = await place.balance("robot")
     async with (
         Network(Endpoints(connect=(place.endpoint,))) as network,
-        Provider(network.session, place.chains["provider"], "airalab.lighthouse.3.robonomics.eth") as provider,
+        working_provider(network.session, place.chains["provider"], "airalab.lighthouse.3.robonomics.eth"),
         robot,
         served(place) as api,
         JsonRpcServer(place.node.provider) as node,
-        Background() as tasks,
     ):
-        tasks.start(provider.run(), "provider of the test")
         content = b64encode(task.read_bytes()).decode()
         found = await run(place, "robonomics-3", node.url, place.market.deployment.ens, api.url, MODEL, content)
         async with LegacyClient(api.url) as client:

@@ -9,22 +9,21 @@ from mcp_types import ElicitRequestFormParams, ElicitResult
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from tests.bridges.mcp.world import PRICE, World, content, ended
-from tests.support.market import Place, founded
+from tests.support.market import Place
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from tests.support.market import Founded
+    from mesh.testing import MarketChain
     from tests.support.routers import EmbeddedRouter
 
-__all__ = ["founded"]
 BOTH = pytest.mark.parametrize("version", [LATEST_MODERN_VERSION, LATEST_HANDSHAKE_VERSION])
 
 
 @pytest.fixture
-async def world(founded: Founded, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[World]:
-    async with World(Place(founded, router.endpoint, tmp_path), tmp_path) as world:
+async def world(market_chain: MarketChain, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[World]:
+    async with World(Place(market_chain, router.endpoint, tmp_path), tmp_path) as world:
         yield world
 
 

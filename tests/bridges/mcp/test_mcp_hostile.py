@@ -19,7 +19,7 @@ from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 from mesh.signer.protocol import SignerError
 from tests.bridges.mcp.hostile import CALLS, HIDDEN_TOOLS, STORIES, URIS, Attempt, Story, table
 from tests.bridges.mcp.world import INJECTION, PRICE, World, content, ended
-from tests.support.market import Place, founded
+from tests.support.market import Place
 from tests.support.routers import EmbeddedRouter
 
 if TYPE_CHECKING:
@@ -27,18 +27,17 @@ if TYPE_CHECKING:
 
     from mcp import Client
 
-    from tests.support.market import Founded
+    from mesh.testing import MarketChain
 
-__all__ = ["founded"]
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 GUIDE = Path(__file__).parents[3] / "docs" / "guides" / "mcp.md"
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def world(founded: Founded, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[World]:
+async def world(market_chain: MarketChain, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[World]:
     folder = tmp_path_factory.mktemp("hostile")
     with EmbeddedRouter() as router:
-        async with World(Place(founded, router.endpoint, folder), folder) as world:
+        async with World(Place(market_chain, router.endpoint, folder), folder) as world:
             world.write_policy(hour="60 XRT")
             await world.owner.use_policy()
             yield world

@@ -15,7 +15,6 @@ from bridges.ros1.node import Ros1Graph
 from mesh.base.flood import Drops
 from tests.bridges.ros1.jobs import Scene, bridged
 from tests.bridges.ros1.peers import Ros, RosMasterServer
-from tests.support.market import founded, place
 from tests.support.peers import require
 
 if TYPE_CHECKING:
@@ -23,9 +22,6 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from tests.support.market import Place
-
-
-__all__ = ["founded", "place"]
 
 
 @pytest.fixture(scope="session")

@@ -5,13 +5,12 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from mesh.base.background import Background
-from mesh.market.provider import Provider, ProviderOptions
 from mesh.network import Network
 from mesh.ops.identity import Member
+from mesh.testing._market import working_provider
 from schemas import Empty
 from tests.bridges.ros1.jobs import bridged
-from tests.support.market import Founded, Place
+from tests.support.market import Place
 from tests.support.sites import Site
 
 if TYPE_CHECKING:
@@ -20,11 +19,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bridges.ros1.node import Ros1Graph
+    from mesh.testing import MarketChain
     from tests.bridges.ros1.peers import Ros
 
 
 async def test_a_job_of_a_node_is_paid_on_a_site_where_the_bridge_has_the_identity_of_its_agent(
-    founded: Founded,
+    market_chain: MarketChain,
     graph: Callable[[], AbstractAsyncContextManager[Ros1Graph]],
     ros: Callable[[str], Ros],
     messages: dict[str, Path],
@@ -32,7 +32,7 @@ async def test_a_job_of_a_node_is_paid_on_a_site_where_the_bridge_has_the_identi
 ) -> None:
     """It calls the agent's services, which no other member may."""
     site = Site(tmp_path / "site")
-    async with Place(founded, site.endpoint, tmp_path) as place:
+    async with Place(market_chain, site.endpoint, tmp_path) as place:
         roles = {"robot": "agent", "person": "person", "provider": "provider"}
         folders = {
             name: site.enlist(Member(name=name, address=place.address(name), roles=(role,)))  # type: ignore[arg-type]
@@ -54,15 +54,13 @@ async def test_a_job_of_a_node_is_paid_on_a_site_where_the_bridge_has_the_identi
             async with (
                 asyncio.timeout(90),
                 Network(site.client(folders["provider"])) as network,
-                Provider(network.session, place.chains["provider"], lighthouse, ProviderOptions()) as provider,
-                Background() as tasks,
+                working_provider(network.session, place.chains["provider"], lighthouse),
                 robot,
                 person,
                 graph() as here,
                 bridged(place, robot, here, endpoints=site.client(folders["robot"])),
                 ros(here.master).node("blink", messages=messages["5"]) as node,
             ):
-                tasks.start(provider.run(), "provider of the test")
                 assert await node.hear() == "ready"
                 contract = await person.demand([("/blink", Empty())], cost=42)
                 assert (await contract.outcome()).success

@@ -26,7 +26,7 @@ from schemas.keys import topic_selector
 from schemas.payloads import defined_by
 from schemas.status import ALIVE
 from tests.support.commands import AIRA, Serving, aira, refused
-from tests.support.market import founded, offering, place
+from tests.support.market import offering
 from tests.support.raising import raises_with
 from tests.support.routers import EmbeddedRouter
 from tests.support.waiting import until, until_answered, until_heard
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import Job
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
 
 AGENT: Final = "0x" + "11" * 20
 JOB: Final = "0x" + "22" * 20

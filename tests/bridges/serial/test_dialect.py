@@ -32,7 +32,6 @@ from mesh.errors import ConfigurationError, InputError
 from schemas.payloads import String
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, TALKER, board, edge, firmware
 from tests.support.lines import LineClient
-from tests.support.market import founded, place
 from tests.support.raising import raises_with
 from tests.support.waiting import until
 
@@ -70,8 +69,6 @@ def test_an_installed_package_adds_a_dialect(tmp_path: Path, monkeypatch: pytest
         load_dialect("odd")
     assert caught.value.hint == "reinstall or uninstall morse"
 
-
-__all__ = ["founded", "place"]
 
 LONG = 60.0
 SECOND = 115_200

@@ -22,7 +22,6 @@ from schemas.keys import any_topic_selector
 from schemas.payloads import STRING
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, ROSSERIAL_TWINS, board, edge
 from tests.support.commands import aira
-from tests.support.market import founded, place
 from tests.support.orders import ROBOT
 from tests.support.ports import free_port
 from tests.support.raising import raises_with
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
 
-__all__ = ["founded", "place"]
 
 LONG = 60.0
 MEGABYTES = 40

@@ -15,12 +15,13 @@ from mesh.agent.agent import Agent
 from mesh.agent.jobs import QUIET_SECONDS
 from mesh.chain import Account, Chain
 from mesh.recording import open_objective
+from mesh.testing._market import TIMING
 from schemas import Empty, String, cid_of_bytes, topic_selector
 from schemas.keys import PRESENT, DeviceTopicKey
 from schemas.payloads import decode_value
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
-from tests.support.market import QUICK, founded, offering, place
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.raising import raises_with
 from tests.support.routers import client_config
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from mesh.network import Pump
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
 
 LONG = 60.0
 OTHER_MODEL = cid_of_bytes(b"what the second robot of the test can do")
@@ -231,7 +231,7 @@ async def test_a_command_in_a_job_reaches_only_the_device_with_that_topic_name(p
 async def second_robot(place: Place, account: Account, model: str) -> AsyncIterator[Agent]:
     """A robot beside the market's own, not yet running."""
     settings = place.settings("second")
-    async with Chain(place.node.provider, account=account, ens=place.market.deployment.ens, timing=QUICK) as chain:
+    async with Chain(place.node.provider, account=account, ens=place.market.deployment.ens, timing=TIMING) as chain:
         yield Agent(model, settings=settings, account=account, chain=chain)
 
 

@@ -10,7 +10,6 @@ from bridges.serial.dialect import CallFailed
 from schemas.status import ALIVE
 from tests.support.boards import COUNTER, board, edge
 from tests.support.commands import AIRA, Serving, aira
-from tests.support.market import founded, place
 from tests.support.ports import free_port
 from tests.support.raising import raises_with
 from tests.support.scraping import health, scraped
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
 
 LONG = 60.0
 WELL = {"channel": ALIVE, "line": ALIVE, "board": ALIVE}

@@ -12,7 +12,7 @@ from bridges.serial.firmware import compile_sketch, size_of
 from mesh.recording import open_objective
 from schemas.payloads import decode_value
 from tests.support.boards import DIMMER, LIBRARIES, ROOT, board, edge, firmware
-from tests.support.market import founded, offering, place
+from tests.support.market import offering
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import Job
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
 
 LONG = 60.0
 BUTTON = 2

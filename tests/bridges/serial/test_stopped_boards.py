@@ -13,7 +13,7 @@ from schemas import Empty, String
 from schemas.payloads import decode_value
 from tests.support.boards import COUNTER, STOPPABLE, board, edge
 from tests.support.commands import aira
-from tests.support.market import founded, offering, place
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
 
-__all__ = ["founded", "place"]
 
 LONG = 60.0
 

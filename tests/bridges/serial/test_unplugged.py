@@ -15,7 +15,7 @@ from schemas import Empty, String
 from schemas.payloads import decode_value
 from tests.support.boards import ROSSERIAL_ECHO, board, edge
 from tests.support.lines import LineClient
-from tests.support.market import founded, offering, place
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import Job
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
 
 LONG = 60.0
 WORK = "WORK=2000"

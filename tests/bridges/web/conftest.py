@@ -14,7 +14,6 @@ from bridges.web._access import WebOptions
 from bridges.web.components import opened
 from bridges.web.server import PageServer
 from tests.bridges.web.openapi import check, check_answer
-from tests.support.market import founded, place
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
 
 OWN = {"X-Aira-Request": "1", "Content-Type": "application/json"}
 

@@ -13,12 +13,11 @@ from aiohttp import ClientConnectionError, ClientSession, CookieJar, TCPConnecto
 from bridges.web._access import WebOptions
 from bridges.web.components import opened
 from bridges.web.server import PageServer
-from mesh.base.background import Background
 from mesh.base.fresh_file import CHECK_INTERVAL
 from mesh.errors import ConfigurationError
-from mesh.market.provider import Provider
 from mesh.network import Network
 from mesh.ops.identity import Member
+from mesh.testing._market import working_provider
 from tests.bridges.web.conftest import Browser
 from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import objective
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.ops.identity.certificates import MemberFolder
-    from tests.support.market import Founded
+    from mesh.testing import MarketChain
 
 TOKEN, OPERATOR = "a token of people 123", "a token of operators 456"
 BOSS, ANN, GONE, STRANGER, PAGE = ("0x" + f"{number:02x}" * 20 for number in range(1, 6))
@@ -135,13 +134,13 @@ def test_a_roster_without_tls_is_refused() -> None:
 
 
 async def test_an_operator_of_the_roster_starts_and_finishes_a_job_of_a_robot(
-    founded: Founded, site: Site, tmp_path: Path
+    market_chain: MarketChain, site: Site, tmp_path: Path
 ) -> None:
     boss = site.enlist(Member(name="boss", address=BOSS, roles=("operator",)))
     ann = site.enlist(Member(name="ann", address=ANN, roles=("person",)))
     async with AsyncExitStack() as stack:
         enter = stack.enter_async_context
-        place = await enter(Place(founded, site.endpoint, tmp_path))
+        place = await enter(Place(market_chain, site.endpoint, tmp_path))
         roles: dict[str, Any] = {"robot": "agent", "person": "person", "provider": "provider"}
         folders = {
             name: site.enlist(Member(name=name, address=place.address(name), roles=(role,)))
@@ -153,8 +152,7 @@ async def test_an_operator_of_the_roster_starts_and_finishes_a_job_of_a_robot(
         await enter(offering(place.agent("robot", **tls(folders["robot"]))))
         person = await enter(place.agent("person", **tls(folders["person"])))
         network = await enter(Network(site.client(folders["provider"])))
-        provider = await enter(Provider(network.session, place.chains["provider"], MARKET))
-        (await enter(Background())).start(provider.run(), "provider of the test")
+        await enter(working_provider(network.session, place.chains["provider"], MARKET))
         contract = await person.demand(place.save(objective(("/go", "there"))), cost=3)
         job, robot = {"liability": contract.address, "success": True}, place.address("robot")
 

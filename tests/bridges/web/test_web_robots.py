@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+import pytest_asyncio
 from msgspec.structs import replace
 
 from bridges.web import _robots
@@ -17,11 +18,12 @@ from mesh import Agent, Demand, Verified
 from mesh.agent.errors import Declined
 from mesh.chain import Account
 from mesh.role.handover import keep_handover
+from mesh.testing import MarketChain
 from schemas import ZERO_ADDRESS, message_hash
 from schemas.profiles import Handover
 from schemas.rpc import AcceptDemand, OrderPair, SendDemand, SendOffer
 from tests.bridges.web.test_page_server import DATA
-from tests.mesh.agent.test_hiring import another, listening
+from tests.mesh.agent.test_hiring import listening
 from tests.mesh.agent.test_quotes import priced
 from tests.mesh.agent.trades import working
 from tests.support.market import MODEL
@@ -36,6 +38,13 @@ if TYPE_CHECKING:
     from tests.support.market import Place
 
 NAMED = {"name": "Arm", "about": "It moves.", "place": "Hall 3"}
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def market_chain() -> AsyncIterator[MarketChain]:
+    """One without the robots of other tests, which are away."""
+    async with MarketChain() as chain:
+        yield chain
 
 
 async def made(browser: Any) -> str:
@@ -60,7 +69,7 @@ async def kinds_until_matched(socket: Any) -> set[str]:
 
 async def test_robots_present_themselves_and_say_what_they_want(place: Place, serve: Any) -> None:
     cheap = priced(place.agent("robot", **NAMED), 4)
-    async with another(place) as declining, cheap, priced(declining, 1, only="closed-today"), serve() as browser:
+    async with place.another(5) as declining, cheap, priced(declining, 1, only="closed-today"), serve() as browser:
 
         async def presented() -> Any:
             agents = (await browser.get("agents"))["agents"]
@@ -94,7 +103,7 @@ async def moved(place: Place) -> AsyncIterator[Agent]:
     handover = Handover(agent=place.address("robot"), successor=account.address, time=1)
     keep_handover(settings.state_directory, handover.signed_by(place.market.accounts["robot"].signer))
     async with (
-        place.chain_of(account, place.founded.generation) as chain,
+        place.chain_of(account, place.generation) as chain,
         working(Agent(MODEL, settings=settings, account=account, chain=chain)) as successor,
     ):
         yield successor
@@ -156,7 +165,7 @@ async def test_robots_that_have_left_are_known_as_away(
 
 
 async def test_an_order_for_one_robot_is_seen_by_nobody_else(place: Place, serve: Any) -> None:
-    robot, rival = place.agent("robot"), another(place)
+    robot, rival = place.agent("robot"), place.another(5)
     async with (
         place.provider(),
         working(robot),
@@ -199,7 +208,7 @@ async def test_a_wallet_orders_from_one_robot_alone(place: Place, serve: Any) ->
     async with (
         place.provider(),
         working(place.agent("robot")) as robot,
-        another(place) as rival,
+        place.another(5) as rival,
         working(rival),
         serve() as browser,
         listening(place) as heard,

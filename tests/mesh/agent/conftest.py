@@ -11,7 +11,6 @@ from mesh.chain import TransactionSender
 from mesh.chain._contracts import ContractVersion
 from mesh.network import Endpoints, Network, ServiceFailed, call
 from schemas.rpc import Nothing
-from tests.support.market import founded, place
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
     from mesh.agent.agent import Agent
     from schemas import Record
     from tests.support.market import Place
-
-__all__ = ["founded", "place"]
 
 
 async def other_token(place: Place, role: str, *, supply: int) -> str:

@@ -10,6 +10,7 @@ import pytest
 from mesh.agent.agent import Agent
 from mesh.chain import Account, Chain, new_private_key
 from mesh.chain.errors import InsufficientFunds, Reverted, UnknownName
+from mesh.testing._market import TIMING
 from schemas import ZERO_ADDRESS, cid_of_bytes
 from schemas.records import ControlRobot
 from schemas.rpc import (
@@ -31,7 +32,7 @@ from schemas.rpc import (
     TransferRequest,
 )
 from tests.mesh.agent.conftest import Asker, asking, other_token
-from tests.support.market import QUICK, offering
+from tests.support.market import offering
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -165,7 +166,7 @@ async def test_a_refused_transaction_is_one_line(opened: Asker, request_: Transf
 
 async def test_the_error_of_an_account_without_ether_names_the_missing_amount(place: Place) -> None:
     poor = Account(new_private_key())
-    chain = Chain(place.node.provider, account=poor, ens=place.market.deployment.ens, timing=QUICK)
+    chain = Chain(place.node.provider, account=poor, ens=place.market.deployment.ens, timing=TIMING)
     async with chain:
         agent = Agent(settings=place.settings("poor", open_services=True), account=poor, chain=chain)
         async with asking(place, agent) as asker:
@@ -175,7 +176,7 @@ async def test_the_error_of_an_account_without_ether_names_the_missing_amount(pl
 
 
 async def test_a_chain_that_was_opened_for_reading_sends_nothing(place: Place) -> None:
-    reader = Chain(place.node.provider, ens=place.market.deployment.ens, timing=QUICK)
+    reader = Chain(place.node.provider, ens=place.market.deployment.ens, timing=TIMING)
     async with reader:
         settings = place.settings("robot", open_services=True)
         agent = Agent(settings=settings, account=place.market.accounts["robot"], chain=reader)

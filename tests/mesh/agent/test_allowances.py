@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import Allowances, Chain, InsufficientTokens
+from mesh.testing._market import TIMING
 from schemas import Demand, Offer
-from tests.support.market import QUICK
 from tests.support.orders import terms
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def road(place: Place) -> Overtaken:
 async def chain(place: Place, road: Overtaken) -> AsyncIterator[Chain]:
     """The chain as the person uses it, with no allowance given."""
     async with Chain(
-        road, account=place.market.accounts["person"], ens=place.market.deployment.ens, timing=QUICK
+        road, account=place.market.accounts["person"], ens=place.market.deployment.ens, timing=TIMING
     ) as opened:
         await opened.tokens.approve(opened.factory, 0)
         yield opened

@@ -11,7 +11,6 @@ import pytest
 from mesh import JobFailed
 from mesh.agent.orders import FEWEST_BLOCKS
 from mesh.errors import InputError
-from tests.mesh.agent.test_hiring import another
 from tests.mesh.agent.trades import job, known
 from tests.support.waiting import until
 
@@ -74,7 +73,7 @@ async def market(
     """
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(place.provider())
-        robots = [priced(place.agent("robot"), CHEAP, cheap), await stack.enter_async_context(another(place))]
+        robots = [priced(place.agent("robot"), CHEAP, cheap), await stack.enter_async_context(place.another(5))]
         priced(robots[1], DEAR, dear, think)
         for robot in (*robots, person := place.agent("person", **options)):
             await stack.enter_async_context(robot)

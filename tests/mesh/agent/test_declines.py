@@ -17,7 +17,6 @@ from mesh.base.flood import Drops
 from mesh.network import Endpoints, Network
 from schemas import DeclineKey, Demand, Empty, RejectKey, Signer, Verified, cid_of_bytes
 from schemas.signing import Decline
-from tests.mesh.agent.test_hiring import another
 from tests.mesh.agent.trades import OBJECTIVE, posted
 from tests.support import orders
 from tests.support.log_events import logged_facts
@@ -176,7 +175,7 @@ async def test_only_those_who_demand_subscribe_to_declines(place: Place) -> None
 
 
 async def test_a_demand_ends_when_all_robots_of_its_model_have_declined(place: Place) -> None:
-    async with another(place) as second, asyncio.timeout(60):
+    async with place.another(5) as second, asyncio.timeout(60):
         for robot in (first := place.agent("robot"), second):
             _decline_all(robot)
         async with place.at_work(first, second) as person:
@@ -196,7 +195,7 @@ async def test_a_demand_ends_when_all_robots_of_its_model_have_declined(place: P
 
 
 async def test_a_demand_goes_on_while_one_robot_has_not_declined(place: Place) -> None:
-    async with another(place) as second, asyncio.timeout(60):
+    async with place.another(5) as second, asyncio.timeout(60):
         _decline_all(second)
 
         async with place.at_work(second, silent := taking_speeds(place.agent("robot", MODEL))) as person:

@@ -11,10 +11,10 @@ import pytest
 from mesh.chain import DeploymentPlan, InsufficientFunds, Reverted
 from mesh.chain.liabilities import Liabilities
 from mesh.dev import EmbeddedChain
-from mesh.dev.development import deploy_market
+from mesh.testing import MarketChain
 from tests.mesh.agent.restarts import COST, half_way, words
 from tests.support.log_events import logged_facts
-from tests.support.market import Founded, Place
+from tests.support.market import Place
 from tests.support.rollups import ForeignBlocks, seen_in
 from tests.support.waiting import until_found
 
@@ -32,10 +32,8 @@ REFUND_DELAY = 60
 @pytest.fixture(params=[EmbeddedChain, ForeignBlocks], ids=["own blocks", "blocks of another chain"])
 async def place(request: pytest.FixtureRequest, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
     plan = DeploymentPlan(timeout_blocks=10, refund_delay=REFUND_DELAY)
-    async with request.param() as node:
-        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
-        async with Place(Founded(node, market), router.endpoint, tmp_path) as place:
-            yield place
+    async with MarketChain(plan, node=request.param()) as chain, Place(chain, router.endpoint, tmp_path) as place:
+        yield place
 
 
 async def test_the_cost_of_a_job_that_is_never_finished_comes_back_within_two_blocks_of_its_time(

@@ -16,9 +16,10 @@ from mesh.dev import EmbeddedChain
 from mesh.dev.development import deploy_market
 from mesh.market.book import OrderStage
 from mesh.role.following import ChainHead
+from mesh.testing._market import TIMING
 from schemas import ZERO_ADDRESS, Demand, Offer
 from tests.mesh.agent.trades import job
-from tests.support.market import QUICK, Founded, Place, in_phase, offering
+from tests.support.market import ForeignChain, Place, in_phase, offering
 from tests.support.nodes import Anvil
 from tests.support.waiting import until, until_found
 
@@ -57,7 +58,7 @@ class Settling:
     async def mine(self, blocks: int) -> None:
         for _ in range(blocks):
             await self.node.request("evm_mine")
-            await asyncio.sleep(2 * QUICK.poll_interval)
+            await asyncio.sleep(2 * TIMING.poll_interval)
 
     async def mine_until_one_before(self, block: int) -> None:
         """Mine until what happened in a block counts with the next one."""
@@ -85,9 +86,8 @@ async def market(request: Any, router: EmbeddedRouter, tmp_path: Path) -> AsyncI
         made = await deploy_market(anvil.url, anvil.private_keys)
         async with made.chain(anvil.url, "person") as chain:  # nothing mines the confirmations of a demand's own
             await chain.tokens.approve(chain.factory, 10**9)
-        founded = Founded(cast("Any", anvil), made)
-        timing = replace(QUICK, finality=finality, confirmations=5 if finality == "latest" else 1)
-        async with Place(founded, router.endpoint, tmp_path, node=anvil.url, timing=timing) as place:
+        timing = replace(TIMING, finality=finality, confirmations=5 if finality == "latest" else 1)
+        async with Place(ForeignChain(anvil, made), router.endpoint, tmp_path, node=anvil.url, timing=timing) as place:
             yield Settling(place, LATE[finality])
 
 
@@ -159,7 +159,7 @@ async def test_a_provider_is_done_with_orders_when_the_block_of_their_contract_c
 
 async def test_an_end_counts_only_as_far_as_the_agent_has_read_the_chain() -> None:
     """The node's latest blocks may be of a chain that the agent has not seen yet, on which the contract is open."""
-    async with EmbeddedChain() as chain, Node(chain.provider, timing=replace(QUICK, confirmations=3)) as node:
+    async with EmbeddedChain() as chain, Node(chain.provider, timing=replace(TIMING, confirmations=3)) as node:
         await chain.mine(20)
         head = ChainHead(5)
         parts: Any = SimpleNamespace(chain=SimpleNamespace(node=node), chain_head=head)

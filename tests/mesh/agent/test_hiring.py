@@ -8,34 +8,24 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh import Agent
 from mesh.agent.errors import Declined, DemandDeclined, OtherRobot
-from mesh.chain import Account
 from mesh.errors import InputError, RemoteError
 from mesh.network import Channel, Endpoints, Network, ServiceFailed, Services
 from schemas import Demand, Offer
 from schemas.rpc import Accepted, SendOffer
 from tests.mesh.agent.trades import job, working
-from tests.support.market import MODEL, QUICK_RESEND, Place, offering
+from tests.support.market import Place, offering
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from mesh import Agent
     from mesh.agent.handlers import Job
     from schemas import Verified
     from schemas.rpc import AcceptDemand
 
 GENERATIONS = pytest.mark.parametrize("generation", [3, 5])
-
-
-@asynccontextmanager
-async def another(place: Place, key: int = 5) -> AsyncIterator[Agent]:
-    """A robot of the same model with an account of its own, not yet running."""
-    account = Account(place.founded.node.funded_keys[key])
-    async with place.chain_of(account, place.founded.generation) as chain:
-        settings = place.settings(f"robot-{key}")
-        yield Agent(MODEL, settings=settings, account=account, chain=chain, resend=QUICK_RESEND)
 
 
 @asynccontextmanager
@@ -65,7 +55,7 @@ async def test_only_the_robot_that_was_named_gets_the_job_and_its_pay(place: Pla
     before = await place.balance("robot")
     async with (
         place.provider() as provider,
-        another(place) as rival,
+        place.another(5) as rival,
         working(rival),
         working(place.agent("robot")) as robot,
         place.agent("person", generation=generation) as person,
@@ -201,7 +191,7 @@ async def test_a_person_is_told_when_a_provider_gave_the_job_to_another_robot(pl
     """A provider with the signed pair can do that; the demand can't name the robot."""
     lighthouse = place.market.deployment.lighthouse
     async with (
-        another(place) as rival,
+        place.another(5) as rival,
         offering(rival),
         working(place.agent("robot")) as robot,
         place.agent("person") as person,

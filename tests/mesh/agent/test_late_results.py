@@ -11,12 +11,11 @@ from mesh.agent._runtime import SOON
 from mesh.agent.ledger import Phase
 from mesh.chain import DeploymentPlan, Reverted
 from mesh.chain.liabilities import Liabilities
-from mesh.dev._embedded import EmbeddedChain
-from mesh.dev.development import deploy_market
 from mesh.role.following import ChainHead
+from mesh.testing import MarketChain
 from tests.mesh.agent.restarts import COST, made_by_a_provider_that_leaves, speaking, words
 from tests.support.log_events import logged_facts
-from tests.support.market import Founded, Place, in_phase, offering
+from tests.support.market import Place, in_phase, offering
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -35,10 +34,8 @@ REFUND_DELAY = 200
 async def place(router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
     """A market whose liabilities can be refunded soon."""
     plan = DeploymentPlan(timeout_blocks=100, refund_delay=REFUND_DELAY)
-    async with EmbeddedChain() as node:
-        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
-        async with Place(Founded(node, market), router.endpoint, tmp_path) as place:
-            yield place
+    async with MarketChain(plan) as chain, Place(chain, router.endpoint, tmp_path) as place:
+        yield place
 
 
 async def test_a_robot_brings_its_own_result_before_the_refund_if_no_provider_does(

@@ -14,8 +14,9 @@ from mesh.agent.contracts import Contract
 from mesh.agent.errors import DemandDeclined
 from mesh.amounts import InvalidAmount
 from mesh.base.hours import Hours
+from mesh.testing._market import RESEND
 from tests.mesh.agent.conftest import other_token
-from tests.support.market import MODEL, QUICK_RESEND, Place, offering
+from tests.support.market import MODEL, Place, offering
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def working(place: Place, *, parallel: int = 1, **options: Any) -> tuple[Agent, 
     released, begun = asyncio.Event(), list[str]()
     account, chain = place.market.accounts["robot"], place.chains["robot"]
     settings = place.settings("robot", **options)
-    robot = Agent(MODEL, settings=settings, account=account, chain=chain, resend=QUICK_RESEND, parallel=parallel)
+    robot = Agent(MODEL, settings=settings, account=account, chain=chain, resend=RESEND, parallel=parallel)
 
     @robot.on("/go")
     async def go(job: Job, message: Empty) -> None:

@@ -10,22 +10,21 @@ from typing import TYPE_CHECKING, Literal
 
 import pytest
 
-from mesh import Agent, Progress
 from mesh.chain import Account, DeploymentPlan
 from mesh.chain.deploy import XRT
-from mesh.dev import EmbeddedChain
-from mesh.dev.development import deploy_market
 from mesh.errors import InputError
+from mesh.testing import MarketChain
 from schemas import Demand
 from tests.mesh.agent.restarts import COST, speaking, words
 from tests.mesh.agent.trades import job, working
-from tests.support.market import MODEL, QUICK_RESEND, Founded, Place, offering
+from tests.support.market import MODEL, Place, offering
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from mesh import Agent, Progress
     from mesh.agent.agent import DemandTerms
     from tests.support.routers import EmbeddedRouter
 
@@ -36,11 +35,12 @@ FUNDS = 100 * XRT
 @asynccontextmanager
 async def penniless(place: Place, generation: Literal[3, 5]) -> AsyncIterator[Agent]:
     """A person with XRT and without ether, which it must not have or need at any time."""
-    account = Account(secrets.token_bytes(32))
+    key = secrets.token_bytes(32)
+    account = Account(key)
     await place.chains["provider"].tokens.transfer(account.address, FUNDS)
-    async with place.chain_of(account, generation) as chain:
-        settings = place.settings("penniless", generation=generation)
-        async with Agent(MODEL, settings=settings, account=account, chain=chain, resend=QUICK_RESEND) as person:
+    async with place.another(key, generation=generation) as penniless:
+        async with penniless as person:
+            chain = person.chain
             yield person
         assert await chain.tokens.eth_balance() == 0
         assert await chain.node.transaction_count(account.address, block="pending") == 0
@@ -181,10 +181,8 @@ REFUND_DELAY = 40
 async def impatient(router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
     """A market whose contracts can be refunded soon."""
     plan = DeploymentPlan(timeout_blocks=10, refund_delay=REFUND_DELAY)
-    async with EmbeddedChain() as node:
-        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
-        async with Place(Founded(node, market), router.endpoint, tmp_path) as place:
-            yield place
+    async with MarketChain(plan) as chain, Place(chain, router.endpoint, tmp_path) as place:
+        yield place
 
 
 @pytest.mark.parametrize("is_restarted", [False, True])

@@ -15,7 +15,8 @@ from tests.support.log_events import logged_facts
 if TYPE_CHECKING:
     import pytest
 
-    from tests.support.market import Founded, Place
+    from mesh.testing import MarketChain
+    from tests.support.market import Place
 
 __all__ = ["paid"]
 
@@ -24,13 +25,13 @@ ROBOT = 1
 
 
 async def test_a_success_after_a_power_cut_has_a_complete_recording(
-    founded: Founded, place: Place, paid: Paying
+    market_chain: MarketChain, place: Place, paid: Paying
 ) -> None:
     """Killed when the ledger says that all was played, before the recording is closed."""
     said: list[str] = []
     objective = words(place)
     async with place.provider(), place.agent("person") as person:
-        async with powered_robot(place, founded.node.funded_keys[ROBOT], last=len(WORDS)) as powered:
+        async with powered_robot(place, market_chain.node.funded_keys[ROBOT], last=len(WORDS)) as powered:
             contract = await person.demand(objective, cost=COST)
             await powered.lose_power()
         async with speaking(place.agent("robot"), said):
@@ -47,12 +48,12 @@ async def test_a_success_after_a_power_cut_has_a_complete_recording(
 
 
 async def test_a_job_whose_recording_lost_what_was_played_is_no_success(
-    founded: Founded, place: Place, paid: Paying, caplog: pytest.LogCaptureFixture
+    market_chain: MarketChain, place: Place, paid: Paying, caplog: pytest.LogCaptureFixture
 ) -> None:
     """As on a disk that loses what it has confirmed: the promisee is refunded."""
     said: list[str] = []
     async with place.provider(), place.agent("person") as person:
-        async with powered_robot(place, founded.node.funded_keys[ROBOT], last=len(WORDS)) as powered:
+        async with powered_robot(place, market_chain.node.funded_keys[ROBOT], last=len(WORDS)) as powered:
             contract = await person.demand(words(place), cost=COST)
             await powered.lose_power(keeps="nothing")
         async with speaking(place.agent("robot"), said) as robot:

@@ -13,7 +13,6 @@ from mesh.agent.errors import Declined, DemandDeclined
 from mesh.errors import RemoteError
 from mesh.network import Endpoints, Network, Services
 from schemas.rpc import Quote, QuoteRequest
-from tests.mesh.agent.test_hiring import another
 from tests.mesh.agent.trades import job, working
 from tests.support.market import MODEL, Place
 
@@ -51,7 +50,7 @@ def played_by_devices(robot: Agent) -> Agent:
 async def two_robots(place: Place, dear: int = 9, cheap: int = 4) -> AsyncIterator[tuple[Agent, Agent, Agent]]:
     """A dear robot, a cheap one, and a person, with a provider at work."""
     async with (
-        another(place) as second,
+        place.another(5) as second,
         place.provider(),
         priced(place.agent("robot"), dear) as first,
         priced(second, cheap),
@@ -137,7 +136,7 @@ async def test_a_robot_without_a_price_says_so(place: Place) -> None:
 
 
 async def test_the_next_robot_is_asked_if_the_cheapest_declines_after_all(place: Place) -> None:
-    async with another(place) as second:
+    async with place.another(5) as second:
 
         @second.on_quote
         async def quote(request: QuoteRequest) -> str:

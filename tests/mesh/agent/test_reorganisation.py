@@ -8,8 +8,8 @@ import pytest
 
 from mesh.base.background import Background
 from mesh.chain import Approval, Chain, ChainWentBack, History, Timing, Transfer
+from mesh.testing._market import TIMING
 from tests.mesh.agent.listeners import contract, finalize, ledger, listening, opened, started
-from tests.support.market import QUICK
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ class Behind:
 async def test_a_node_that_is_behind_loses_no_contract(place: Place, ledger: Ledger) -> None:
     node = Behind(place)
     robot, ens = place.market.accounts["robot"], place.market.deployment.ens
-    async with Chain(node, account=robot, ens=ens, timing=QUICK) as chain:
+    async with Chain(node, account=robot, ens=ens, timing=TIMING) as chain:
         await ledger.set_cursor(await chain.block_number())
         address, *_ = await contract(place)
         node.contract, node.calls = address, 2

@@ -11,9 +11,10 @@ import pytest_asyncio
 
 from mesh.chain import Chain, Finalized, NewLiability
 from mesh.dev.development import deploy_market
+from mesh.testing._market import TIMING
 from schemas import Empty
 from tests.mesh.chain.conftest import events_of, read_to
-from tests.support.market import QUICK, Founded, Place, offering
+from tests.support.market import ForeignChain, Place, offering
 from tests.support.nodes import Anvil
 from tests.support.objectives import objective
 from tests.support.spoiling import SpoilingProxy
@@ -38,10 +39,9 @@ async def anvil() -> AsyncIterator[Anvil]:
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def founded(anvil: Anvil) -> Founded:
+async def founded(anvil: Anvil) -> ForeignChain:
     """A market on anvil; its tests reach the node by `_SpoiledPlace.chain` only."""
-    node: Any = anvil
-    return Founded(node, await deploy_market(anvil.url, anvil.private_keys))
+    return ForeignChain(anvil, await deploy_market(anvil.url, anvil.private_keys))
 
 
 class _SpoiledPlace(Place):
@@ -50,7 +50,7 @@ class _SpoiledPlace(Place):
     urls: tuple[str, ...] = ()
 
     def chain(self, role: str) -> Chain:
-        return Chain(self.urls, account=self.market.accounts[role], ens=self.market.deployment.ens, timing=QUICK)
+        return Chain(self.urls, account=self.market.accounts[role], ens=self.market.deployment.ens, timing=TIMING)
 
 
 def _going(robot: Agent) -> Agent:
@@ -67,7 +67,7 @@ def _going(robot: Agent) -> Agent:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("nodes", "rate"), [(1, 0.03), (2, 0.1)])
 async def test_jobs_are_done_and_paid_once(
-    founded: Founded, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, nodes: int, rate: float, seed: int
+    founded: ForeignChain, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, nodes: int, rate: float, seed: int
 ) -> None:
     await _do_jobs(founded, anvil, router, tmp_path, nodes=nodes, seed=seed, rate=rate)
 
@@ -75,17 +75,24 @@ async def test_jobs_are_done_and_paid_once(
 @pytest.mark.sample("seed")
 @pytest.mark.parametrize("seed", range(3))
 async def test_jobs_survive_a_node_that_at_times_lacks_the_contracts(
-    founded: Founded, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, seed: int
+    founded: ForeignChain, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, seed: int
 ) -> None:
     lacking: dict[str, Any] = {"methods": frozenset({"eth_call"}), "kinds": ("emptied",), "rate": 0.1}
     await _do_jobs(founded, anvil, router, tmp_path, nodes=1, seed=seed, **lacking)
 
 
 async def _do_jobs(
-    founded: Founded, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, *, nodes: int, seed: int, **spoiling: Any
+    founded: ForeignChain,
+    anvil: Anvil,
+    router: EmbeddedRouter,
+    tmp_path: Path,
+    *,
+    nodes: int,
+    seed: int,
+    **spoiling: Any,
 ) -> None:
     """Do some jobs over proxies with these options, one after another."""
-    async with Chain(anvil.url, ens=founded.market.deployment.ens, timing=QUICK) as chain:
+    async with Chain(anvil.url, ens=founded.market.deployment.ens, timing=TIMING) as chain:
         first = await chain.block_number() + 1
         robot_account = founded.market.accounts["robot"].address
         before = await chain.tokens.balance(robot_account)

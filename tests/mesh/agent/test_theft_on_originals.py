@@ -13,8 +13,8 @@ from mesh.chain import XRT, Account, Chain, UnsafeValidator
 from mesh.chain._node import Node
 from mesh.chain._validators import Validators
 from mesh.settings import Settings
+from mesh.testing._market import TIMING
 from schemas import Demand, Offer, Result, Verified, keccak256, message_hash, order_abi, parse_cid
-from tests.support.market import QUICK
 from tests.support.objectives import objective
 from tests.support.orders import MODEL, RECORDING
 from tests.support.originals import NEEDS_ORIGINALS, Originals
@@ -102,7 +102,7 @@ async def test_a_stranger_takes_the_robots_tokens_only_without_the_check(
 ) -> None:
     if not is_checked:
         monkeypatch.setattr(Validators, "check", believe)
-    async with Node(anvil.url, timing=QUICK) as node:
+    async with Node(anvil.url, timing=TIMING) as node:
         market = Theft(node, anvil.private_keys)
         await market.prepare()
         before = {role: await market.balance(role) for role in (market.robot, market.stranger)}
@@ -114,7 +114,7 @@ async def test_a_stranger_takes_the_robots_tokens_only_without_the_check(
             contracts="original",
             playback="at-once",
         )
-        chain = Chain(node, account=market.robot, ens=market.ens, generation=3, contracts="original", timing=QUICK)
+        chain = Chain(node, account=market.robot, ens=market.ens, generation=3, contracts="original", timing=TIMING)
         async with chain, Agent(MODEL, settings=settings, account=market.robot, chain=chain) as robot:
             work = tmp_path / "work.mcap"
             work.write_bytes(objective(("/say", "hello")))

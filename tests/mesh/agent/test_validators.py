@@ -9,9 +9,10 @@ import pytest
 
 from mesh.agent.agent import Agent
 from mesh.chain import XRT, Chain, UnsafeValidator, deploy
+from mesh.testing._market import RESEND, TIMING
 from schemas import Demand, InvalidMessage, Offer
 from tests.mesh.agent.trades import OBJECTIVE, waiting
-from tests.support.market import MODEL, QUICK, QUICK_RESEND, Place
+from tests.support.market import MODEL, Place
 from tests.support.orders import terms
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def chain_with(place: Place, role: str, contracts: ContractKind, generation: int
         place.node.provider,
         account=place.market.accounts[role],
         ens=place.market.deployment.ens,
-        timing=QUICK,
+        timing=TIMING,
         contracts=contracts,
         generation=generation,
     )
@@ -58,9 +59,7 @@ async def test_a_robot_does_not_offer_where_its_offer_would_be_a_demand(
     lighthouse = await make_trap(place)
     settings = place.settings("robot", contracts=contracts, generation=generation)
     async with chain_with(place, "robot", contracts, generation) as chain:
-        robot = Agent(
-            MODEL, settings=settings, account=place.market.accounts["robot"], chain=chain, resend=QUICK_RESEND
-        )
+        robot = Agent(MODEL, settings=settings, account=place.market.accounts["robot"], chain=chain, resend=RESEND)
         async with robot:
             trader = robot.runtime.trader
             shared = await trader.writer.terms(

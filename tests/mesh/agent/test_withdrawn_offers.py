@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from mesh import AiraError
 from mesh.agent._outbox import outgoing
-from mesh.agent.agent import Agent
 from mesh.agent.errors import Declined
 from mesh.agent.orders import EQUAL_DECLINED, OrderState
-from mesh.chain import Account, Chain, Timing
+from mesh.chain import Account, Timing
 from schemas import Demand, Offer, Withdrawal, decode
 from tests.mesh.agent.trades import OBJECTIVE, job, unsettled
 from tests.support import orders
-from tests.support.market import MODEL, QUICK, QUICK_RESEND, Place
 from tests.support.raising import raises_with
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
+    from mesh.agent.agent import Agent
     from mesh.agent.handlers import Job
     from mesh.agent.trade import Order
     from mesh.market.provider import Provider
     from schemas import Verified
+    from tests.support.market import Place
 
 GENERATIONS = pytest.mark.parametrize("generation", [3, 5])
 
@@ -62,16 +59,6 @@ class Robot:
         return self.agent.orders()
 
 
-@asynccontextmanager
-async def another(place: Place, number: int, timing: Timing = QUICK) -> AsyncIterator[Agent]:
-    """An agent of one more account, not yet running."""
-    account = Account(place.node.funded_keys[number])
-    async with Chain(place.node.provider, account=account, ens=place.market.deployment.ens, timing=timing) as chain:
-        yield Agent(
-            MODEL, settings=place.settings(f"another-{number}"), account=account, chain=chain, resend=QUICK_RESEND
-        )
-
-
 async def offers_in(provider: Provider) -> list[Offer]:
     return [order.message for order in provider.book.orders() if isinstance(order.message, Offer)]
 
@@ -85,7 +72,7 @@ async def withdrawals(agent: Agent) -> list[str]:
 @pytest.mark.sample("generation")
 @GENERATIONS
 async def test_the_offer_of_a_robot_that_another_one_beat_is_withdrawn(place: Place, generation: int) -> None:
-    async with place.provider() as provider, another(place, 4) as second:
+    async with place.provider() as provider, place.another(4) as second:
         robots = [Robot(place.agent("robot")), Robot(second)]
         async with robots[0].agent, robots[1].agent, place.agent("person", generation=generation) as person:
             order = await person.order(job(place), cost=1)
@@ -102,7 +89,7 @@ async def test_the_offer_of_a_robot_that_another_one_beat_is_withdrawn(place: Pl
 
 async def test_a_robot_that_polls_seldom_hears_of_contracts_from_the_provider(place: Place) -> None:
     seldom = Timing(poll_interval=60.0)
-    async with place.provider() as provider, another(place, 4, seldom) as second:
+    async with place.provider() as provider, place.another(4, timing=seldom) as second:
         robots = [Robot(place.agent("robot")), Robot(second)]
         async with robots[0].agent, robots[1].agent, place.agent("person") as person:
             await person.demand(job(place), cost=1)  # its first look, which tells how fast blocks come
@@ -127,7 +114,7 @@ async def _none(found: object) -> bool:
 
 async def test_an_offer_that_comes_after_the_contract_is_not_made(place: Place) -> None:
     """The handler is slow: the demand is another robot's contract before it offers."""
-    async with place.provider() as provider, another(place, 4) as second:
+    async with place.provider() as provider, place.another(4) as second:
         slow, quick = Robot(place.agent("robot")), Robot(second)
         slow.waits.clear()
         async with slow.agent, quick.agent, place.agent("person") as person:
@@ -145,7 +132,7 @@ async def test_an_offer_that_comes_after_the_contract_is_not_made(place: Place) 
 async def test_a_decline_withdraws_the_offers_with_equal_terms(place: Place) -> None:
     """There is no provider yet, so the first demand is still open when the robot goes out of service."""
     robot = Robot(place.agent("robot"))
-    async with robot.agent, another(place, 4) as second, place.agent("person") as person:
+    async with robot.agent, place.another(4) as second, place.agent("person") as person:
         first = await person.order(job(place))
         other = await person.order(OBJECTIVE, cost=1)  # nobody has it: no offer
         await until(lambda: len(robot.offers) == 1)
@@ -166,7 +153,7 @@ async def test_a_decline_withdraws_the_offers_with_equal_terms(place: Place) -> 
 
 async def test_a_robot_that_is_busy_keeps_its_offer(place: Place) -> None:
     robot = Robot(place.agent("robot"))
-    async with robot.agent, another(place, 4) as second, second, place.agent("person") as person:
+    async with robot.agent, place.another(4) as second, second, place.agent("person") as person:
         first = await person.order(job(place))
         await until(lambda: len(robot.offers) == 1)
         robot.declines["*"] = "busy"
@@ -185,7 +172,7 @@ async def test_a_robot_that_is_busy_keeps_its_offer(place: Place) -> None:
 
 async def test_a_maker_whose_demand_was_declined_never_gets_the_offer_for_an_equal_one(place: Place) -> None:
     robot = Robot(place.agent("robot"))
-    async with robot.agent, another(place, 4) as unwanted, unwanted, place.agent("person") as person:
+    async with robot.agent, place.another(4) as unwanted, unwanted, place.agent("person") as person:
         robot.declines[unwanted.address] = "not-for-you"
         path = job(place)
         declined = await unwanted.order(path)
@@ -229,7 +216,7 @@ def terms_of(order: Order) -> dict[str, Any]:
 async def test_of_two_equal_demands_the_one_that_is_left_keeps_an_offer(place: Place) -> None:
     """The robot has an offer for each, and another robot's is used for one of them."""
     robot, rival = Robot(place.agent("robot")), Account(place.node.funded_keys[5]).signer
-    async with another(place, 4) as second, second, place.agent("person") as person, robot.agent:
+    async with place.another(4) as second, second, place.agent("person") as person, robot.agent:
         path = job(place)
         demands = [await one.order(path) for one in (person, second)]
         await until(lambda: len(robot.offers) == 2)
@@ -245,7 +232,7 @@ async def test_of_two_equal_demands_the_one_that_is_left_keeps_an_offer(place: P
 async def test_an_offer_that_is_used_for_another_demand_is_replaced(place: Place) -> None:
     """An equal demand that the robot does not know uses its offer; what it has agreed to still gets one."""
     robot, unknown = Robot(place.agent("robot")), place.market.accounts["person"].signer
-    async with another(place, 4) as second, second, robot.agent, place.agent("person") as person:
+    async with place.another(4) as second, second, robot.agent, place.agent("person") as person:
         order = await second.order(job(place))
         await until(lambda: len(robot.offers) == 1)
         (offer,) = robot.offers

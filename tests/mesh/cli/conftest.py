@@ -8,14 +8,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.mesh.cli.served_chain import ServedChain
-from tests.support.market import founded, place
 from tests.support.peers import require
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-__all__ = ["founded", "place"]
 
 
 @pytest.fixture(scope="module")

@@ -7,19 +7,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.mesh.market.local_market import LocalMarket
-from tests.support.market import Founded, founded
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from mesh.testing import MarketChain
     from tests.support.routers import EmbeddedRouter
-
-__all__ = ["founded"]
 
 
 @pytest.fixture
-async def local(founded: Founded, router: EmbeddedRouter) -> AsyncIterator[LocalMarket]:
+async def local(market_chain: MarketChain, router: EmbeddedRouter) -> AsyncIterator[LocalMarket]:
     """A local market for one test."""
-    node = founded.node
-    async with LocalMarket(founded.market, router.endpoint, node=node.provider, keys=node.funded_keys) as opened:
+    node = market_chain.node
+    async with LocalMarket(market_chain.market, router.endpoint, node=node.provider, keys=node.funded_keys) as opened:
         yield opened

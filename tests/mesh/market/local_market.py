@@ -6,12 +6,11 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
-from mesh.base.background import Background
 from mesh.base.retry import RetryPolicy
 from mesh.chain import XRT, Account, Chain, Timing
 from mesh.chain.following import NewLiability
-from mesh.market.provider import Provider, ProviderOptions
 from mesh.network import Channel, Endpoints, Network
+from mesh.testing._market import working_provider
 from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key, verify_message
 from schemas.signing import Rejection
 from tests.support.orders import RECORDING, terms, withdrawal
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from mesh.chain.rpc import Transport
     from mesh.dev.development import DevelopmentMarket
     from mesh.market import Match
+    from mesh.market.provider import Provider
     from schemas import Liability, SignedMessage, Withdrawal
 
 QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01)
@@ -85,7 +85,7 @@ class LocalMarket:
             made = await chain.lighthouses.create(
                 minimal_stake=STAKE,
                 timeout_blocks=timeout_blocks,
-                name=f"test-{next(_names)}",
+                name=f"local-{next(_names)}",
             )
             for role, turns in stakes.items():
                 await chain.tokens.transfer(self.address(role), turns * STAKE)
@@ -134,12 +134,10 @@ class LocalMarket:
         session = await self.new_session()
         async with (
             self.chain_of(role, endpoint, timing=timing) as chain,
-            Provider(
-                session, chain, self.market, ProviderOptions(**({"retry": QUICK_RETRY} | options)), matched=matched
+            working_provider(
+                session, chain, self.market, matched=matched, **({"retry": QUICK_RETRY} | options)
             ) as provider,
-            Background() as tasks,
         ):
-            tasks.start(provider.run(), f"{role} at work")
             for keys in ("demand/x", "offer/x", "result"):
                 await until_heard(self.session, f"aira/{self.market}/{keys}")
             yield provider

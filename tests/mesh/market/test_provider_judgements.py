@@ -9,23 +9,21 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec import structs
 
-from mesh.base.background import Background
 from mesh.chain import Account, DeploymentPlan, TransactionSender, new_private_key
-from mesh.dev import EmbeddedChain
-from mesh.dev.development import deploy_market
 from mesh.market import _settlement
-from mesh.market.provider import Provider
+from mesh.testing import MarketChain
+from mesh.testing._market import working_provider
 from schemas import address_bytes, cid_of_bytes
 from tests.contracts.suite import artifact
 from tests.mesh.market.local_market import LocalMarket
 from tests.mesh.market.observation import events, until_read
-from tests.support.market import Founded
 from tests.support.orders import RECORDING
 from tests.support.waiting import until, until_found, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Sequence
 
+    from mesh.market.provider import Provider
     from schemas import Liability, Result
     from tests.support.routers import EmbeddedRouter
 
@@ -40,14 +38,13 @@ SETTLING = 0.3
 
 
 @pytest.fixture(scope="module")
-def courthouse() -> Iterator[Founded]:
+def courthouse() -> Iterator[MarketChain]:
     """A market on a chain of its own, where a refund is soon possible."""
     with asyncio.Runner() as runner:
         stack = AsyncExitStack()
-        node = runner.run(stack.enter_async_context(EmbeddedChain()))
+        plan = DeploymentPlan(refund_delay=REFUND_DELAY, timeout_blocks=100)
         try:
-            plan = DeploymentPlan(refund_delay=REFUND_DELAY, timeout_blocks=100)
-            yield Founded(node, runner.run(deploy_market(node.provider, node.funded_keys, plan=plan)))
+            yield runner.run(stack.enter_async_context(MarketChain(plan)))
         finally:
             runner.run(stack.aclose())
 
@@ -115,7 +112,7 @@ class Court:
 
 
 @pytest.fixture
-async def court(courthouse: Founded, router: EmbeddedRouter) -> AsyncIterator[Court]:
+async def court(courthouse: MarketChain, router: EmbeddedRouter) -> AsyncIterator[Court]:
     node = courthouse.node
     async with LocalMarket(courthouse.market, router.endpoint, node=node.provider, keys=node.funded_keys) as local:
         async with local.chain_of("person") as chain:
@@ -363,10 +360,8 @@ async def test_the_originals_can_not_be_finalized_by_several(court: Court) -> No
     session = await court.local.new_session()
     async with (
         court.local.chain_of("provider", contracts="original", generation=5) as chain,
-        Provider(session, chain, court.local.market) as provider,
-        Background() as tasks,
+        working_provider(session, chain, court.local.market) as provider,
     ):
-        tasks.start(provider.run(), "provider at work")
         for keys in ("demand/x", "offer/x", "result"):
             await until_heard(court.local.session, f"aira/{court.local.market}/{keys}")
         for quorum in (2, 1):

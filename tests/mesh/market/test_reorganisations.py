@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
     from mesh.market.provider import Provider
+    from mesh.testing import MarketChain
     from schemas import Demand, Liability
-    from tests.support.market import Founded
     from tests.support.routers import EmbeddedRouter
 
     Reorganise = Callable[["Forking"], Awaitable[None]]
 
 COST = 5
-TIMING = replace(QUICK, replace_after=1.0)
+QUICK = replace(QUICK, replace_after=1.0)
 BEFORE_THE_RECEIPT, BEFORE_THE_EVENT = "eth_getTransactionReceipt", "eth_getLogs"
 REPAIR = "eth_sendRawTransaction"
 MOMENTS = {"before the receipt": BEFORE_THE_RECEIPT, "before the event is read": BEFORE_THE_EVENT}
@@ -70,12 +70,14 @@ class Forking:
 
 
 @pytest.fixture(params=["embedded", "anvil"])
-async def forking(request: pytest.FixtureRequest, founded: Founded, router: EmbeddedRouter) -> AsyncIterator[Forking]:
+async def forking(
+    request: pytest.FixtureRequest, market_chain: MarketChain, router: EmbeddedRouter
+) -> AsyncIterator[Forking]:
     if request.param == "anvil":
         anvil = request.getfixturevalue("anvil")
         market, node, keys = await deploy_market(anvil.url, anvil.private_keys), anvil.url, anvil.private_keys
     else:
-        market, node, keys = founded.market, founded.node.provider, founded.node.funded_keys
+        market, node, keys = market_chain.market, market_chain.node.provider, market_chain.node.funded_keys
     async with LocalMarket(market, router.endpoint, node=node, keys=keys) as local:
         async with local.chain_of("person") as chain:
             await chain.tokens.approve(market.deployment.factory, 100 * COST)
@@ -89,7 +91,7 @@ async def test_a_contract_that_vanishes_before_it_is_confirmed_is_created_again(
     forking: Forking, moment: str, reorganise: Reorganise
 ) -> None:
     local, before = forking.local, await forking.balance("person")
-    async with local.provider(endpoint=forking.node, timing=TIMING) as provider:
+    async with local.provider(endpoint=forking.node, timing=QUICK) as provider:
         demand, offer = local.demand(cost=COST), local.offer(cost=COST)
         with forking.node.back(MOMENTS[moment]):
             local.publish(demand, offer)
@@ -111,7 +113,7 @@ async def test_a_contract_that_vanishes_before_it_is_confirmed_is_created_again(
 
 async def test_a_contract_that_vanishes_after_its_event_was_read_is_created_again(forking: Forking) -> None:
     local, before = forking.local, await forking.balance("person")
-    async with local.provider(endpoint=forking.node, timing=TIMING) as provider:
+    async with local.provider(endpoint=forking.node, timing=QUICK) as provider:
         demand, _ = await forking.created(provider)
         await forking.replace_last()
 
@@ -129,7 +131,7 @@ async def test_a_finalization_that_vanishes_before_it_is_confirmed_is_made_again
     forking: Forking, moment: str, reorganise: Reorganise
 ) -> None:
     local, before = forking.local, await forking.balance("robot")
-    async with local.provider(endpoint=forking.node, timing=TIMING) as provider:
+    async with local.provider(endpoint=forking.node, timing=QUICK) as provider:
         _, liability = await forking.created(provider)
         with forking.node.back(MOMENTS[moment]):
             local.publish(local.result(liability.address))
@@ -149,7 +151,7 @@ async def test_a_finalization_that_vanishes_before_it_is_confirmed_is_made_again
 
 async def test_a_finalization_that_vanishes_after_its_event_was_read_is_made_again(forking: Forking) -> None:
     local, before = forking.local, await forking.balance("robot")
-    async with local.provider(endpoint=forking.node, timing=TIMING) as provider:
+    async with local.provider(endpoint=forking.node, timing=QUICK) as provider:
         _, liability = await forking.created(provider)
         local.publish(local.result(liability.address))
         await until_found(lambda: forking.is_finalized(liability))
@@ -166,7 +168,7 @@ async def test_a_finalization_that_vanishes_after_its_event_was_read_is_made_aga
 async def test_what_another_provider_settled_and_lost_passes_when_it_is_sent_again(forking: Forking) -> None:
     """The other one is gone. This one never read its transactions: it learned of them by refusals only."""
     local = forking.local
-    async with local.provider(endpoint=forking.node, timing=TIMING) as provider, local.chain_of("provider") as other:
+    async with local.provider(endpoint=forking.node, timing=QUICK) as provider, local.chain_of("provider") as other:
         await until_read(local, provider)
         demand, offer = local.demand(cost=COST), local.offer(cost=COST)
         with forking.node.back(BEFORE_THE_EVENT):
@@ -197,7 +199,7 @@ async def test_a_reorganisation_of_the_block_before_the_start_does_not_stop_the_
     async with local.chain_of("provider") as other:
         demand, offer = local.demand(cost=COST), local.offer(cost=COST)
         await other.liabilities.create(local.lighthouse, demand, offer)
-    async with local.provider(endpoint=forking.node, timing=TIMING) as provider:
+    async with local.provider(endpoint=forking.node, timing=QUICK) as provider:
         await until_read(local, provider)
         local.publish(demand, offer)
         await forking.replace_last()
@@ -210,7 +212,7 @@ async def test_a_reorganisation_of_the_block_before_the_start_does_not_stop_the_
 
 async def test_a_result_for_a_contract_that_a_reorganisation_took_does_not_stop_the_provider(forking: Forking) -> None:
     local = forking.local
-    async with local.provider(endpoint=forking.node, timing=TIMING) as provider:
+    async with local.provider(endpoint=forking.node, timing=QUICK) as provider:
         demand, liability = await forking.created(provider)
         with forking.node.back("eth_estimateGas"):
             await forking.replace_last()

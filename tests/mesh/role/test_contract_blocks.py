@@ -12,9 +12,9 @@ from mesh.agent.errors import OrderExpired
 from mesh.chain import DeploymentPlan, Node, Reverted
 from mesh.chain._node import RUN_NUMBER
 from mesh.dev import EmbeddedChain
-from mesh.dev.development import deploy_market
+from mesh.testing import MarketChain
 from tests.mesh.agent.restarts import COST, made_by_a_provider_that_leaves, speaking, words
-from tests.support.market import Founded, Place, offering
+from tests.support.market import Place, offering
 from tests.support.rollups import FIRST, ForeignBlocks, seen_in
 from tests.support.waiting import until_found
 
@@ -30,10 +30,8 @@ REFUND_DELAY = 40
 @pytest.fixture
 async def place(router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
     plan = DeploymentPlan(timeout_blocks=10, refund_delay=REFUND_DELAY)
-    async with ForeignBlocks() as node:
-        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
-        async with Place(Founded(node, market), router.endpoint, tmp_path) as place:
-            yield place
+    async with MarketChain(plan, node=ForeignBlocks()) as chain, Place(chain, router.endpoint, tmp_path) as place:
+        yield place
 
 
 class Counted:

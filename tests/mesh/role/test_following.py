@@ -12,15 +12,12 @@ from mesh.base.outage_log import OutageLog
 from mesh.chain import NewLiability, NotALiability
 from mesh.role.following import ChainHead, follow_chain
 from tests.mesh.agent.listeners import contract
-from tests.support.market import founded, place
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from mesh.chain import ChainEvent
     from mesh.role.following import Created
     from tests.support.market import Place
-
-__all__ = ["founded", "place"]
 
 
 class Provider:

@@ -10,7 +10,6 @@ from mesh.role.models import ABSENT, Models
 from schemas import cid_of_bytes
 from schemas.model import MAX_MODEL_SIZE, InvalidDescription, ModelDescription
 from tests.support.clocks import SECOND, SetClock
-from tests.support.market import founded, place
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
     from tests.support.market import Place
 
-__all__ = ["founded", "place"]
 
 LAMP = ModelDescription(title="Lamp")
 

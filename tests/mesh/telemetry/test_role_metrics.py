@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.agent.agent import Agent
 from mesh.agent.handlers import JobFailed
-from mesh.base.background import Background
 from mesh.chain import NodeUnreachable
-from mesh.market.provider import Provider, ProviderProcess
+from mesh.market.provider import ProviderProcess
 from mesh.network import Endpoints, Network
 from mesh.telemetry.serving import Telemetry
+from mesh.testing._market import working_provider
 from schemas import Demand, Empty, Offer, cid_of_bytes
 from schemas.status import ALIVE
 from tests.support.market import MODEL, offering
@@ -44,11 +44,11 @@ async def provider_at(place: Place) -> AsyncIterator[str]:
         asyncio.timeout(LONG),
         Telemetry(HERE) as telemetry,
         Network(Endpoints(connect=(place.endpoint,))) as network,
-        Provider(network.session, place.chains["provider"], place.market.deployment.lighthouse_name) as provider,
-        Background() as tasks,
+        working_provider(
+            network.session, place.chains["provider"], place.market.deployment.lighthouse_name
+        ) as provider,
     ):
         process = ProviderProcess(network, place.chains["provider"], [provider])
-        tasks.start(provider.run(), "provider of the test")
         with telemetry.showing(measure=process.measure, health=process.health):
             yield telemetry.url
 

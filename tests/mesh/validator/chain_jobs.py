@@ -11,8 +11,7 @@ import zenoh
 
 from mesh.base.background import Background
 from mesh.chain import Account, DeploymentPlan
-from mesh.dev._embedded import EmbeddedChain
-from mesh.dev.development import deploy_market
+from mesh.testing import MarketChain
 from schemas import Offer
 from schemas.keys import ResultKey
 from tests.mesh.validator.courts import FEE, PRICE, Court
@@ -30,7 +29,7 @@ from tests.mesh.validator.lamps import (
 )
 from tests.mesh.validator.tampered_claims import tampered, tamperings
 from tests.mesh.validator.tampering import Others
-from tests.support.market import Founded, Place
+from tests.support.market import Place
 from tests.support.routers import client_config
 
 if TYPE_CHECKING:
@@ -197,9 +196,8 @@ async def hand_in_tampered(endpoint: str, folder: Path, kinds: Collection[str] =
     plan = DeploymentPlan(timeout_blocks=100, refund_delay=REFUND_DELAY)
     async with AsyncExitStack() as stack:
         enter = stack.enter_async_context
-        node = await enter(EmbeddedChain())
-        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
-        court = await enter(Court(await enter(Place(Founded(node, market), endpoint, folder)), 5))
+        chain = await enter(MarketChain(plan))
+        court = await enter(Court(await enter(Place(chain, endpoint, folder)), 5))
         tamperers = await enter(Tamperers(court, folder))
         others = await tamperers.honest()
         ways = [one for one in tamperings(others) if one.kind not in IMPOSSIBLE]

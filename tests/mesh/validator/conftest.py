@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.mesh.validator.jobs import SampleJob, make_job
-from tests.support.market import founded, place
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-__all__ = ["founded", "place"]
 
 
 @pytest.fixture

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mesh.agent.agent import Agent
 from mesh.chain import Account
+from mesh.testing._market import RESEND
 from mesh.validator.validator import Validator
 from mesh.watching.market import query_all
 from schemas import Result
 from schemas.keys import ValidatorKey, report_selector
 from schemas.verdicts import ValidatorAnnouncement, ValidatorReport
-from tests.support.market import MODEL, QUICK_RESEND, Place, offering_unseen
+from tests.support.market import MODEL, Place, offering_unseen
 from tests.support.objectives import objective
 from tests.support.waiting import until_answered, until_found
 
@@ -61,16 +62,14 @@ class Court:
         account = self.account(number)
         settings = self.place.settings(f"juror-{number}", validator_contract=contract, generation=self.generation)
         chain = await self.chain(account)
-        return Validator(
-            settings=settings, account=account, chain=chain, resend=QUICK_RESEND, **({"fee": FEE} | options)
-        )
+        return Validator(settings=settings, account=account, chain=chain, resend=RESEND, **({"fee": FEE} | options))
 
     async def agent(self, role: str, model: str = MODEL, *, account: Account | None = None) -> Agent:
         """An agent of the person or the robot, or with an account of its own, that trades in this generation."""
         account = account or self.place.market.accounts[role]
         settings = dataclasses.replace(self.place.settings(role), generation=self.generation)
         chain = await self.chain(account)
-        return Agent(model, settings=settings, account=account, chain=chain, resend=QUICK_RESEND)
+        return Agent(model, settings=settings, account=account, chain=chain, resend=RESEND)
 
     async def robot(self) -> Agent:
         """A robot that offers for every demand, and reports each message that it did."""

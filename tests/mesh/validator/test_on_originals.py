@@ -9,9 +9,10 @@ import pytest
 from mesh.chain import XRT, Account, Node
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import ROLES, DevelopmentMarket
+from mesh.testing._market import TIMING
 from tests.mesh.validator.courts import FEE, PRICE, Court, claim, liar, reports_on
 from tests.support.log_events import logged_facts
-from tests.support.market import QUICK, Founded, Place
+from tests.support.market import ForeignChain, Place
 from tests.support.objectives import objective
 from tests.support.originals import NEEDS_ORIGINALS, Originals
 from tests.support.waiting import until_found
@@ -33,14 +34,14 @@ TIMEOUT: Final = 100
 pytestmark = NEEDS_ORIGINALS
 
 
-async def found(node: EmbeddedChain, generation: Literal[3, 5]) -> Founded:
+async def found(node: EmbeddedChain, generation: Literal[3, 5]) -> ForeignChain:
     """The original contracts with a market on them."""
     accounts = dict(zip(ROLES, map(Account, node.funded_keys), strict=False))
-    async with Node(node.provider, timing=QUICK) as open_node:
+    async with Node(node.provider, timing=TIMING) as open_node:
         originals = Originals(open_node, accounts["provider"], generation)
         await originals.deploy(timeout_blocks=TIMEOUT)
     market = DevelopmentMarket(deployment=originals.deployment, accounts=accounts)
-    return Founded(node, market, "original", generation)
+    return ForeignChain(node, market, "original", generation)
 
 
 async def supply(place: Place) -> None:

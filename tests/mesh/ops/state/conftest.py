@@ -16,14 +16,12 @@ from mesh.chain._pending import TransactionStore
 from mesh.content import Store
 from schemas import cid_of_bytes
 from tests.mesh.agent.samples import liability
-from tests.support.market import founded, place
 from tests.support.orders import demand
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-__all__ = ["founded", "place"]
 
 ADDRESS = "0x3C44CdDdB6a900fa2b585dd299e03d12FA4293BC"
 CHAIN = "1337-0badcafe"
