@@ -30,11 +30,10 @@ from schemas import Demand, Result, Signer, decode
 from schemas.decoding import InvalidData, text_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Container, Iterable, Mapping
     from contextlib import AbstractAsyncContextManager, AsyncExitStack
 
     from bridges.ipfs._messages import RelayMessage
-    from mesh.base.blocklist import BlockedSigners
     from mesh.chain import Chain
     from mesh.network import Network
     from mesh.settings import IpfsSettings, Settings
@@ -58,7 +57,7 @@ class ChainView:
         lighthouses: tuple[str, ...],
         *,
         interval: float,
-        blocked: BlockedSigners = frozenset(),
+        blocked: Container[str] = frozenset(),
         retry: RetryPolicy = REMOTE,
     ) -> None:
         self._make_chain = chain

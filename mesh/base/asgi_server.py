@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import socket
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -13,10 +12,11 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from mesh.base.background import Background
 from mesh.base.door import Door, DoorLimits, Guest
+from mesh.base.http_server import listening_sockets
 from mesh.base.lifecycle import Lifecycle
-from mesh.errors import PortUnavailable
 
 if TYPE_CHECKING:
+    import socket
     import ssl
     from collections.abc import Awaitable, Callable, MutableMapping
     from contextlib import AbstractContextManager, AsyncExitStack
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 SHUTDOWN: Final = 2
 """Seconds for requests in progress when the server ends."""
-CHECKS: Final = 0.5
-"""Seconds between two looks at who is late."""
 LARGEST_HEAD: Final = 32 << 10
 """Bytes of the head of a request."""
 
@@ -69,8 +67,10 @@ class AsgiServer(Lifecycle):
         return f"{'http' if self._tls is None else 'https'}://{host}:{self.port}"
 
     async def _open(self, stack: AsyncExitStack) -> None:
-        listening = await self._listen()
-        stack.callback(listening.close)
+        listening = await listening_sockets(self._host, self.port, option=self._option)
+        for one in listening:
+            stack.callback(one.close)
+        self.port = listening[0].getsockname()[1]
         stack.callback(self._door.end_all)
         tls = self._tls
         config = uvicorn.Config(
@@ -90,39 +90,14 @@ class AsgiServer(Lifecycle):
         )
         server = _Server(config)
         tasks = await stack.enter_async_context(Background())
-        tasks.start(self._end_late(), "late connections")
-        serving = asyncio.create_task(server.serve([listening]), name="http server")
+        tasks.start(self._door.run(), "late connections")
+        serving = asyncio.create_task(server.serve(listening), name="http server")
         stack.push_async_callback(_end, server, serving)
         started = asyncio.create_task(server.ready.wait())
         await asyncio.wait((serving, started), return_when=asyncio.FIRST_COMPLETED)
         started.cancel()
         if serving.done():
             await serving
-
-    async def _listen(self) -> socket.socket:
-        loop = asyncio.get_running_loop()
-        try:
-            family, kind, number, _, address = (
-                await loop.getaddrinfo(self._host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-            )[0]
-            one = socket.socket(family, kind, number)
-            try:
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                one.setblocking(False)
-                one.bind(address)
-            except BaseException:
-                one.close()
-                raise
-        except (OSError, OverflowError, UnicodeError) as error:
-            why = getattr(error, "strerror", None) or str(error)
-            raise PortUnavailable(self._host, self.port, why, option=self._option) from None
-        self.port = one.getsockname()[1]
-        return one
-
-    async def _end_late(self) -> None:
-        while True:
-            await asyncio.sleep(CHECKS)
-            self._door.end_late()
 
     async def _watched(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """Tell the door when a request began, when its body is whole, and when it was answered."""

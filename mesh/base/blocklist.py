@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.fresh_file import FreshFile
@@ -14,7 +14,7 @@ from schemas import InputError, parse_address
 from schemas.decoding import InvalidData, text_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Container
 
     from mesh.base.clock import Clock
     from mesh.errors import AiraError
@@ -23,12 +23,6 @@ log = logging.getLogger(__name__)
 
 SIZE_LIMIT: Final = 4 * 1024 * 1024
 """The largest file, in bytes: about 90,000 addresses."""
-
-
-class BlockedSigners(Protocol):
-    """Which signers are blocked."""
-
-    def __contains__(self, signer: object) -> bool: ...
 
 
 class Blocklist:
@@ -85,6 +79,6 @@ def _log_error(error: AiraError) -> None:
     log.warning("the blocklist stays as it was: %s", error, extra=log_event("blocklist-unusable"))
 
 
-def blocklist_at(path: str) -> BlockedSigners:
+def blocklist_at(path: str) -> Container[str]:
     """The blocklist in the file that a setting names; nobody is blocked if it is empty. Raises `ConfigurationError`."""
     return Blocklist(Path(path).expanduser()) if path else frozenset()

@@ -1,15 +1,16 @@
 """What strangers may use of a server's connections: the same limits for every server of ours.
 
-A `Door` knows who is connected, and is pure. When there are too many connections, the one that has waited longest
+A `Door` knows who is connected. When there are too many connections, the one that has waited longest
 without a whole request makes room: those who ask something are heard in a flood of connections that ask nothing.
 """
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import threading
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.base.clock import SYSTEM_CLOCK
 
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
     from mesh.base.clock import Clock
+
+
+LOOK_INTERVAL: Final = 0.5
+"""Seconds between two looks at who is late."""
 
 
 class DoorLimits(NamedTuple):
@@ -137,6 +142,12 @@ class Door:
             late = [guest for guest in self._guests if guest.is_late(self.limits, now)]
         for guest in late:
             guest.close()
+
+    async def run(self) -> None:
+        """Do so again and again, until cancelled."""
+        while True:
+            await asyncio.sleep(LOOK_INTERVAL)
+            self.end_late()
 
     def end_all(self) -> None:
         """Close all connections."""

@@ -26,8 +26,6 @@ log = logging.getLogger(__name__)
 
 SHUTDOWN: Final = 2.0
 """Seconds for requests in progress when the server ends."""
-CHECKS: Final = 0.5
-"""Seconds between two looks at who is late."""
 STALLED: Final = 30.0
 """Seconds in which a client must take something of what it is sent, or its connection ends (on Linux)."""
 BACKLOG: Final = 256
@@ -38,6 +36,34 @@ REFUSAL_SECONDS: Final = 1.0
 """For how long they may ask first: who is answered earlier may not hear it."""
 BREATH: Final = 0.2
 """Seconds until connections are accepted again when the process has no descriptor left."""
+
+
+async def listening_sockets(host: str, port: int, *, option: str) -> list[socket.socket]:
+    """Sockets that listen on each address of a host, all on one port; 0 selects a free one.
+
+    Raises `PortUnavailable`, whose hint names the `option` for the port.
+    """
+    listening: list[socket.socket] = []
+    try:
+        places = await asyncio.get_running_loop().getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
+        for family, kind, number, _, address in dict.fromkeys(places):
+            one = socket.socket(family, kind, number)
+            listening.append(one)
+            one.setblocking(False)
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if family == socket.AF_INET6:
+                one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            one.bind((address[0], port, *address[2:]))
+            one.listen(BACKLOG)
+            port = one.getsockname()[1]
+    except (OSError, OverflowError, UnicodeError) as error:
+        for one in listening:
+            one.close()
+        why = getattr(error, "strerror", None) or str(error)
+        raise PortUnavailable(host, port, why, option=option) from None
+    return listening
 
 
 class HttpServer(Lifecycle):
@@ -90,10 +116,16 @@ class HttpServer(Lifecycle):
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.callback(self._door.end_all)
         tasks = await stack.enter_async_context(Background())
-        tasks.start(self._end_late(), "late connections")
+        tasks.start(self._door.run(), "late connections")
         await self._runner.setup()
         stack.push_async_callback(self._runner.cleanup)
-        listening = await self._listen()
+        if self._bound is None:
+            listening = await listening_sockets(self._host, self.port, option=self._option)
+            self.port = listening[0].getsockname()[1]
+        else:
+            self._bound.listen(BACKLOG)
+            self._bound.setblocking(False)
+            listening = [self._bound]
         stack.push_async_callback(self._stop, listening)
         for one in listening:
             self._watch(one)
@@ -111,31 +143,6 @@ class HttpServer(Lifecycle):
             for task in self._tasks:
                 task.cancel()
             await asyncio.wait(self._tasks)
-
-    async def _listen(self) -> list[socket.socket]:
-        loop, listening = asyncio.get_running_loop(), list[socket.socket]()
-        if self._bound is not None:
-            self._bound.setblocking(False)
-            self._bound.listen(BACKLOG)
-            return [self._bound]
-        try:
-            places = await loop.getaddrinfo(self._host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-            for family, kind, number, _, address in dict.fromkeys(places):
-                one = socket.socket(family, kind, number)
-                listening.append(one)
-                one.setblocking(False)
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                if family == socket.AF_INET6:
-                    one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-                one.bind((address[0], self.port, *address[2:]))
-                one.listen(BACKLOG)
-                self.port = one.getsockname()[1]
-        except (OSError, OverflowError, UnicodeError) as error:
-            for one in listening:
-                one.close()
-            why = getattr(error, "strerror", None) or str(error)
-            raise PortUnavailable(self._host, self.port, why, option=self._option) from None
-        return listening
 
     def _accept(self, listening: socket.socket) -> None:
         """Accept a connection: at once, because an `await` that is cancelled would lose it."""
@@ -195,11 +202,6 @@ class HttpServer(Lifecycle):
         finally:
             self._refused -= 1
             connection.close()
-
-    async def _end_late(self) -> None:
-        while True:
-            await asyncio.sleep(CHECKS)
-            self._door.end_late()
 
     def made(self, transport: asyncio.BaseTransport, guest: Guest) -> None:
         """A connection is made: it is closed by its transport from now on."""

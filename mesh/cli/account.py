@@ -11,6 +11,7 @@ import click
 from msgspec import to_builtins
 
 from mesh.amounts import ETH, XRT
+from mesh.base.private_files import write_new
 from mesh.cli.chain_client import address_in_keyfile, open_chain, required_address
 from mesh.cli.options import FILE, with_chain_settings, with_json, with_settings, with_timeout
 from mesh.cli.output import plural, print_result
@@ -233,8 +234,7 @@ def password_in(path: Path) -> str:
     try:
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-                file.write(secrets.token_urlsafe(24) + "\n")
+            write_new(path, f"{secrets.token_urlsafe(24)}\n".encode())
     except OSError as error:
         raise ConfigurationError(
             f"can't use the password file {path}: {error.strerror}", code="password-file-unusable"

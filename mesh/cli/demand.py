@@ -11,7 +11,6 @@ import asyncio
 import shutil
 import signal
 import sys
-import threading
 from collections import Counter
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
@@ -23,7 +22,7 @@ import click
 
 from mesh.agent.errors import OrderExpired
 from mesh.amounts import XRT
-from mesh.base.background import Background
+from mesh.base.background import Background, in_daemon_thread
 from mesh.chain import permit_fee as permit_fee_of
 from mesh.cli.chain_client import check_balance
 from mesh.cli.files import file_or_cid, model_named, require_writable
@@ -316,19 +315,7 @@ def _json(seen: Progress, name: str) -> dict[str, Any]:
 
 async def answer_of(ask: Callable[[], A]) -> A:
     """What `ask` returns, which asks in the terminal, in a thread that does not keep an interrupted program alive."""
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[A] = loop.create_future()
-
-    def ask_there() -> None:
-        try:
-            given = ask()
-        except click.Abort:
-            loop.call_soon_threadsafe(answer.cancel)
-        else:
-            loop.call_soon_threadsafe(answer.set_result, given)
-
-    threading.Thread(target=ask_there, name="prompt", daemon=True).start()
-    return await answer
+    return await asyncio.wrap_future(in_daemon_thread(ask, "prompt"))
 
 
 async def print_connection_changes(network: Network, *, before: Callable[[], object] = lambda: None) -> None:

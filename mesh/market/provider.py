@@ -38,13 +38,12 @@ from mesh.telemetry.logs import LogService
 from schemas import Demand, Offer, Permit, Result, Withdrawal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Container, Mapping, Sequence
     from contextlib import AsyncExitStack
     from pathlib import Path
 
     import zenoh
 
-    from mesh.base.blocklist import BlockedSigners
     from mesh.base.flood import KnownSenders
     from mesh.base.retry import RetryPolicy
     from mesh.chain import Chain
@@ -182,7 +181,7 @@ class ProviderOptions:
     deadline_limit: int = DEADLINE_LIMIT
     free_contracts: int = A_DAY
     customers: Collection[str] = ()
-    blocked: BlockedSigners = frozenset()
+    blocked: Container[str] = frozenset()
 
 
 DEFAULTS: Final = ProviderOptions()

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -38,7 +38,6 @@ from schemas.signing import SignedDigest, recover_keys, signed_digest, verify_re
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator
 
-    from mesh.base.blocklist import BlockedSigners
     from mesh.base.clock import Clock
 
     Resolver = Callable[[str], Awaitable[str]]
@@ -98,7 +97,7 @@ class MarketRules:
         head: Callable[[], int] = lambda: 0,
         resolver: Resolver | None = None,
         validators: ValidatorCheck | None = None,
-        blocked: BlockedSigners = frozenset(),
+        blocked: Container[str] = frozenset(),
     ) -> None:
         self.lighthouse: Final = lighthouse
         self.address = address

@@ -25,9 +25,8 @@ from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, lighthouse_selector, market_selector, parse_key, presence_selector
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Container, Iterator
 
-    from mesh.base.blocklist import BlockedSigners
     from mesh.network._validation import Resolver, ValidationStatistics, ValidatorCheck
 
 
@@ -202,7 +201,7 @@ class Channel:
         resolver: Resolver | None = None,
         validators: ValidatorCheck | None = None,
         head: Callable[[], int] = lambda: 0,
-        blocked: BlockedSigners = frozenset(),
+        blocked: Container[str] = frozenset(),
         drops: Drops | None = None,
         answer_timeout: float = ANSWER_TIMEOUT,
     ) -> None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from mesh.base.log_context import log_event
-from mesh.base.private_files import make_private_folder, open_private, sync_directory
+from mesh.base.private_files import atomic_file, make_private_folder
 from mesh.errors import AiraError
 from schemas.decoding import InvalidData, decode_json
 from schemas.records import ControlRobot, RobotControl  # msgspec reads the annotations
@@ -97,11 +97,8 @@ def release(folder: Path) -> int:
 
 def _write_hold(path: Path, why: str) -> None:
     make_private_folder(path.parent)
-    with open(path, "wb", opener=open_private) as file:
+    with atomic_file(path, private=True) as file:
         file.write(msgspec.json.encode({"why": why, "time": int(time.time())}))
-        file.flush()
-        os.fsync(file.fileno())
-    sync_directory(path.parent)
 
 
 @contextmanager

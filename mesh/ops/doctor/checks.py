@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import asyncio
 import ssl
-import threading
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, TypeVar
 
-from mesh.base.background import call_in_loop
+from mesh.base.background import in_daemon_thread
 from mesh.errors import AiraError, ConfigurationError, InvalidAddress
 from mesh.network import Tls
 from mesh.network.endpoints import TLS_PREFIXES
@@ -120,32 +120,9 @@ async def run_checks(checks: Sequence[Check], *, seconds: float) -> AsyncGenerat
 
 
 async def in_thread(function: Callable[..., T], *arguments: Any) -> T:
-    """Run a blocking function in a daemon thread.
-
-    Unlike `asyncio.to_thread`, the end of the program does not wait for it: a dead name server or disk can hold a call
-    for minutes.
-    """
-    loop = asyncio.get_running_loop()
-    outcome: asyncio.Future[T] = loop.create_future()
-
-    def settle(result: T | None, error: BaseException | None) -> None:
-        if outcome.done():
-            return
-        if error is not None:
-            outcome.set_exception(error)
-        else:
-            outcome.set_result(result)  # type: ignore[arg-type]
-
-    def run() -> None:
-        result, raised = None, None
-        try:
-            result = function(*arguments)
-        except BaseException as error:
-            raised = error
-        call_in_loop(loop, settle, result, raised)
-
-    threading.Thread(target=run, name=getattr(function, "__name__", "check"), daemon=True).start()
-    return await outcome
+    """Run a blocking function in a daemon thread: a dead name server or disk can hold a call for minutes."""
+    name = getattr(function, "__name__", "check")
+    return await asyncio.wrap_future(in_daemon_thread(partial(function, *arguments), name))
 
 
 async def _run(
