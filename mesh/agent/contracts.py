@@ -23,7 +23,7 @@ import msgspec
 
 from mesh.agent.errors import LiabilityReverted
 from mesh.agent.jobs import Reason, check_stop, read_reason
-from mesh.agent.validators import accepted_of, signed_answers
+from mesh.agent.validators import accepted_of
 from mesh.base.background import Background, call_in_loop
 from mesh.base.flood import BoundedDict, FairQueue, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
@@ -32,7 +32,7 @@ from mesh.content import ContentUnavailable
 from mesh.errors import AiraError
 from mesh.network import Pump, ServiceFailed, call
 from mesh.network.services import declared
-from mesh.watching.market import JobEvent, query_all, read_event
+from mesh.watching.market import JobEvent, query_all, read_event, signed_answers
 from schemas import (
     ZERO_ADDRESS,
     InvalidRecord,
@@ -575,7 +575,7 @@ async def asked_reports(
         return []
     selector = report_selector(lighthouse, liability.promisee, liability.address)
     found = await signed_answers(
-        session, selector, ValidatorReport, lambda report: is_about(report, liability), timeout=timeout
+        session, [selector], ValidatorReport, lambda report: is_about(report, liability), timeout=timeout
     )
     return [found[juror] for juror in await accepted_of(chain, liability.validator, found)]
 

@@ -42,10 +42,9 @@ from mesh.base.private_files import make_private_folder, sync_directory
 from mesh.errors import AiraError, ClosedError, ContentError, InputError, public_text
 from mesh.network.presence import present_keys
 from mesh.recording import (
+    AT_ONCE,
     GENEROUS,
     NOTE_TOPIC,
-    AtOnce,
-    RecordedTimes,
     Recorders,
     RecordingAbout,
     RecordingFailed,
@@ -84,7 +83,7 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import StopHandler, TopicHandlers
     from mesh.agent.ledger import JobRecord, Ledger
     from mesh.agent.objectives import Objectives
-    from mesh.recording import Objective, Pace, Played, Recorder, RecordingSummary
+    from mesh.recording import Objective, Played, Recorder, RecordingSummary
     from schemas import Liability
 
     Handle = Callable[[Job, Played], Awaitable[object]]
@@ -225,7 +224,7 @@ class JobRun(Job):
         recorder: Recorder,
         *,
         objective: Objective | None = None,
-        pace: Pace | None = None,
+        speed: float = AT_ONCE,
         recorded: frozenset[str] | None = None,
     ) -> None:
         super().__init__(session, agent, job.liability, position=job.position)
@@ -238,7 +237,7 @@ class JobRun(Job):
         self._closing = False
         self._heard_at = 0.0
         """When something was last received on the job's topics."""
-        self.pace: Pace = pace or AtOnce()
+        self.speed = speed
         """How fast the objective is played."""
         self.recorded = recorded
         """The topics that are recorded; None for all."""
@@ -372,7 +371,7 @@ class JobRun(Job):
 
     async def _publish_messages(self) -> None:
         assert self._objective is not None, "a run without an objective only records"
-        async for step in play(self._objective, pace=self.pace, start_index=self.position):
+        async for step in play(self._objective, speed=self.speed, start_index=self.position):
             message = step.message
             while self._recorder.is_behind:
                 await asyncio.wrap_future(self._recorder.sync())
@@ -580,7 +579,7 @@ class Executor:
         self._holds_when_stopped = parts.settings.hold_when_stopped
         self.hold = Hold(stop_folder(parts.settings), parts.signer.address)
         """While it is held, no job begins."""
-        self._pace: Pace = AtOnce() if parts.settings.playback == "at-once" else RecordedTimes()
+        self._speed = AT_ONCE if parts.settings.playback == "at-once" else 1.0
         names = (name.strip() for name in parts.settings.recording_topics.split(","))
         self._recorded = frozenset(name for name in names if name) or None
         self._bag_results = parts.settings.bag_results
@@ -935,7 +934,7 @@ class Executor:
             job,
             await self.recordings.open(job.liability),
             objective=objective,
-            pace=self._pace,
+            speed=self._speed,
             recorded=self._recorded,
         )
 

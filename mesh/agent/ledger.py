@@ -190,7 +190,7 @@ class Ledger(RoleLedger):
 
     async def add_job(self, liability: Liability) -> bool:
         """Add a job as INCOMING, or bring back one that was set aside. False if it was known already."""
-        return await self._database.run(
+        return await self._run(
             "INSERT INTO jobs (liability, phase, record, changed) VALUES (?, ?, ?, ?)"
             " ON CONFLICT (liability) DO UPDATE SET aside = 0 WHERE aside",
             (liability.address, Phase.INCOMING, liability.encode(), time.time()),
@@ -199,16 +199,16 @@ class Ledger(RoleLedger):
 
     async def set_aside(self, liability: str) -> None:
         """Hide a job, with everything that is known of it, until `add_job` or `bring_back` shows it again."""
-        await self._database.run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,), sync=False)
+        await self._run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,), sync=False)
 
     async def bring_back(self, liability: str) -> bool:
         """Show a job that was set aside. False if there is none."""
         statement = "UPDATE jobs SET aside = 0 WHERE liability = ? AND aside"
-        return await self._database.run(statement, (liability,), sync=False)
+        return await self._run(statement, (liability,), sync=False)
 
     async def set_phase(self, liability: str, phase: Phase, *, position: int | None = None) -> None:
         """Set the phase of the job at `liability` (address) and, if given, how many messages it has played."""
-        await self._database.run(
+        await self._run(
             "UPDATE jobs SET phase = ?, position = COALESCE(?, position), changed = ? WHERE liability = ?",
             (phase, position, time.time(), liability),
             sync=False,
@@ -219,49 +219,49 @@ class Ledger(RoleLedger):
 
         Its recording must already have `recorded` messages on the disk, and with them all that were played.
         """
-        await self._database.run(
+        await self._run(
             "UPDATE jobs SET position = ?, recorded = ? WHERE liability = ?", (position, recorded, liability)
         )
 
     async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
         """Set the job's outcome and keep its signed Result for sending: both or neither."""
         ended = "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?"
-        await self._database.run_together(
+        await self._run_together(
             (ended, (Phase.COMPLETE, success, result, note, time.time(), liability)), (POST, _posted(outgoing))
         )
 
     async def stop(self, liability: str, stop: Stop) -> None:
         """Keep that the job at `liability` (address) was stopped. The first stop counts."""
-        await self._database.run("INSERT OR IGNORE INTO stops VALUES (?, ?, ?)", (liability, stop.why, stop.code))
+        await self._run("INSERT OR IGNORE INTO stops VALUES (?, ?, ?)", (liability, stop.why, stop.code))
 
     async def stopped(self, liability: str) -> Stop | None:
         """How the job at `liability` (address) was stopped; None if it was not."""
-        rows = await self._database.rows("SELECT why, code FROM stops WHERE liability = ?", (liability,))
+        rows = await self._rows("SELECT why, code FROM stops WHERE liability = ?", (liability,))
         return Stop(*rows[0]) if rows else None
 
     async def keep_control(self, changed: ControlRobot) -> None:
         """Keep what the owner has changed while the agent ran."""
-        await self._database.run("INSERT OR REPLACE INTO control VALUES (1, ?)", (changed.encode(),))
+        await self._run("INSERT OR REPLACE INTO control VALUES (1, ?)", (changed.encode(),))
 
     async def control(self) -> ControlRobot:
         """What the owner has changed, also in earlier runs."""
-        rows = await self._database.rows("SELECT record FROM control")
+        rows = await self._rows("SELECT record FROM control")
         return ControlRobot.decode(rows[0][0]) if rows else ControlRobot()
 
     async def job(self, liability: str) -> JobRecord | None:
         """The job at `liability` (EIP-55 address), if there is one."""
-        rows = await self._database.rows("SELECT * FROM jobs WHERE liability = ? AND NOT aside", (liability,))
+        rows = await self._rows("SELECT * FROM jobs WHERE liability = ? AND NOT aside", (liability,))
         return _job(rows[0]) if rows else None
 
     async def jobs(self, phases: Iterable[Phase] = UNFINISHED) -> list[JobRecord]:
         """The jobs in the given phases, oldest first."""
         wanted = (json_encode(tuple(phases)),)
         statement = "SELECT * FROM jobs WHERE phase IN (SELECT value FROM json_each(?)) AND NOT aside ORDER BY rowid"
-        return [_job(row) for row in await self._database.rows(statement, wanted)]
+        return [_job(row) for row in await self._rows(statement, wanted)]
 
     async def promisees(self, limit: int) -> list[str]:
         """The promisees of the latest jobs, of `limit` jobs at most, the latest last."""
-        rows = await self._database.rows("SELECT record FROM jobs ORDER BY rowid DESC LIMIT ?", (limit,))
+        rows = await self._rows("SELECT record FROM jobs ORDER BY rowid DESC LIMIT ?", (limit,))
         return [Liability.decode(row[0]).promisee for row in reversed(rows)]
 
     async def holds(self, names: Sequence[str]) -> set[str]:
@@ -270,7 +270,7 @@ class Ledger(RoleLedger):
             "WITH names AS (SELECT value FROM json_each(?)) SELECT liability FROM jobs WHERE liability IN names"
             " UNION SELECT identity FROM outbox WHERE identity IN names"
         )
-        return {row[0] for row in await self._database.rows(statement, (json_encode(names),))}
+        return {row[0] for row in await self._rows(statement, (json_encode(names),))}
 
     async def jobs_by_phase(self) -> dict[str, int]:
         """The number of jobs in each phase that has any."""
@@ -279,21 +279,21 @@ class Ledger(RoleLedger):
     async def phases(self) -> list[tuple[str, int, float]]:
         """Each phase that has jobs: how many, and when (Unix time) the first of them entered it."""
         statement = "SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase"
-        return await self._database.rows(statement)
+        return await self._rows(statement)
 
     async def post(self, outgoing: Outgoing) -> None:
         """Keep a signed message for sending, until `settle`."""
-        await self._database.run(POST, _posted(outgoing))
+        await self._run(POST, _posted(outgoing))
 
     async def settle(self, identity: str) -> bool:
         """Remove a message whose effect was seen. False if it was not in the outbox."""
         statement = "DELETE FROM outbox WHERE identity = ? AND NOT withdrawn"
-        return await self._database.run(statement, (identity,), sync=False)
+        return await self._run(statement, (identity,), sync=False)
 
     async def spend(self, identity: str, liability: str) -> None:
         """Take an order out of the outbox that became the contract at `liability`, and keep it for `unspend`."""
         keep = f"INSERT OR REPLACE INTO spent SELECT {COLUMNS}, ? FROM outbox WHERE identity = ?"
-        await self._database.run_together(
+        await self._run_together(
             (keep, (liability, identity)),
             ("DELETE FROM outbox WHERE identity = ?", (identity,)),
             ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (self._spent_kept,)),
@@ -302,23 +302,23 @@ class Ledger(RoleLedger):
 
     async def spent(self, liability: str) -> list[Outgoing]:
         """The orders that became the contract at this address, withdrawn ones included."""
-        rows = await self._database.rows(f"SELECT {OUTGOING} FROM spent WHERE liability = ?", (liability,))
+        rows = await self._rows(f"SELECT {OUTGOING} FROM spent WHERE liability = ?", (liability,))
         return [Outgoing(*row) for row in rows]
 
     async def contracts(self, kind: str) -> list[tuple[bytes, str]]:
         """The 64 latest orders of a kind, also withdrawn, that became contracts: payload, contract's address."""
         statement = "SELECT payload, liability FROM spent WHERE kind = ? ORDER BY posted DESC LIMIT 64"
-        return await self._database.rows(statement, (kind,))
+        return await self._rows(statement, (kind,))
 
     async def unspend(self, liability: str) -> None:
         """Move the orders of a reverted contract back into the outbox. Withdrawn ones stay withdrawn."""
         back = f"INSERT OR IGNORE INTO outbox ({COLUMNS}) SELECT {COLUMNS} FROM spent WHERE liability = ?"
         remove = "DELETE FROM spent WHERE liability = ?"
-        await self._database.run_together((back, (liability,)), (remove, (liability,)), sync=False)
+        await self._run_together((back, (liability,)), (remove, (liability,)), sync=False)
 
     async def withdraw(self, withdrawals: Mapping[str, Outgoing]) -> None:
         """Send their signed withdrawals instead of orders, which are remembered while they may become contracts."""
-        await self._database.run_together(
+        await self._run_together(
             *(
                 step
                 for identity, withdrawal in withdrawals.items()
@@ -331,7 +331,7 @@ class Ledger(RoleLedger):
 
     async def use_up(self, identity: str, tx: str) -> None:
         """The transaction `tx` has made sure that a withdrawn order can't become a contract any more."""
-        await self._database.run("UPDATE outbox SET tx = ? WHERE identity = ?", (tx, identity))
+        await self._run("UPDATE outbox SET tx = ? WHERE identity = ?", (tx, identity))
 
     async def withdrawn_on_chain(self, *, head: int) -> list[StoredOrder]:
         """The orders that transactions of ours withdrew, with a deadline after block `head`, the oldest first."""
@@ -340,7 +340,7 @@ class Ledger(RoleLedger):
     async def replace(self, identity: str, outgoing: Outgoing) -> None:
         """Keep a message for sending instead of the one called `identity`."""
         remove = ("DELETE FROM outbox WHERE identity = ?", (identity,))
-        await self._database.run_together(remove, (POST, _posted(outgoing)))
+        await self._run_together(remove, (POST, _posted(outgoing)))
 
     async def orders(self) -> list[StoredOrder]:
         """The orders that may still become contracts, oldest first, the withdrawn ones behind the others.
@@ -351,7 +351,7 @@ class Ledger(RoleLedger):
 
     async def _stored(self, condition: str, values: tuple[Any, ...] = ()) -> list[StoredOrder]:
         statement = f"SELECT identity, payload, posted, withdrawn, tx, robot FROM outbox WHERE {condition}"
-        rows = await self._database.rows(statement, values)
+        rows = await self._rows(statement, values)
         return [
             StoredOrder(identity, payload, posted, bool(withdrawn), tx, robot)
             for identity, payload, posted, withdrawn, tx, robot in rows
@@ -363,18 +363,18 @@ class Ledger(RoleLedger):
         Deletes the latter `reorg_depth` blocks after their deadline.
         """
         last = head - self._reorg_depth
-        rows = await self._database.rows(
+        rows = await self._rows(
             f"SELECT {OUTGOING}, withdrawn FROM outbox WHERE NOT withdrawn OR deadline <= ? ORDER BY rowid", (last,)
         )
         if any(row[3] is not None and row[3] <= last for row in rows):
-            await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (last,), sync=False)
+            await self._run("DELETE FROM outbox WHERE deadline <= ?", (last,), sync=False)
         return [Outgoing(*row[:5]) for row in rows if not row[5] and (row[3] is None or row[3] > head)]
 
     async def waiting_by_kind(self, *, head: int) -> dict[str, int]:
         """The messages to send of each kind (`demand`, `offer`, `withdrawal`, `result`) that has any."""
         condition = "NOT withdrawn AND (deadline IS NULL OR deadline > ?)"
         statement = f"SELECT kind, COUNT(*) FROM outbox WHERE {condition} GROUP BY kind"
-        return dict(await self._database.rows(statement, (head,)))
+        return dict(await self._rows(statement, (head,)))
 
 
 def _job(row: Any) -> JobRecord:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -12,14 +11,14 @@ from mesh.agent.errors import Declined
 from mesh.amounts import XRT
 from mesh.base.flood import BoundedDict
 from mesh.errors import RemoteError
-from mesh.watching.market import query_all
-from schemas import ZERO_ADDRESS, Demand, InvalidRecord
+from mesh.watching.market import signed_answers
+from schemas import ZERO_ADDRESS, Demand
 from schemas.keys import ValidatorKey
 from schemas.signing import SignedRecord
-from schemas.verdicts import LONGEST_REPORT, PolicyNote, ValidatorAnnouncement
+from schemas.verdicts import PolicyNote, ValidatorAnnouncement
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
     import zenoh
 
@@ -32,10 +31,6 @@ KEPT: Final = 60.0
 """Seconds for which the announcements of a validator are not asked again, …"""
 KEPT_SILENCE: Final = 5.0
 """… and those for which a validator without any is not."""
-OLDEST: Final = 24 * 3600.0
-"""Seconds since a juror signed an announcement after which it does not count."""
-CLOCK_ERROR: Final = 300.0
-"""Seconds by which a juror's clock may be ahead."""
 
 
 class ValidatorSilent(RemoteError, code="validator-silent"):
@@ -136,16 +131,11 @@ class ValidatorDirectory:
             raise Declined("validator-underpaid", why)
 
     async def _ask(self, validator: str) -> AnnouncedValidator:
-        key, now = str(ValidatorKey(self._channel.lighthouse, validator)), time.time()
-
-        def is_wanted(one: ValidatorAnnouncement) -> bool:
-            return one.validator == validator and now - OLDEST <= one.made_at <= now + CLOCK_ERROR
-
         said = await signed_answers(
             self._session,
-            key,
+            [str(ValidatorKey(self._channel.lighthouse, validator))],
             ValidatorAnnouncement,
-            is_wanted,
+            lambda one: one.validator == validator,
             timeout=self._channel.answer_timeout,
             made_at=lambda one: one.made_at,
         )
@@ -179,30 +169,3 @@ async def refund_delay(chain: Chain) -> int | None:
     if not await chain.has_mesh_contracts():
         return None
     return int(await chain.node.read(chain.node.contract("Factory", chain.factory).refundDelay()))
-
-
-async def signed_answers(
-    session: zenoh.Session,
-    selector: str,
-    record: type[S],
-    is_wanted: Callable[[S], bool],
-    *,
-    timeout: float,
-    made_at: Callable[[S], float] = lambda _record: 0.0,
-) -> dict[str, S]:
-    """The wanted records in the answers to a query, by signer: of each the latest by `made_at`, or the first."""
-    replies = await query_all(session, [selector], timeout=timeout)
-
-    def read() -> dict[str, S]:
-        found: dict[str, S] = {}
-        for sample in (reply.ok for reply in replies if reply.ok is not None):
-            if len(sample.payload) > LONGEST_REPORT:
-                continue
-            with suppress(InvalidRecord):
-                one = record.decode(sample.payload.to_bytes())
-                before = found.get(one.signer)
-                if is_wanted(one) and (before is None or made_at(before) < made_at(one)) and one.is_signed:
-                    found[one.signer] = one
-        return found
-
-    return await asyncio.to_thread(read)

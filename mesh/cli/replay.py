@@ -15,7 +15,7 @@ from mesh.cli.files import FETCH_SETTINGS, fetch, file_of, names_in, opened_stor
 from mesh.cli.options import FiniteRange, with_json, with_settings
 from mesh.cli.output import format_duration, plural, print_result, progress, said_by
 from mesh.errors import ConfigurationError, InputError
-from mesh.recording import GENEROUS, AtOnce, RecordedTimes, open_objective, play
+from mesh.recording import AT_ONCE, GENEROUS, open_objective, play
 from mesh.settings import ChainSettings
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, topic_chunks
 
@@ -87,7 +87,7 @@ async def command(
         _check_topics(recording, chosen)
         for topic in chosen or {topic.name for topic in recording.topics}:
             key_of(topic, "")  # raises before anything is sent if a topic gives no valid key
-        steps = play(recording, pace=AtOnce() if at_once else RecordedTimes(speed=rate), start_ns=int(start * 1e9))
+        steps = play(recording, speed=AT_ONCE if at_once else rate, start_ns=int(start * 1e9))
         began, played = time.monotonic(), 0
         async with Network(endpoints_of(settings)) as network:
             publishers: dict[str, Any] = {}

@@ -49,11 +49,4 @@ from mesh.recording.objective import (
     rates_of,
     shown_value,
 )
-from mesh.recording.playback import (
-    AtOnce,
-    FixedRate,
-    Pace,
-    RecordedTimes,
-    paced,
-    play,
-)
+from mesh.recording.playback import AT_ONCE, paced, play

@@ -7,11 +7,11 @@ ones: late messages go out at once, in order.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from contextlib import aclosing
-from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Protocol
 
 from msgspec import Struct
 
@@ -31,46 +31,8 @@ _AHEAD: Final = 64
 _AHEAD_BYTES: Final = 4 << 20
 
 
-@dataclass(frozen=True)
-class RecordedTimes:
-    """Messages at their recorded intervals, divided by `speed`. Raises `ValueError` unless `speed` is positive."""
-
-    speed: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not self.speed > 0:
-            raise ValueError(f"the speed must be positive, not {self.speed}")
-
-    def due_ns(self, position: int, elapsed_ns: int) -> int:
-        """When the message at `position`, recorded `elapsed_ns` after the first, is due: nanoseconds from the start."""
-        return elapsed_ns if self.speed == 1 else int(elapsed_ns / self.speed)
-
-
-@dataclass(frozen=True)
-class AtOnce:
-    """Every message immediately after the one before."""
-
-    def due_ns(self, position: int, elapsed_ns: int) -> int:
-        """Always now."""
-        return 0
-
-
-@dataclass(frozen=True)
-class FixedRate:
-    """`hz` messages per second, whatever their times. Raises `ValueError` unless `hz` is positive."""
-
-    hz: float
-
-    def __post_init__(self) -> None:
-        if not self.hz > 0:
-            raise ValueError(f"the rate must be positive, not {self.hz}")
-
-    def due_ns(self, position: int, elapsed_ns: int) -> int:
-        """When the message at `position` is due: nanoseconds from the start."""
-        return int(position * _SECOND / self.hz)
-
-
-Pace: TypeAlias = RecordedTimes | AtOnce | FixedRate
+AT_ONCE: Final = math.inf
+"""The speed at which every message follows the one before immediately."""
 
 
 class Step(Struct, frozen=True):
@@ -106,16 +68,16 @@ class MonotonicClock:
 
 
 async def paced(
-    messages: AsyncIterable[Played], pace: Pace, clock: PlaybackClock, *, first_index: int = 0, start_ns: int = 0
+    messages: AsyncIterable[Played], speed: float, clock: PlaybackClock, *, first_index: int = 0, start_ns: int = 0
 ) -> AsyncGenerator[Step, None]:
-    """Each message as a step when it is due by `clock`, never earlier.
+    """Each message as a step when it is due by `clock`, never earlier: recorded times count `speed` times faster.
 
     The first is due at once, and time starts with it; `first_index` is its number in the recording. With `start_ns`,
     messages recorded less than that after the first are skipped, and the others are due as if the recording began
     there. Cancelling is safe between two steps.
     """
-    index, position, unpaused = first_index - 1, -1, 0
-    origin = begin = 0
+    index, unpaused = first_index - 1, 0
+    origin, begin = 0, None
     async for message in messages:
         index += 1
         if index == first_index:
@@ -123,9 +85,8 @@ async def paced(
         elapsed = message.log_time_ns - origin - start_ns
         if elapsed < 0:
             continue
-        position += 1
-        due = pace.due_ns(position, elapsed)
-        if not position:
+        due = elapsed if speed == 1 else int(elapsed / speed)  # a float does not hold all nanoseconds
+        if begin is None:
             begin = clock.now_ns()
         unpaused += 1
         if begin + due > clock.now_ns() or unpaused >= _UNPAUSED:
@@ -134,19 +95,18 @@ async def paced(
         yield Step(index, due, message)
 
 
-_AS_RECORDED: Final = RecordedTimes()
 _CLOCK: Final = MonotonicClock()
 
 
 async def play(
     objective: Objective,
     *,
-    pace: Pace = _AS_RECORDED,
+    speed: float = 1.0,
     start_index: int = 0,
     start_ns: int = 0,
     clock: PlaybackClock = _CLOCK,
 ) -> AsyncGenerator[Step, None]:
-    """Play an objective: each of its messages when it is due.
+    """Play an objective: each of its messages when it is due, at `speed` times the recorded pace.
 
     `start_index` skips that many messages, and the next is due at once: to continue after an interruption. `start_ns`
     starts that long after the first message (after the one at `start_index`). Cancelling, or leaving the loop, stops
@@ -154,7 +114,7 @@ async def play(
     """
     messages = read_ahead(objective.messages(from_index=start_index))
     async with aclosing(messages):
-        async for step in paced(messages, pace, clock, first_index=start_index, start_ns=start_ns):
+        async for step in paced(messages, speed, clock, first_index=start_index, start_ns=start_ns):
             yield step
 
 

@@ -30,38 +30,53 @@ class LedgerUnusable(ConfigurationError, code="ledger-unusable"):
         self.why = str(why)
 
 
-class Database:
-    """The database in the file at `path`, with the tables of `schema`. Calls run in order.
+class RoleLedger:
+    """What a role keeps, in the file at `path`, which is created if it is missing: `async with` opens it.
 
-    Every call raises `LedgerUnusable`, and `ClosedError` before `open` and after `close`.
+    It has the tables of `schema`, and how far the role has handled the chain. A file belongs to one role of one
+    account. Calls run in order. Each raises `LedgerUnusable`, and `ClosedError` outside of `async with`; entering also
+    `ConfigurationError` if a newer version wrote the file.
     """
 
-    def __init__(self, path: Path, schema: str) -> None:
+    schema: str
+    """The tables of a subclass."""
+
+    def __init__(self, path: Path) -> None:
+        cursor = "CREATE TABLE IF NOT EXISTS cursor (row INTEGER PRIMARY KEY CHECK (row = 0), block INTEGER NOT NULL, "
         self._path = path
-        self._file = SyncedDatabase(path, schema)
+        self._file = SyncedDatabase(path, f"{self.schema} {cursor} history BLOB NOT NULL);")
         self._using = asyncio.Lock()
         self._needed = 0
         """The number of the last write that must not be lost."""
 
-    async def open(self) -> None:
-        """Open the file, or create it. Raises `ConfigurationError` if a newer version wrote it."""
+    async def __aenter__(self) -> Self:
         if self._file.is_open:
             raise ClosedError("this ledger is open already")
         try:
             self._file.open()
         except DISK_ERRORS as error:
             raise LedgerUnusable(self._path, getattr(error, "strerror", None) or error) from None
+        return self
 
-    async def close(self) -> None:
-        """Close the file if it is open, after the calls that have begun."""
-        async with self._using:
+    async def __aexit__(self, *exc_info: object) -> None:
+        async with self._using:  # after the calls that have begun
             self._file.close()
 
-    async def run(self, statement: str, values: tuple[Any, ...] = (), *, sync: bool = True) -> bool:
-        """Run one statement, and sync it to the disk. Returns whether it changed any rows."""
-        return await self.run_together((statement, values), sync=sync)
+    async def cursor(self) -> tuple[int | None, bytes]:
+        """The last block that the role has handled (None: it never handled one), and its encoded chain history."""
+        rows = await self._rows("SELECT block, history FROM cursor")
+        return rows[0] if rows else (None, b"")
 
-    async def run_together(self, *statements: tuple[str, tuple[Any, ...]], sync: bool = True) -> bool:
+    async def set_cursor(self, block: int, *, history: bytes = b"") -> None:
+        """Save that the role has handled all of `block`, with its encoded chain history."""
+        statement = "INSERT OR REPLACE INTO cursor (row, block, history) VALUES (0, ?, ?)"
+        await self._run(statement, (block, history), sync=False)
+
+    async def _run(self, statement: str, values: tuple[Any, ...] = (), *, sync: bool = True) -> bool:
+        """Run one statement, and sync it to the disk. Returns whether it changed any rows."""
+        return await self._run_together((statement, values), sync=sync)
+
+    async def _run_together(self, *statements: tuple[str, tuple[Any, ...]], sync: bool = True) -> bool:
         """Run all statements in one transaction. All of them have an effect or, if it fails, none."""
         async with self._usable() as file:
             changed = file.write(*((statement, [values]) for statement, values in statements))
@@ -70,7 +85,7 @@ class Database:
                 await file.sync()
         return changed > 0
 
-    async def rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
+    async def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """The rows that a statement returns: nothing that a power loss might still take back, and should not."""
         async with self._usable() as file:
             rows = file.rows(statement, values)
@@ -88,35 +103,3 @@ class Database:
                 yield self._file
             except (OSError, sqlite3.OperationalError) as error:
                 raise LedgerUnusable(self._path, getattr(error, "strerror", None) or error) from None
-
-
-class RoleLedger:
-    """What a role keeps, in the file at `path`, which is created if it is missing: `async with` opens it.
-
-    It has the tables of `schema`, and how far the role has handled the chain. A file belongs to one role of one
-    account. Every call raises `LedgerUnusable`.
-    """
-
-    schema: str
-    """The tables of a subclass."""
-
-    def __init__(self, path: Path) -> None:
-        cursor = "CREATE TABLE IF NOT EXISTS cursor (row INTEGER PRIMARY KEY CHECK (row = 0), block INTEGER NOT NULL, "
-        self._database = Database(path, f"{self.schema} {cursor} history BLOB NOT NULL);")
-
-    async def __aenter__(self) -> Self:
-        await self._database.open()
-        return self
-
-    async def __aexit__(self, *exc_info: object) -> None:
-        await self._database.close()
-
-    async def cursor(self) -> tuple[int | None, bytes]:
-        """The last block that the role has handled (None: it never handled one), and its encoded chain history."""
-        rows = await self._database.rows("SELECT block, history FROM cursor")
-        return rows[0] if rows else (None, b"")
-
-    async def set_cursor(self, block: int, *, history: bytes = b"") -> None:
-        """Save that the role has handled all of `block`, with its encoded chain history."""
-        statement = "INSERT OR REPLACE INTO cursor (row, block, history) VALUES (0, ?, ?)"
-        await self._database.run(statement, (block, history), sync=False)

@@ -22,24 +22,24 @@ ETHEREUM_SECONDS: Final = 12.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChainProfile:
-    """What is known of a chain."""
+    """What is known of a chain; by default what holds where none is named."""
 
-    name: str
+    name: str = ""
     """As in the setting `chain`."""
-    title: str
+    title: str = "any chain"
     """For people."""
-    chain_id: int
+    chain_id: int = 0
     """EIP-155; 0 for any."""
-    block_seconds: float
+    block_seconds: float = ETHEREUM_SECONDS
     """Between two blocks."""
-    confirmations: int
-    reorg_depth: int
-    poll_interval: float
+    confirmations: int = 1
+    reorg_depth: int = 12
+    poll_interval: float = 1.0
     log_range: int = 2000
     """Blocks whose logs are asked for at once, at first; less where a node refuses."""
-    explorer: str
+    explorer: str = ""
     """The address of a block explorer; pages are at `/tx/…` and `/address/…`."""
-    coin: str
+    coin: str = "ETH"
     """What gas is paid in."""
     tokens: Mapping[str, str] = field(default_factory=dict)
     """Well-known tokens: addresses (EIP-55) by symbol."""
@@ -48,7 +48,7 @@ class ChainProfile:
     l1: Literal["", "op", "arbitrum"] = ""
     """How an underlying chain shows: as a fee for data that an oracle tells (op), or as the numbers of blocks that
     contracts see (arbitrum)."""
-    finalized: str
+    finalized: str = "whatever the node answers"
     """What final means there, in one sentence."""
 
     @property
@@ -83,7 +83,6 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 poll_interval=2.0,
                 log_range=10_000,
                 explorer="https://basescan.org",
-                coin="ETH",
                 tokens={"USDC": "0x833589fCD6eDb6E08f4c7C32D4f71b54bdA02913"},
                 l1="op",
                 finalized=ROLLED_UP,
@@ -95,9 +94,7 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 block_seconds=2.0,
                 confirmations=2,
                 reorg_depth=30,
-                poll_interval=1.0,
                 explorer="https://optimistic.etherscan.io",
-                coin="ETH",
                 tokens={"USDC": "0x0b2C639c533813f4Aa9D7837CAf62653d097Ff85"},
                 l1="op",
                 finalized=ROLLED_UP,
@@ -112,7 +109,6 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 poll_interval=2.0,
                 log_range=10_000,
                 explorer="https://arbiscan.io",
-                coin="ETH",
                 tokens={"USDC": "0xaf88d065e77c8cC2239327C5EDb3A432268e5831"},
                 has_priority_fee=False,
                 l1="arbitrum",
@@ -125,7 +121,6 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 block_seconds=5.0,
                 confirmations=3,
                 reorg_depth=48,
-                poll_interval=1.0,
                 explorer="https://gnosisscan.io",
                 coin="xDAI",
                 tokens={"USDC.e": "0x2a22f9c3b484c3629090FeED35F17Ff8F88f76F0"},
@@ -138,7 +133,6 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 block_seconds=2.0,
                 confirmations=4,
                 reorg_depth=64,
-                poll_interval=1.0,
                 explorer="https://polygonscan.com",
                 coin="POL",
                 tokens={"USDC": "0x3c499c542cEF5E3811e1192ce70d8cC03d5c3359"},
@@ -148,12 +142,9 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 name="ethereum",
                 title="Ethereum",
                 chain_id=1,
-                block_seconds=ETHEREUM_SECONDS,
                 confirmations=3,
                 reorg_depth=64,
-                poll_interval=1.0,
                 explorer="https://etherscan.io",
-                coin="ETH",
                 tokens={"USDC": "0xA0b86991c6218b36c1d19D4a2e9Eb0cE3606eB48"},
                 finalized="two thirds of the stake have voted for the block twice, about 13 minutes after it",
             ),
@@ -161,25 +152,16 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
                 name="sepolia",
                 title="Sepolia, a test network",
                 chain_id=11_155_111,
-                block_seconds=ETHEREUM_SECONDS,
                 confirmations=2,
                 reorg_depth=64,
-                poll_interval=1.0,
                 explorer="https://sepolia.etherscan.io",
-                coin="ETH",
                 tokens={"USDC": "0x1c7D4B196Cb0C7B01d743Fbc6116a902379C7238"},
                 finalized="as on Ethereum, about 13 minutes after the block; its coins are worth nothing",
             ),
             ChainProfile(
                 name="local",
                 title="a development chain",
-                chain_id=0,
                 block_seconds=1.0,
-                confirmations=1,
-                reorg_depth=12,
-                poll_interval=1.0,
-                explorer="",
-                coin="ETH",
                 finalized="whatever the node answers: on most of them each block is final at once",
             ),
         )
@@ -188,18 +170,7 @@ CHAINS: Final[Mapping[str, ChainProfile]] = MappingProxyType(
 """The profiles by name."""
 
 
-ANY: Final = ChainProfile(
-    name="",
-    title="any chain",
-    chain_id=0,
-    block_seconds=ETHEREUM_SECONDS,
-    confirmations=1,
-    reorg_depth=12,
-    poll_interval=1.0,
-    explorer="",
-    coin="ETH",
-    finalized="whatever the node answers",
-)
+ANY: Final = ChainProfile()
 """What holds where no chain is named: blocks as slow as those of Ethereum, and nothing is waited for."""
 
 

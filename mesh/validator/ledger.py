@@ -76,7 +76,7 @@ class VerdictLedger(RoleLedger):
 
     async def open(self, liability: Liability, *, since_ns: int) -> StoredVerdict:
         """Add a liability, or bring back one that was set aside; what is known of it."""
-        await self._database.run(
+        await self._run(
             "INSERT INTO verdicts (liability, record, since, changed) VALUES (?, ?, ?, ?)"
             " ON CONFLICT (liability) DO UPDATE SET aside = 0 WHERE aside",
             (liability.address, liability.encode(), since_ns, time.time()),
@@ -88,11 +88,11 @@ class VerdictLedger(RoleLedger):
 
     async def set_aside(self, liability: str) -> None:
         """Hide a liability that a reorganisation reverted, until `open` shows it again. Its verdict stays signed."""
-        await self._database.run("UPDATE verdicts SET aside = 1 WHERE liability = ?", (liability,), sync=False)
+        await self._run("UPDATE verdicts SET aside = 1 WHERE liability = ?", (liability,), sync=False)
 
     async def take(self, liability: str, result: Result, *, seen_ns: int) -> bool:
         """Keep the Result that the promisor has signed. False if there is one already: the first one counts."""
-        return await self._database.run(
+        return await self._run(
             "UPDATE verdicts SET result = ?, seen = ?, changed = ? WHERE liability = ? AND result = x''",
             (encode(result), seen_ns, time.time(), liability),
         )
@@ -106,7 +106,7 @@ class VerdictLedger(RoleLedger):
         assert self._signer is not None, "it was opened to be read"
         signed, address = encode(self._signer.sign(result)), result.liability
         is_new = "WHERE EXISTS (SELECT 1 FROM verdicts WHERE liability = ? AND signed = x'')"
-        await self._database.run_together(
+        await self._run_together(
             *((f"INSERT OR IGNORE INTO marks SELECT ?, ? {is_new}", (mark, address, address)) for mark in marks),
             (
                 "UPDATE verdicts SET signed = ?, report = ?, changed = ? WHERE liability = ? AND signed = x''",
@@ -119,7 +119,7 @@ class VerdictLedger(RoleLedger):
 
     async def end(self, liability: str, *, ended: bool = True) -> None:
         """The chain has the end of a liability; or not any more, after a reorganisation."""
-        await self._database.run(
+        await self._run(
             "UPDATE verdicts SET ended = ?, changed = ? WHERE liability = ?",
             (ended, time.time(), liability),
             sync=False,
@@ -128,23 +128,23 @@ class VerdictLedger(RoleLedger):
     async def verdict(self, liability: str) -> StoredVerdict | None:
         """What is known of the liability at this EIP-55 address; None if it does not name this validator."""
         statement = f"SELECT {COLUMNS} FROM verdicts WHERE liability = ? AND NOT aside"
-        rows = await self._database.rows(statement, (liability,))
+        rows = await self._rows(statement, (liability,))
         return _stored(rows[0]) if rows else None
 
     async def unended(self) -> list[StoredVerdict]:
         """The liabilities whose end is not on the chain, oldest first."""
         statement = f"SELECT {COLUMNS} FROM verdicts WHERE NOT ended AND NOT aside ORDER BY rowid"
-        return [_stored(row) for row in await self._database.rows(statement)]
+        return [_stored(row) for row in await self._rows(statement)]
 
     async def owner_of(self, mark: str, *, other_than: str) -> str:
         """The first liability that a recording with this mark succeeded for, `other_than` one; empty without one."""
         statement = "SELECT liability FROM marks WHERE mark = ? AND liability != ? ORDER BY rowid LIMIT 1"
-        rows = await self._database.rows(statement, (mark, other_than))
+        rows = await self._rows(statement, (mark, other_than))
         return str(rows[0][0]) if rows else ""
 
     async def stages(self) -> dict[str, int]:
         """The number of liabilities in each of `STAGES`."""
-        rows = await self._database.rows(f"SELECT {STAGE}, COUNT(*) FROM verdicts WHERE NOT aside GROUP BY 1")
+        rows = await self._rows(f"SELECT {STAGE}, COUNT(*) FROM verdicts WHERE NOT aside GROUP BY 1")
         return dict.fromkeys(STAGES, 0) | dict(rows)
 
 

@@ -10,7 +10,9 @@ import asyncio
 import logging
 import tempfile
 import threading
+import time
 from collections import Counter
+from contextlib import suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -31,6 +33,7 @@ from mesh.recording import Limits, open_objective
 from schemas import (
     Demand,
     EventKey,
+    InvalidRecord,
     Liability,
     Offer,
     ProgressKey,
@@ -43,8 +46,8 @@ from schemas import (
     parse_key,
 )
 from schemas.payloads import plain_value
-from schemas.signing import Decline, Rejection
-from schemas.verdicts import ValidatorReport
+from schemas.signing import Decline, Rejection, SignedRecord
+from schemas.verdicts import LONGEST_REPORT, ValidatorReport
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
@@ -55,8 +58,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+R = TypeVar("R", bound=SignedRecord)
+
 TIMEOUT: Final = 3.0
 """Seconds to wait for replies."""
+OLDEST: Final = 24 * 3600.0
+"""Seconds since a profile or an announcement was signed after which it does not count."""
+CLOCK_ERROR: Final = 300.0
+"""Seconds by which the clock of who signed it may be ahead."""
 MAX_REPLIES: Final = 256
 """Replies read per query."""
 
@@ -71,6 +80,42 @@ async def query_all(
         return await asyncio.to_thread(_query_all, session, list(keys), payload, timeout, token)
     finally:
         token.cancel()  # type: ignore[no-untyped-call]
+
+
+async def signed_answers(
+    session: zenoh.Session,
+    keys: Iterable[str],
+    record: type[R],
+    is_wanted: Callable[[R], bool],
+    *,
+    timeout: float,
+    longest: int = LONGEST_REPORT,
+    made_at: Callable[[R], float] | None = None,
+) -> dict[str, R]:
+    """The wanted records in the answers to queries on these keys, by signer: of each the first.
+
+    Longer ones than `longest` (bytes) are not read. With `made_at`, the time (Unix) at which a record was signed, it is
+    the latest, and none that is older than `OLDEST`.
+    """
+    replies, now = await query_all(session, keys, timeout=timeout), time.time()
+
+    def is_better(one: R, before: R | None) -> bool:
+        if made_at is None:
+            return before is None
+        is_new = before is None or made_at(before) < made_at(one)
+        return is_new and now - OLDEST <= made_at(one) <= now + CLOCK_ERROR
+
+    def read() -> dict[str, R]:
+        found: dict[str, R] = {}
+        for sample in (reply.ok for reply in replies if reply.ok is not None):
+            if len(sample.payload) <= longest:
+                with suppress(InvalidRecord):
+                    one = record.decode(sample.payload.to_bytes())
+                    if is_wanted(one) and is_better(one, found.get(one.signer)) and one.is_signed:
+                        found[one.signer] = one
+        return found
+
+    return await asyncio.to_thread(read)
 
 
 def _query_all(

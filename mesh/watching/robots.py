@@ -6,19 +6,17 @@ while no other robot that is present has it.
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections import Counter
-from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.errors import InputError
-from mesh.watching.market import TIMEOUT, query_all
+from mesh.watching.market import TIMEOUT, signed_answers
 from mesh.watching.presence import BATCH, PATIENCE, present
-from schemas import InvalidRecord, ProfileKey, parse_address
+from schemas import ProfileKey, parse_address
 from schemas.address import shortened
 from schemas.profiles import LARGEST_PROFILE, Profile, ProfileState
 
@@ -43,10 +41,6 @@ LOOKUPS: Final = Rate(per_second=20.0, burst=200)
 REST: Final = 10.0
 """How many times as long as a robot was silent no other is asked: strangers who are silent may take a tenth of the
 time."""
-OLDEST: Final = 24 * 3600.0
-"""Seconds since a robot signed a profile after which it does not count."""
-CLOCK_ERROR: Final = 300.0
-"""Seconds by which a robot's clock may be ahead."""
 COUNTED_BLOCKS: Final = 50_000
 """Blocks, a week where one takes 12 seconds, whose contracts count for the records of robots …"""
 COUNTED: Final = 500
@@ -180,25 +174,17 @@ class RobotDirectory:
         return "" if profile is None else profile.name
 
     async def _ask(self, addresses: Iterable[str], timeout: float) -> Mapping[str, Profile]:
-        """The latest profile that each robot has signed on its key."""
-        wanted = {str(ProfileKey(address)): address for address in addresses}
-        replies, now = await query_all(self._session, wanted, timeout=timeout), time.time()
-
-        def read() -> Mapping[str, Profile]:
-            found: dict[str, Profile] = {}
-            for sample in (reply.ok for reply in replies if reply.ok is not None):
-                address = wanted.get(str(sample.key_expr))
-                if address is None or len(sample.payload) > LARGEST_PROFILE:
-                    continue
-                with suppress(InvalidRecord):
-                    one, before = Profile.decode(sample.payload.to_bytes()), found.get(address)
-                    is_recent = now - OLDEST <= one.time <= now + CLOCK_ERROR
-                    is_new = before is None or before.time < one.time
-                    if one.agent == address and is_recent and is_new and one.is_signed:
-                        found[address] = one
-            return found
-
-        return await asyncio.to_thread(read)
+        """The latest profile that each robot has signed."""
+        asked = frozenset(addresses)
+        return await signed_answers(
+            self._session,
+            [str(ProfileKey(address)) for address in asked],
+            Profile,
+            lambda one: one.agent in asked,
+            timeout=timeout,
+            longest=LARGEST_PROFILE,
+            made_at=lambda one: one.time,
+        )
 
 
 async def robot_address(session: zenoh.Session, channel: Channel, named: str, *, model: str = "") -> str:

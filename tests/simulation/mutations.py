@@ -129,7 +129,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the ledger is not synced",
-        "mesh.role.database:Database.run_together",
+        "mesh.role.database:RoleLedger._run_together",
         "if sync:",
         "if False:",
         CRASHES,

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from mesh.agent.jobs import JobRun
-from mesh.recording import AtOnce, RecordedTimes, Recorder, RecorderSettings, RecordingAbout, open_objective
+from mesh.recording import AT_ONCE, Recorder, RecorderSettings, RecordingAbout, open_objective
 from tests.mesh.agent.samples import job
 from tests.support.routers import EmbeddedRouter, client_config
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from mesh.recording import Objective
 
 AGENT = "0x" + "ab" * 20
-AT_ONCE = AtOnce()
 
 
 @pytest.fixture
@@ -44,7 +43,7 @@ class Making:
         *,
         position: int = 0,
         topics: frozenset[str] | None = None,
-        pace: AtOnce | RecordedTimes = AT_ONCE,
+        speed: float = AT_ONCE,
         queue_bytes: int = 64 << 20,
     ) -> JobRun:
         """A run of the objective in `content`, not yet open."""
@@ -58,7 +57,7 @@ class Making:
             msgspec.structs.replace(job(), position=position),
             Recorder(self.path, RecordingAbout(), settings=RecorderSettings(queue_bytes=queue_bytes)),
             objective=played,
-            pace=pace,
+            speed=speed,
             recorded=topics,
         )
 

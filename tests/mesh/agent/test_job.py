@@ -11,7 +11,7 @@ from mesh import AiraError
 from mesh.agent.handlers import WAITING, Job
 from mesh.agent.jobs import QUEUED
 from mesh.errors import ClosedError, InvalidKey
-from mesh.recording import NOTE_TOPIC, RecordedTimes
+from mesh.recording import NOTE_TOPIC
 from schemas import InvalidPayload, LiabilityTopicKey, String
 from tests.mesh.agent.runs import AGENT, Making, making, session
 from tests.support.objectives import objective
@@ -142,7 +142,7 @@ async def test_a_handler_may_close_its_own_run_and_is_the_last_to_be_called(maki
 
 
 async def test_a_run_that_is_closed_while_its_handler_waits_for_a_message_ends(making: Making) -> None:
-    run = making.run(objective(("/a", "now"), ("/a", "much later"), step_ns=10**12), pace=RecordedTimes())
+    run = making.run(objective(("/a", "now"), ("/a", "much later"), step_ns=10**12), speed=1.0)
     run.open()
     playing = asyncio.create_task(run.play(None))
     await until(lambda: run.position == 1)

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent.ledger import SCHEMA, Ledger, Phase
+from mesh.agent.ledger import Ledger, Phase
 from mesh.base.database import VERSION
 from mesh.errors import ClosedError, ConfigurationError
-from mesh.role.database import Database, LedgerUnusable
+from mesh.role.database import LedgerUnusable
 from tests.mesh.agent.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.agent.samples import liability, message
 from tests.support.disks import file_size_limit, synced
@@ -259,18 +259,17 @@ async def completed(ledger: Ledger) -> LedgerUnusable | None:
 async def test_what_comes_while_the_ledger_is_closed_finds_it_closed(tmp_path: Path) -> None:
     """Calls that have begun are done first."""
     for turns in range(20):
-        database = Database(tmp_path / "ledger.db", SCHEMA)
-        await database.open()
+        ledger = await Ledger(tmp_path / "ledger.db").__aenter__()
         row = ("INSERT OR REPLACE INTO outbox VALUES ('x', '', '', 1, '', 1, 0, '')", ())
         calls: list[Coroutine[Any, Any, object]] = [
-            database.run(*row),
-            database.run_together(row),
-            database.rows("SELECT 1"),
+            ledger._run(*row),
+            ledger._run_together(row),
+            ledger._rows("SELECT 1"),
         ]
         tasks = [asyncio.create_task(call) for call in calls]
         for _ in range(turns):
             await asyncio.sleep(0)
-        await database.close()
+        await ledger.__aexit__()
         done = await asyncio.gather(*tasks, return_exceptions=True)
         failures = [error for error in done if isinstance(error, Exception)]
         assert [type(error) for error in failures] == [ClosedError] * len(failures)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.recording import AtOnce, RecordedTimes, open_objective
+from mesh.recording import AT_ONCE, open_objective
 from schemas import String
 from tests.mesh.agent.samples import job, liability
 
@@ -68,12 +68,12 @@ async def test_a_recording_that_does_not_exist_can_be_discarded(executor: Execut
 async def test_the_settings_choose_pace_and_topics(place: Place) -> None:
     async with place.agent("robot", enable_executor=False, playback="recorded", recording_topics=" /a,/b/c ,") as robot:
         run = await robot.runtime.executor.create_run(job())
-        assert run.pace == RecordedTimes()
+        assert run.speed == 1.0
         assert run.recorded == frozenset({"/a", "/b/c"})
         await run.close()
 
 
 async def test_by_default_all_topics_are_recorded(executor: Executor) -> None:
     run = await executor.create_run(job())
-    assert (run.pace, run.recorded) == (AtOnce(), None)
+    assert (run.speed, run.recorded) == (AT_ONCE, None)
     await run.close()

@@ -22,9 +22,9 @@ from mesh import (
     Verified,
 )
 from mesh.agent.ledger import Phase
-from mesh.agent.validators import OLDEST
 from mesh.chain import UnsafeValidator
 from mesh.errors import InputError
+from mesh.watching.market import OLDEST
 from schemas import Demand, ReportKey, Result, Signer, decode
 from tests.mesh.agent.trades import OBJECTIVE, job, working
 from tests.support.jurors import COMPLETE, MISSING, Juror

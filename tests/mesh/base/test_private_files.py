@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from bridges.ipfs._relay import RelayJournal
+from mesh.agent.ledger import Ledger
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.private_files import make_private_folder
 from mesh.chain._pending import TransactionStore
 from mesh.content import Store
 from mesh.recording._recorder import PartialFile, RecordingAbout
 from mesh.recording._recovery import recover
-from mesh.role.database import Database
 from schemas import cid_of_bytes
 
 if TYPE_CHECKING:
@@ -37,11 +37,9 @@ def open_umask() -> Iterator[None]:
 
 
 async def ledger(folder: Path) -> None:
-    database = Database(folder / "chain" / "ledger.sqlite", "CREATE TABLE IF NOT EXISTS one (row);")
-    await database.open()
-    await database.run("PRAGMA user_version = 1")
-    check_private(folder)  # with the write-ahead log beside it
-    await database.close()
+    async with Ledger(folder / "chain" / "ledger.sqlite") as opened:
+        await opened.set_cursor(1)
+        check_private(folder)  # with the write-ahead log beside it
 
 
 async def content(folder: Path) -> None:

@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.recording import (
-    AtOnce,
+    AT_ONCE,
     CorruptRecording,
-    FixedRate,
-    Pace,
     Played,
-    RecordedTimes,
     open_objective,
     paced,
     play,
@@ -55,8 +52,8 @@ async def given(items: list[Played]) -> AsyncIterator[Played]:
         yield item
 
 
-async def steps_of(items: list[Played], pace: Pace, **start: int) -> list[Step]:
-    return [step async for step in paced(given(items), pace, WoundClock(), **start)]
+async def steps_of(items: list[Played], speed: float, **start: int) -> list[Step]:
+    return [step async for step in paced(given(items), speed, WoundClock(), **start)]
 
 
 def objective(directory: Path, *times: int) -> Objective:
@@ -66,49 +63,38 @@ def objective(directory: Path, *times: int) -> Objective:
 
 
 @pytest.mark.parametrize(
-    ("pace", "due"),
+    ("speed", "due"),
     [
-        (RecordedTimes(), [0, 10, 10, 250]),
-        (RecordedTimes(speed=2), [0, 5, 5, 125]),
-        (RecordedTimes(speed=0.5), [0, 20, 20, 500]),
-        (AtOnce(), [0, 0, 0, 0]),
-        (FixedRate(hz=100), [0, 10, 20, 30]),
+        (1.0, [0, 10, 10, 250]),
+        (2.0, [0, 5, 5, 125]),
+        (0.5, [0, 20, 20, 500]),
+        (AT_ONCE, [0, 0, 0, 0]),
     ],
 )
-async def test_due_times_of_messages(pace: Pace, due: list[int]) -> None:
+async def test_due_times_of_messages(speed: float, due: list[int]) -> None:
     recorded = messages(0, 10 * MILLISECOND, 10 * MILLISECOND, 250 * MILLISECOND)
-    steps = await steps_of(recorded, pace)
+    steps = await steps_of(recorded, speed)
     assert [step.due_ns for step in steps] == [one * MILLISECOND for one in due]
     assert [step.index for step in steps] == [0, 1, 2, 3]
     assert [step.message for step in steps] == recorded
 
 
 async def test_starting_at_an_index_makes_its_message_due_at_once() -> None:
-    steps = await steps_of(messages(5, 7, 20)[1:], RecordedTimes(), first_index=1)
+    steps = await steps_of(messages(5, 7, 20)[1:], 1.0, first_index=1)
     assert [(step.index, step.due_ns) for step in steps] == [(1, 0), (2, 13)]
 
 
 async def test_starting_at_a_time_skips_earlier_messages() -> None:
     recorded = messages(0, 4, 10, 15)
-    steps = await steps_of(recorded, RecordedTimes(), start_ns=6)
+    steps = await steps_of(recorded, 1.0, start_ns=6)
     assert [(step.index, step.due_ns) for step in steps] == [(2, 4), (3, 9)]
-    steps = await steps_of(recorded, FixedRate(hz=1), start_ns=6)
-    assert [(step.index, step.due_ns) for step in steps] == [(2, 0), (3, SECOND)]
-
-
-@pytest.mark.parametrize("value", [0, -1, float("nan")])
-def test_a_pace_must_be_positive(value: float) -> None:
-    with pytest.raises(ValueError, match="must be positive"):
-        RecordedTimes(speed=value)
-    with pytest.raises(ValueError, match="must be positive"):
-        FixedRate(hz=value)
 
 
 async def test_messages_are_never_given_before_they_are_due() -> None:
     clock = WoundClock()
     begin = clock.now
     seen = []
-    async for _ in paced(given(messages(0, 10, 10, 2500)), RecordedTimes(), clock):
+    async for _ in paced(given(messages(0, 10, 10, 2500)), 1.0, clock):
         seen.append(clock.now - begin)
     assert seen == [0, 10, 10, 2500]
     assert clock.slept_until == [begin + 10, begin + 2500]
@@ -118,7 +104,7 @@ async def test_a_stall_does_not_shift_later_messages() -> None:
     clock = WoundClock()
     begin = clock.now
     seen = []
-    async for step in paced(given(messages(0, 10, 20, 30, 1000)), RecordedTimes(), clock):
+    async for step in paced(given(messages(0, 10, 20, 30, 1000)), 1.0, clock):
         seen.append(clock.now - begin)
         if step.index == 1:
             clock.now += 500
@@ -135,7 +121,7 @@ async def test_playing_at_once_yields_to_the_event_loop() -> None:
             await asyncio.sleep(0)
 
     task = asyncio.create_task(other())
-    async for _ in paced(given(messages(*range(1000))), AtOnce(), WoundClock()):
+    async for _ in paced(given(messages(*range(1000))), AT_ONCE, WoundClock()):
         pass
     task.cancel()
     assert turns > 10
@@ -144,7 +130,7 @@ async def test_playing_at_once_yields_to_the_event_loop() -> None:
 @pytest.mark.parametrize("start", [0, 1, 700, 999, 1000])
 async def test_an_objective_is_played_from_any_index(tmp_path: Path, start: int) -> None:
     it = objective(tmp_path, *(T0 + n * 100 for n in range(1000)))
-    played = [step async for step in play(it, pace=AtOnce(), start_index=start)]
+    played = [step async for step in play(it, speed=AT_ONCE, start_index=start)]
     assert [step.index for step in played] == list(range(start, 1000))
     assert [step.message for step in played] == list(it.messages())[start:]
 
@@ -159,7 +145,7 @@ async def test_an_objective_is_played_from_a_time(tmp_path: Path) -> None:
 
 async def test_playing_can_stop_at_any_message(tmp_path: Path) -> None:
     it = objective(tmp_path, *(T0 + n for n in range(2000)))
-    playing = play(it, pace=AtOnce())
+    playing = play(it, speed=AT_ONCE)
     async for step in playing:
         if step.index == 300:
             break
@@ -185,7 +171,7 @@ async def test_a_file_changed_while_playing_is_corrupt(tmp_path: Path) -> None:
     it = objective(tmp_path, *(T0 + n for n in range(2000)))
     it.path.write_bytes(it.path.read_bytes()[:3000])
     with pytest.raises(CorruptRecording):
-        async for _ in play(it, pace=AtOnce()):
+        async for _ in play(it, speed=AT_ONCE):
             pass
 
 

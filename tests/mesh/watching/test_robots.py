@@ -12,7 +12,8 @@ import pytest
 
 from mesh.errors import InputError, InvalidAddress
 from mesh.watching import RobotDirectory, robot_address
-from mesh.watching.robots import CLOCK_ERROR, LOOKUP_TIMEOUT, OLDEST
+from mesh.watching.market import CLOCK_ERROR, OLDEST
+from mesh.watching.robots import LOOKUP_TIMEOUT
 from schemas import ProfileKey, Signer
 from schemas.address import shortened
 from schemas.profiles import Profile
