@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec.structs import replace
 
-from mesh.agent.contracts import Attempt, Progress, fail_future, followed_job, report, request_stop
+from mesh.agent.contracts import Progress, fail_future, followed_job, report, request_stop
 from mesh.agent.errors import ENDED, OrderClosed, OrderExpired
 from mesh.agent.jobs import STOPPED
 from mesh.base.log_context import liability_context, log_event
@@ -187,8 +187,8 @@ class Attempts:
                 return None
             finally:
                 self.order = ""
-        if following is not None and contract.attempt is not None:
-            following.attempt, contract.attempt.following = Attempt(self), following
+        if following is not None:
+            following.attempts, contract.following = self, following
         return following
 
     async def _unless_called_off(self, doing: Coroutine[Any, Any, T]) -> T | None:

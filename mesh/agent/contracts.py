@@ -630,15 +630,6 @@ class JobAttempts(Protocol):
         """Order no more."""
 
 
-@dataclass(eq=False)
-class Attempt:
-    """What a contract is among the attempts at one job."""
-
-    attempts: JobAttempts
-    following: Contract | None = None
-    """The contract of the next attempt, after this one has failed."""
-
-
 async def request_stop(
     session: zenoh.Session, signer: Signer, liability: Liability, why: str, *, code: str | None = None
 ) -> Stopped:
@@ -681,7 +672,10 @@ class Contract:
         self._parts = parts
         self._reports = reports
         self._failure: Reason | None = None
-        self.attempt: Attempt | None = None
+        self.attempts: JobAttempts | None = None
+        """What it is one of, if its job is ordered again when it fails, or must begin in time."""
+        self.following: Contract | None = None
+        """That of the next attempt, after this one has failed."""
 
     def __repr__(self) -> str:
         liability, ended = self.liability, self._latest._ended
@@ -695,8 +689,7 @@ class Contract:
     @property
     def _latest(self) -> Contract:
         """The contract of the latest attempt."""
-        following = None if self.attempt is None else self.attempt.following
-        return self if following is None else following._latest
+        return self if self.following is None else self.following._latest
 
     @property
     def liability(self) -> Liability:
@@ -719,12 +712,12 @@ class Contract:
 
         Empty for a contract that this program has not ordered with `retry` or `start_within`.
         """
-        return "" if self.attempt is None else self.attempt.attempts.number
+        return "" if self.attempts is None else self.attempts.number
 
     @property
     def order(self) -> str:
         """The order (hash) for the next attempt at the job, after this one has failed, while it is no contract."""
-        return "" if self.attempt is None else self.attempt.attempts.order
+        return "" if self.attempts is None else self.attempts.order
 
     def recreated(self, liability: Liability) -> None:
         """It was created again after a reorganisation."""
@@ -741,9 +734,9 @@ class Contract:
 
         Of a job that failed it fetches the recording, for at most `REASON_TIMEOUT`, and reads the reason.
         """
-        if self.attempt is None:
+        if self.attempts is None:
             return await self.end(on_progress)
-        return await self.attempt.attempts.outcome(on_progress)
+        return await self.attempts.outcome(on_progress)
 
     async def end(self, on_progress: OnProgress = nothing) -> Outcome:
         """The same for this contract alone, whatever follows it."""
@@ -775,8 +768,8 @@ class Contract:
         network, which can't be stopped; `service-failed` if it refuses, or the job has ended. Raises `InputError` for
         a `why` that is too long.
         """
-        if self.attempt is not None:
-            await self.attempt.attempts.call_off()
+        if self.attempts is not None:
+            await self.attempts.call_off()
             if (ended := self._latest._ended).done() and not ended.exception() and not ended.result().success:
                 return Stopped()  # between two attempts
         return await request_stop(self._parts.network.session, self._parts.signer, self.liability, why)

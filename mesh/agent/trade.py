@@ -17,7 +17,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.agent.contracts import (
-    Attempt,
     Contract,
     Progress,
     WatchedContracts,
@@ -65,7 +64,7 @@ if TYPE_CHECKING:
     from mesh.agent.orders import Terms
     from mesh.chain import Chain
     from mesh.network import Channel
-    from schemas import Liability, Permit, Verified
+    from schemas import Liability, Verified
 
 
 log = logging.getLogger(__name__)
@@ -290,7 +289,8 @@ class Trader(Lifecycle):
         await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
         self._tasks = await stack.enter_async_context(Background())
         self.hiring = Hiring(self._parts, self._tasks, rejected=self._pair_rejected, declined=self._pair_declined)
-        self._parts.outbox.send_alone, self._parts.outbox.permit_for = self.hiring.send, self._permit_for
+        self._parts.outbox.send_alone = self.hiring.send
+        self._parts.outbox.permit_for = lambda demand: self._chain.permits.own(demand.token)
         self._send_covered(resumed)
         stack.push_async_callback(self._withdraw_at_end)
 
@@ -479,9 +479,6 @@ class Trader(Lifecycle):
         else:
             await ensure(order, costs)
 
-    def _permit_for(self, demand: Demand) -> Permit | None:
-        return self._chain.permits.own(demand.token)
-
     async def _cover_and_send(self, order: TradedOrder) -> None:
         chain = self._chain
         try:
@@ -658,8 +655,8 @@ class Trader(Lifecycle):
                     await self.taken(liability, demand_hash, order)
                 if order.created is not None and not order.created.done():
                     contract = known or self.contracts.watch(liability, order=lasts)
-                    if order.attempts is not None and contract.attempt is None:
-                        contract.attempt = Attempt(order.attempts)
+                    if order.attempts is not None and contract.attempts is None:
+                        contract.attempts = order.attempts
                         self._tasks.start(order.attempts.run(contract), f"attempts {identity}")
                     order.created.set_result(contract)
                 is_earlier = order.nonce is not None and order.identity != identity
