@@ -238,6 +238,10 @@ class Market(Lifecycle):
         agent = Agent(settings=self.settings(account.address), account=account, chain=chain, resend=RESEND)
         return await self._stack_of_people.enter_async_context(agent)
 
+    async def balance(self, agent: Agent) -> int:
+        """What an agent at work has, wn."""
+        return await agent.chain.tokens.balance(agent.address)
+
     @asynccontextmanager
     async def robot(self, agent: Agent, *, disk: int = 0) -> AsyncIterator[Agent]:
         """Put an agent to work in this market: `async with market.robot(agent)`; yields it.

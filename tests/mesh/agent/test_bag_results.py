@@ -7,27 +7,38 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh import Agent, Settings
 from mesh.base.extras import PackageMissing
 from mesh.recording import open_objective
+from mesh.testing import Market, assert_paid
 from mesh.validator.verification import Claim, JobFiles, verify
 from schemas import Empty, String, cid_of_file
 from tests.support.bags import Bag, BagMessage
 from tests.support.log_events import logged_facts
-from tests.support.market import Place, offering
-from tests.support.objectives import objective
+from tests.support.market import MODEL, offering
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.agent.agent import Agent
     from mesh.agent.handlers import Job
 
 BAG = Bag([BagMessage("/blink", String(word).encode(), at) for at, word in enumerate(("red", "blue"), 1)]).encode()
 
 
-def blinking(place: Place, says: Any = "on", **options: Any) -> Agent:
+@pytest.fixture
+def task(tmp_path: Path) -> Path:
+    path = tmp_path / "objective.bag"
+    path.write_bytes(BAG)
+    return path
+
+
+def answering() -> Agent:
+    return offering(Agent(MODEL, settings=Settings(bag_results=True)))
+
+
+def blinking(says: Any = "on") -> Agent:
     """A robot that says something on /led for each message."""
-    robot = offering(place.agent("robot", bag_results=True, **options))
+    robot = answering()
 
     @robot.on("/blink")
     async def blink(job: Job, _message: Any) -> None:
@@ -41,15 +52,14 @@ def said(path: Path) -> list[tuple[str, Any]]:
     return [(one.topic, one.value) for one in open_objective(path).messages()]
 
 
-async def test_a_bag_is_answered_with_a_bag_that_shows_the_job(place: Place) -> None:
+async def test_a_bag_is_answered_with_a_bag_that_shows_the_job(market: Market, task: Path) -> None:
     """Its topics are named as the legacy software names them, so that it passes the checks of a bag."""
-    robot = blinking(place)
-    async with place.at_work(robot) as person:
-        task = place.save(BAG, "objective.bag")
-        contract = await person.demand(task, cost=42)
-        outcome = await contract.outcome()
+    robot = blinking()
+    async with market.robot(robot):
+        contract = await market.demand(MODEL, task, cost=42)
+        outcome = await market.outcome(contract)
         result = await contract.recording()
-        assert outcome.success
+        assert_paid(outcome)
         assert open_objective(result).format == "bag"
         below = f"/liability/eth_{contract.address}"
         assert sorted(said(result)) == [
@@ -65,13 +75,15 @@ async def test_a_bag_is_answered_with_a_bag_that_shows_the_job(place: Place) -> 
         assert not list(robot.parts.recordings.iterdir())
 
 
-async def test_the_recording_stays_in_the_store_as_it_was_made(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+async def test_the_recording_stays_in_the_store_as_it_was_made(
+    market: Market, task: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """The log names it: it has what a bag can't hold, such as who sent a message."""
     caplog.set_level("INFO")
-    robot = blinking(place)
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(BAG, "objective.bag"))
-        outcome = await contract.outcome()
+    robot = blinking()
+    async with market.robot(robot):
+        person = await market.person()
+        outcome = await market.order(MODEL, task, by=person)
         (facts,) = logged_facts(caplog, "job-finished")
         assert facts["result"] == outcome.result != facts["recording"]
         recording = open_objective(await person.fetch(facts["recording"]))
@@ -81,36 +93,35 @@ async def test_the_recording_stays_in_the_store_as_it_was_made(place: Place, cap
 
 @pytest.mark.parametrize("is_bag", [True, False])
 async def test_other_jobs_are_answered_with_the_recording(
-    place: Place, caplog: pytest.LogCaptureFixture, is_bag: bool
+    market: Market, task: Path, caplog: pytest.LogCaptureFixture, is_bag: bool
 ) -> None:
     """Those with an MCAP objective; and those in which a message is none of ROS, which a bag can't hold."""
-    robot = blinking(place, {"lamp": "on"} if is_bag else "on")
-    content = BAG if is_bag else objective(("/blink", Empty()))
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(content))
-        assert (await contract.outcome()).success
+    robot = blinking({"lamp": "on"} if is_bag else "on")
+    async with market.robot(robot):
+        contract = await market.demand(MODEL, task if is_bag else [("/blink", Empty())])
+        assert_paid(await market.outcome(contract))
         assert open_objective(await contract.recording()).format == "mcap"
     codes = [facts["code"] for facts in logged_facts(caplog, "result-not-a-bag")]
     assert codes == (["unconvertible"] if is_bag else [])
 
 
-async def test_the_reason_of_a_failed_job_is_read_from_its_bag(place: Place) -> None:
-    robot = offering(place.agent("robot", bag_results=True))
+async def test_the_reason_of_a_failed_job_is_read_from_its_bag(market: Market, task: Path) -> None:
+    robot = answering()
 
     @robot.on("/blink")
     async def blink(job: Job, _message: Any) -> None:
         raise ValueError("the lamp is broken")
 
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(BAG, "objective.bag"))
-        outcome = await contract.outcome()
+    async with market.robot(robot):
+        contract = await market.demand(MODEL, task)
+        outcome = await market.outcome(contract)
         assert open_objective(await contract.recording()).format == "bag"
     assert (outcome.success, outcome.code) == (False, "handler-failed")
     assert "the lamp is broken" in outcome.reason
 
 
-async def test_what_a_killed_run_left_of_a_bag_is_replaced(place: Place) -> None:
-    robot = offering(place.agent("robot", bag_results=True))
+async def test_what_a_killed_run_left_of_a_bag_is_replaced(market: Market, task: Path) -> None:
+    robot = answering()
 
     @robot.on("/blink")
     async def blink(job: Job, _message: Any) -> None:
@@ -118,19 +129,19 @@ async def test_what_a_killed_run_left_of_a_bag_is_replaced(place: Place) -> None
         left.mkdir(exist_ok=True)
         (left / "result.bag").write_bytes(BAG[:1000])
 
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(BAG, "objective.bag"))
-        assert (await contract.outcome()).success
+    async with market.robot(robot):
+        contract = await market.demand(MODEL, task)
+        assert_paid(await market.outcome(contract))
         assert len(said(await contract.recording())) == 2
         assert not list(robot.parts.recordings.iterdir())
 
 
 async def test_an_agent_does_not_start_without_the_package_that_makes_bags(
-    place: Place, monkeypatch: pytest.MonkeyPatch
+    market: Market, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It would find out at the end of its first job."""
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
     with pytest.raises(PackageMissing) as caught:
-        async with place.agent("robot", bag_results=True):
+        async with market.robot(answering()):
             pass
     assert caught.value.extra == "ros"

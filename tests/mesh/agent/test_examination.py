@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec import Struct
 
+from mesh import Agent, Settings
 from mesh.agent.objectives import ObjectiveUnfit
 from mesh.content import ContentUnavailable
+from mesh.testing import Market, assert_paid
 from schemas import Empty, cid_of_bytes, cid_of_file
-from tests.support.market import Place, offering
+from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from mesh.agent.agent import Agent
     from mesh.agent.handlers import Job
 
 
@@ -47,54 +48,55 @@ def going(robot: Agent) -> Agent:
 
 
 async def test_no_offer_is_made_for_an_objective_that_can_not_be_played(
-    place: Place, caplog: pytest.LogCaptureFixture
+    market: Market, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    robot = going(offering(place.agent("robot")))
-    async with place.at_work(robot) as person:
-        unfit = asyncio.create_task(person.demand(place.save(objective(("/fly", Empty())), "unfit.mcap"), wait=True))
+    robot = going(offering(Agent(MODEL)))
+    async with market.robot(robot):
+        person = await market.person()
+        unfit = asyncio.create_task(person.demand([("/fly", Empty())], model=MODEL, wait=True))
         await until(lambda: refused_offers(caplog), seconds=30)
         assert {error.reason for error in refused_offers(caplog)} == {"unknown-topic"}
         assert "/fly" in str(refused_offers(caplog)[0])
-        fit = await person.demand(place.save(objective(("/go", Empty()))))
-        assert (await fit.outcome()).success
+        assert_paid(await market.order(MODEL, [("/go", Empty())]))
         assert not unfit.done()
         unfit.cancel()
 
 
 async def test_no_offer_is_made_for_a_message_that_its_handler_can_not_take(
-    place: Place, caplog: pytest.LogCaptureFixture
+    market: Market, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    robot = offering(place.agent("robot"))
+    robot = offering(Agent(MODEL))
     speeds: list[Speed] = []
 
     @robot.on("/go", Speed)
     async def go(job: Job, speed: Speed) -> None:
         speeds.append(speed)
 
-    async with place.at_work(robot) as person:
-        said = objective(("/go", Speed(1.0)), ("/go", {"metres_per_second": "fast"}))
-        unfit = asyncio.create_task(person.demand(place.save(said, "unfit.mcap"), wait=True))
+    async with market.robot(robot):
+        said = [("/go", Speed(1.0)), ("/go", {"metres_per_second": "fast"})]
+        person = await market.person()
+        unfit = asyncio.create_task(person.demand(said, model=MODEL, wait=True))
         await until(lambda: refused_offers(caplog), seconds=30)
         assert {error.reason for error in refused_offers(caplog)} == {"unfit-message"}
         assert "not a Speed" in str(refused_offers(caplog)[0])
-        fit = await person.demand(place.save(objective(("/go", Speed(2.0)))))
-        assert (await fit.outcome()).success
+        assert_paid(await market.order(MODEL, [("/go", Speed(2.0))]))
         assert speeds == [Speed(2.0)]
         assert not unfit.done()
         unfit.cancel()
 
 
-async def test_demands_with_unavailable_objectives_do_not_delay_others(place: Place) -> None:
-    robot = going(offering(place.agent("robot", fetch_timeout=60.0)))
-    async with place.at_work(robot) as person, asyncio.timeout(50):
+async def test_demands_with_unavailable_objectives_do_not_delay_others(market: Market) -> None:
+    robot = going(offering(Agent(MODEL, settings=Settings(fetch_timeout=60.0))))
+    async with market.robot(robot), asyncio.timeout(50):
+        person = await market.person()
         missing = [
-            asyncio.create_task(person.demand(cid_of_bytes(b"nobody has objective %d" % number))) for number in range(5)
+            asyncio.create_task(person.demand(cid_of_bytes(b"nobody has objective %d" % number), model=MODEL))
+            for number in range(5)
         ]
         await until(lambda: len(person.orders()) == 5, seconds=30)
-        fit = await person.demand(place.save(objective(("/go", Empty()))))
-        assert (await fit.outcome()).success
+        assert_paid(await market.order(MODEL, [("/go", Empty())], by=person))
         for task in missing:
             assert not task.done()
             task.cancel()

@@ -5,22 +5,27 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+from mesh import Agent, Settings
 from mesh.agent.ledger import Phase
+from mesh.testing import assert_paid, assert_refunded
 from schemas import Empty, String, cid_of_file
 from tests.mesh.agent.executions import COST, doing_nothing, heard, recorded
-from tests.support.market import Place, offering
+from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import MILLISECOND, objective, timed
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.agent.handlers import Job
-    from mesh.recording import Played
+    from mesh.testing import Market
     from schemas import Liability
 
 
-async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_paid(place: Place) -> None:
-    robot = offering(place.agent("robot"))
-    done: list[object] = []
+async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_paid(
+    market: Market, tmp_path: Path
+) -> None:
+    robot, done = offering(Agent(MODEL)), list[object]()
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
@@ -30,35 +35,37 @@ async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_
     async def anything(job: Job, message: Any) -> None:
         done.append((job.playing.topic if job.playing else "", message))
 
-    path = place.save(objective(("/go", Empty()), ("/say", "hi"), ("/go", {"speed": 2}), ("/raw", b"\x01\x02")))
-    async with place.at_work(robot) as person:
-        before = await place.balance("robot"), await place.balance("person")
-        contract = await person.demand(path, cost=COST)
-        outcome = await contract.outcome()
-        assert outcome.success
+    path = tmp_path / "objective.mcap"
+    path.write_bytes(objective(("/go", Empty()), ("/say", "hi"), ("/go", {"speed": 2}), ("/raw", b"\x01\x02")))
+    async with market.robot(robot):
+        person = await market.person()
+        before = await market.balance(robot), await market.balance(person)
+        contract = await market.demand(MODEL, path, by=person, cost=COST)
+        outcome = await market.outcome(contract)
+        assert_paid(outcome)
         assert done == [Empty(), ("/say", String("hi")), {"speed": 2}, ("/raw", b"\x01\x02")]
-        assert await place.balance("robot") == before[0] + COST
-        assert await place.balance("person") == before[1] - COST
+        assert await market.balance(robot) == before[0] + COST
+        assert await market.balance(person) == before[1] - COST
         assert contract.liability.objective == cid_of_file(path)
         assert cid_of_file(await contract.recording()) == outcome.result
 
 
-async def test_the_recording_holds_the_played_messages_and_those_of_the_handler(place: Place) -> None:
-    robot = offering(place.agent("robot"))
+async def test_the_recording_holds_the_played_messages_and_those_of_the_handler(market: Market) -> None:
+    robot = offering(Agent(MODEL))
 
     @robot.on("/go")
     async def go(job: Job, message: String) -> None:
         job.publish("/done", f"did {message.data}")
 
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(objective(("/go", "one"), ("/go", "two"))))
+    async with market.robot(robot):
+        contract = await market.demand(MODEL, [("/go", "one"), ("/go", "two")])
         recording = await recorded(contract)
-    assert heard(recording, "/go") == [String("one").encode(), String("two").encode()]
-    assert heard(recording, "/done") == [String("did one").encode(), String("did two").encode()]
-    about = recording.metadata["aira"]
-    assert about["liability"] == contract.address
-    assert about["agent"] == place.address("robot")
-    assert about["objective"] == contract.liability.objective
+        assert heard(recording, "/go") == [String("one").encode(), String("two").encode()]
+        assert heard(recording, "/done") == [String("did one").encode(), String("did two").encode()]
+        about = recording.metadata["aira"]
+        assert about["liability"] == contract.address
+        assert about["agent"] == robot.address
+        assert about["objective"] == contract.liability.objective
 
 
 async def test_messages_are_played_at_their_recorded_times(place: Place) -> None:
@@ -90,10 +97,8 @@ async def test_at_once_means_without_waiting_for_recorded_times(place: Place) ->
         assert (await (await person.demand(path)).outcome()).success
 
 
-async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
-    robot = offering(place.agent("robot"))
-    begun: list[str] = []
-    release = asyncio.Event()
+async def test_jobs_are_done_one_after_the_other(market: Market) -> None:
+    robot, begun, release = offering(Agent(MODEL)), list[str](), asyncio.Event()
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
@@ -103,29 +108,29 @@ async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
     async def others_are_ready() -> bool:
         return len(await robot.parts.ledger.jobs((Phase.READY,))) == 2
 
-    path = place.save(objective(("/go", Empty()), ("/go", Empty())))
-    async with place.at_work(robot) as person:
-        contracts = await asyncio.gather(*(person.demand(path, cost=cost) for cost in (1, 2, 3)))
+    async with market.robot(robot):
+        person, work = await market.person(), [("/go", Empty()), ("/go", Empty())]
+        contracts = await asyncio.gather(*(market.demand(MODEL, work, by=person, cost=cost) for cost in (1, 2, 3)))
         await until(lambda: begun)
         await until_found(others_are_ready)
         assert len(begun) == 1
         release.set()
-        outcomes = await asyncio.gather(*(contract.outcome() for contract in contracts))
-    assert [outcome.success for outcome in outcomes] == [True] * 3
+        for contract in contracts:
+            assert_paid(await market.outcome(contract))
     assert begun[0::2] == begun[1::2], "both messages of a job before any of the next"
 
 
-async def test_phase_handlers_get_every_phase_in_order_with_its_record(place: Place) -> None:
-    robot = doing_nothing(offering(place.agent("robot")))
+async def test_phase_handlers_get_every_phase_in_order_with_its_record(market: Market) -> None:
+    robot = doing_nothing(offering(Agent(MODEL)))
     seen: list[tuple[Phase, Liability]] = []
 
     @robot.on_liability
     async def phase(phase: Phase, liability: Liability) -> None:
         seen.append((phase, liability))
 
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(objective(("/go", Empty()))), cost=COST)
-        outcome = await contract.outcome()
+    async with market.robot(robot):
+        contract = await market.demand(MODEL, [("/go", Empty())], cost=COST)
+        outcome = await market.outcome(contract)
         await until(lambda: len(seen) == 5)
     assert [phase for phase, _ in seen] == list(Phase)
     assert {liability.address for _, liability in seen} == {contract.address}
@@ -134,94 +139,90 @@ async def test_phase_handlers_get_every_phase_in_order_with_its_record(place: Pl
     assert (finalized.result, finalized.is_success, finalized.is_finalized) == (outcome.result, True, True)
 
 
-async def test_a_handler_may_end_its_own_job(place: Place) -> None:
-    robot = offering(place.agent("robot"))
-    done: list[str] = []
+async def test_a_handler_may_end_its_own_job(market: Market) -> None:
+    robot, done = offering(Agent(MODEL)), list[str]()
 
     @robot.on("/go")
     async def go(job: Job, message: String) -> None:
         cid = await robot.finish(job.liability.address, success=False)
         done.append(f"{message.data} {cid}")
 
-    async with place.at_work(robot) as person, asyncio.timeout(60):
-        contract = await person.demand(place.save(objective(*(("/go", str(n)) for n in range(50)), step_ns=0)))
-        outcome = await contract.outcome()
-        assert not outcome.success
+    async with market.robot(robot):
+        outcome = await market.order(MODEL, [("/go", str(number)) for number in range(50)])
+        assert_refunded(outcome)
         await until(lambda: done)
-        second = await person.demand(place.save(objective(("/go", "again")), "second.mcap"))
-        await second.outcome()
+        assert_refunded(await market.order(MODEL, [("/go", "again")]))
         await until(lambda: len(done) == 2)
     assert done[0] == f"0 {outcome.result}"
     assert len(done) == 2, "nothing is played after the end"
 
 
-async def test_a_phase_handler_may_end_the_job_that_has_just_started(place: Place) -> None:
-    robot = doing_nothing(offering(place.agent("robot")))
+async def test_a_phase_handler_may_end_the_job_that_has_just_started(market: Market) -> None:
+    robot = doing_nothing(offering(Agent(MODEL)))
 
     @robot.on_liability
     async def phase(phase: Phase, liability: Liability) -> None:
         if phase is Phase.RUNNING:
             await robot.finish(liability.address, success=False)
 
-    async with place.at_work(robot) as person, asyncio.timeout(60):
-        contract = await person.demand(place.save(objective(("/go", Empty()))))
-        assert not (await contract.outcome()).success
+    async with market.robot(robot):
+        assert_refunded(await market.order(MODEL, [("/go", Empty())]))
 
 
-async def test_only_the_chosen_topics_are_recorded(place: Place) -> None:
-    robot = offering(place.agent("robot", recording_topics="/go, /led"))
+async def test_only_the_chosen_topics_are_recorded(market: Market) -> None:
+    robot = offering(Agent(MODEL, settings=Settings(recording_topics="/go, /led")))
 
     @robot.on("*")
     async def anything(job: Job, message: Any) -> None:
         job.publish("/led", "on")
         job.publish("/camera", b"a picture")
 
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(objective(("/go", Empty()), ("/quietly", Empty()))))
-        recording = await recorded(contract)
-    assert {topic.name for topic in recording.topics} == {"/go", "/led"}
+    async with market.robot(robot):
+        contract = await market.demand(MODEL, [("/go", Empty()), ("/quietly", Empty())])
+        assert {topic.name for topic in (await recorded(contract)).topics} == {"/go", "/led"}
 
 
-async def test_an_agent_without_executor_does_no_jobs(place: Place) -> None:
-    robot = doing_nothing(offering(place.agent("robot", enable_executor=False)))
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(objective(("/go", Empty()))))
-        head = await place.chains["robot"].block_number()
+async def test_an_agent_without_executor_does_no_jobs(market: Market) -> None:
+    robot = doing_nothing(offering(Agent(MODEL, settings=Settings(enable_executor=False))))
+    async with market.robot(robot):
+        contract = await market.demand(MODEL, [("/go", Empty())])
+        head = await robot.chain.block_number()
         await until(lambda: robot.parts.chain_head.head >= head)
         assert [job.phase for job in await robot.parts.ledger.jobs()] == [Phase.INCOMING]
-        assert not (await place.chains["person"].liabilities.get(contract.address)).is_finalized
+        assert not (await robot.chain.liabilities.get(contract.address)).is_finalized
 
 
-async def test_played_messages_are_on_the_mesh(place: Place) -> None:
-    robot = doing_nothing(offering(place.agent("robot")))
-    played: list[tuple[str, bytes, str]] = []
-    async with place.at_work(robot) as person:
-        listener: Any = person.parts.network.session.declare_subscriber(
-            f"aira/agent/{place.address('robot').lower()}/liability/*/objective/**",
+async def test_played_messages_are_on_the_mesh(market: Market) -> None:
+    robot, played = doing_nothing(offering(Agent(MODEL))), list[tuple[str, bytes, str]]()
+    async with market.robot(robot):
+        person = await market.person()
+        listener: Any = person.network.session.declare_subscriber(
+            f"aira/agent/{robot.address.lower()}/liability/*/objective/**",
             lambda sample: played.append(
                 (str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)),
             ),
         )
-        contract = await person.demand(place.save(objective(("/arm/left", "up"), ("/arm/left", "down"))))
-        await contract.outcome()
+        contract = await market.demand(MODEL, [("/arm/left", "up"), ("/arm/left", "down")], by=person)
+        await market.outcome(contract)
         await until(lambda: len(played) == 2)
         listener.undeclare()
-    key = f"aira/agent/{place.address('robot').lower()}/liability/{contract.address.lower()}/objective/arm/left"
+        key = f"aira/agent/{robot.address.lower()}/liability/{contract.address.lower()}/objective/arm/left"
     assert played == [(key, String(word).encode(), "ros1;std_msgs/String") for word in ("up", "down")]
 
 
-async def test_a_burst_of_played_messages_is_recorded_whole_and_heard_in_order(place: Place) -> None:
+async def test_a_burst_of_played_messages_is_recorded_whole_and_heard_in_order(market: Market, tmp_path: Path) -> None:
     """Who listens on the mesh may miss messages of a burst, since Zenoh drops some; the recording misses none."""
-    robot = doing_nothing(offering(place.agent("robot")))
-    heard_by_listener: list[bytes] = []
+    robot, heard_by_listener = doing_nothing(offering(Agent(MODEL))), list[bytes]()
     words = [String(str(number)).encode() for number in range(500)]
-    async with place.at_work(robot) as person:
-        listener: Any = person.parts.network.session.declare_subscriber(
-            f"aira/agent/{place.address('robot').lower()}/liability/*/objective/say",
+    path = tmp_path / "objective.mcap"
+    path.write_bytes(timed([("/say", String.decode(word), 0) for word in words]))
+    async with market.robot(robot):
+        person = await market.person()
+        listener: Any = person.network.session.declare_subscriber(
+            f"aira/agent/{robot.address.lower()}/liability/*/objective/say",
             lambda sample: heard_by_listener.append(sample.payload.to_bytes()),
         )
-        contract = await person.demand(place.save(timed([("/say", String.decode(word), 0) for word in words])))
-        recording = await recorded(contract)
+        recording = await recorded(await market.demand(MODEL, path, by=person))
         await until(lambda: heard_by_listener)
         listener.undeclare()
     assert heard(recording, "/say") == words
@@ -229,15 +230,11 @@ async def test_a_burst_of_played_messages_is_recorded_whole_and_heard_in_order(p
     assert positions == sorted(set(positions))
 
 
-async def test_a_late_device_message_of_a_played_topic_keeps_its_role(place: Place) -> None:
+async def test_a_late_device_message_of_a_played_topic_keeps_its_role(market: Market) -> None:
     """The recording distinguishes played messages from device messages of the same topic."""
-    robot = offering(place.agent("robot"))
-
-    @robot.on("/go")
-    async def go(job: Job, message: Any) -> None:
-        job.publish("/go", "gone")
-
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(objective(("/go", "go"))))
-        messages: list[Played] = list((await recorded(contract)).messages())
-    assert [String.decode(message.payload).data for message in messages] == ["go", "gone"]
+    robot = offering(Agent(MODEL))
+    robot.on("/go")(lambda job, message: job.publish("/go", "gone"))
+    async with market.robot(robot):
+        outcome = await market.order(MODEL, [("/go", "go")])
+    said = [(message.role, String.decode(message.payload).data) for message in outcome.recording.messages]
+    assert said == [("objective", "go"), ("device", "gone")]

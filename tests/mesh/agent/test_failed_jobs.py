@@ -7,25 +7,26 @@ import logging
 import os
 import sqlite3
 from contextlib import closing
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 
+from mesh import Agent, Settings
 from mesh.agent.handlers import JobFailed
 from mesh.agent.ledger import Phase
 from mesh.recording import NOTE_TOPIC
 from mesh.role.database import LedgerUnusable
 from mesh.role.running import cause_of
+from mesh.testing import Market, assert_paid, assert_refunded
 from schemas import Empty, String, cid_of_bytes
 from tests.mesh.agent.executions import COST, doing_nothing, heard, recorded
-from tests.support.market import Place, offering, offering_unseen
+from tests.support.market import MODEL, Place, offering, offering_unseen
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from mesh.agent.agent import Agent
+    from mesh.agent.agent import Messages
     from mesh.agent.handlers import Job
     from mesh.recording import Objective
 
@@ -40,17 +41,18 @@ def notes(recording: Objective) -> list[str]:
     return [String.decode(payload).data for payload in heard(recording, NOTE_TOPIC)]
 
 
-async def refusal(place: Place, robot: Agent, content: bytes | str, **terms: Any) -> tuple[str, str]:
+async def refusal(market: Market, robot: Agent, content: Messages | str | Path) -> tuple[str, str]:
     """Have a robot fail at an objective: its note in the ledger and in the recording. The money must come back."""
-    async with place.at_work(robot) as person:
-        before = await place.balance("robot"), await place.balance("person")
-        source = await person.add(place.save(content)) if isinstance(content, bytes) else content
-        contract = await person.demand(source, cost=COST, **terms)
-        outcome = await contract.outcome()
-        assert not outcome.success
+    async with market.robot(robot):
+        person = await market.person()
+        before = await market.balance(robot), await market.balance(person)
+        source = await person.add(content) if isinstance(content, Path) else content
+        contract = await market.demand(MODEL, source, by=person, cost=COST)
+        outcome = await market.outcome(contract)
+        assert_refunded(outcome)
         assert outcome.reason
         assert outcome.code
-        assert (await place.balance("robot"), await place.balance("person")) == before
+        assert (await market.balance(robot), await market.balance(person)) == before
         job = await robot.parts.ledger.job(contract.address)
         assert job is not None
         assert job.success is False
@@ -68,9 +70,9 @@ async def refusal(place: Place, robot: Agent, content: bytes | str, **terms: Any
     ids=["JobFailed", "ValueError"],
 )
 async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(
-    place: Place, error: Exception, said: str
+    market: Market, error: Exception, said: str
 ) -> None:
-    robot = offering(place.agent("robot"))
+    robot = offering(Agent(MODEL))
     calls = 0
 
     @robot.on("/go")
@@ -79,13 +81,13 @@ async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(
         calls += 1
         raise error
 
-    note, recorded_note = await refusal(place, robot, objective(("/go", Empty()), ("/go", Empty())))
+    note, recorded_note = await refusal(market, robot, [("/go", Empty()), ("/go", Empty())])
     assert note == recorded_note == said
     assert calls == 1
 
 
-async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(place: Place) -> None:
-    robot = offering(place.agent("robot"))
+async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(market: Market) -> None:
+    robot = offering(Agent(MODEL))
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
@@ -93,77 +95,78 @@ async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(pla
         inner.cancel()
         await inner
 
-    note, _ = await refusal(place, robot, objective(("/go", Empty())))
+    note, _ = await refusal(market, robot, [("/go", Empty())])
     assert note == "the handler of /go was cancelled [handler-cancelled]"
 
 
-async def test_a_message_of_another_type_than_the_handlers_is_refused_before_anything_is_played(place: Place) -> None:
-    robot = offering_unseen(place.agent("robot"))
+async def test_a_message_of_another_type_than_the_handlers_is_refused_before_anything_is_played(market: Market) -> None:
+    robot = offering_unseen(Agent(MODEL))
     speeds: list[Speed] = []
 
     @robot.on("/go", Speed)
     async def go(job: Job, message: Speed) -> None:
         speeds.append(message)
 
-    note, _ = await refusal(place, robot, objective(("/go", Speed(3)), ("/go", {"wheel": "fast"})))
+    note, _ = await refusal(market, robot, [("/go", Speed(3)), ("/go", {"wheel": "fast"})])
     assert "(unfit-message): message 1 on /go: not a Speed" in note
     assert speeds == []
 
 
-async def test_a_topic_without_handler_is_refused_before_anything_is_played(place: Place) -> None:
-    robot = offering_unseen(place.agent("robot"))
+async def test_a_topic_without_handler_is_refused_before_anything_is_played(market: Market) -> None:
+    robot = offering_unseen(Agent(MODEL))
     done: list[object] = []
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
         done.append(message)
 
-    note, _ = await refusal(place, robot, objective(("/go", Empty()), ("/fly", Empty())))
+    note, _ = await refusal(market, robot, [("/go", Empty()), ("/fly", Empty())])
     assert "unknown-topic" in note
     assert "/fly" in note
     assert done == []
 
 
-async def test_a_file_that_is_not_a_recording_is_refused(place: Place) -> None:
-    note, _ = await refusal(place, doing_nothing(offering_unseen(place.agent("robot"))), b"please go to the kitchen\n")
+async def test_a_file_that_is_not_a_recording_is_refused(market: Market, tmp_path: Path) -> None:
+    (tmp_path / "objective.mcap").write_bytes(b"please go to the kitchen\n")
+    robot = doing_nothing(offering_unseen(Agent(MODEL)))
+    note, _ = await refusal(market, robot, tmp_path / "objective.mcap")
     assert "not-a-recording" in note
 
 
-async def test_a_job_whose_objective_is_unavailable_fails_and_is_refunded(place: Place) -> None:
-    robot = doing_nothing(offering_unseen(place.agent("robot", fetch_timeout=0.2)))
-    note, _ = await refusal(place, robot, cid_of_bytes(b"held by nobody"))
+async def test_a_job_whose_objective_is_unavailable_fails_and_is_refunded(market: Market) -> None:
+    robot = doing_nothing(offering_unseen(Agent(MODEL, settings=Settings(fetch_timeout=0.2))))
+    note, _ = await refusal(market, robot, cid_of_bytes(b"held by nobody"))
     assert "is not available" in note
 
 
-async def test_an_objective_over_the_size_limit_is_refused(place: Place) -> None:
-    robot = doing_nothing(offering_unseen(place.agent("robot", objective_size_limit=2000)))
-    note, _ = await refusal(place, robot, objective(("/blob", os.urandom(4000))))
+async def test_an_objective_over_the_size_limit_is_refused(market: Market) -> None:
+    robot = doing_nothing(offering_unseen(Agent(MODEL, settings=Settings(objective_size_limit=2000))))
+    note, _ = await refusal(market, robot, [("/blob", os.urandom(4000))])
     assert "2000 allowed" in note
 
 
-async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place: Place) -> None:
-    robot = doing_nothing(offering_unseen(place.agent("robot", fetch_timeout=120.0)))
-    async with place.at_work(robot) as person, asyncio.timeout(60):
-        missing = await person.demand(cid_of_bytes(b"nobody has this"))
-        good = await person.demand(place.save(objective(("/go", Empty()))))
-        assert (await good.outcome()).success
+async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(market: Market) -> None:
+    robot = doing_nothing(offering_unseen(Agent(MODEL, settings=Settings(fetch_timeout=120.0))))
+    async with market.robot(robot):
+        missing = await market.demand(MODEL, cid_of_bytes(b"nobody has this"))
+        assert_paid(await market.order(MODEL, [("/go", Empty())]))
         job = await robot.parts.ledger.job(missing.address)
         assert job is not None
         assert job.phase is Phase.INCOMING
 
 
 async def test_a_job_failed_by_its_handler_is_logged_without_a_traceback(
-    place: Place, caplog: pytest.LogCaptureFixture
+    market: Market, caplog: pytest.LogCaptureFixture
 ) -> None:
-    robot = offering(place.agent("robot"))
+    robot = offering(Agent(MODEL))
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
         raise JobFailed("the battery is empty")
 
     with caplog.at_level(logging.WARNING, "mesh.agent"):
-        async with place.at_work(robot) as person:
-            await (await person.demand(place.save(objective(("/go", Empty()))))).outcome()
+        async with market.robot(robot):
+            await market.order(MODEL, [("/go", Empty())])
     (record,) = [record for record in caplog.records if vars(record).get("event") == "job-failed"]
     assert vars(record)["facts"] == {"code": "job-failed"}
     assert "the battery is empty" in record.getMessage()

@@ -51,21 +51,17 @@ def forklift() -> Forklift:
     return Forklift()
 
 
-async def xrt_of(agent: Agent) -> int:
-    return await agent.chain.tokens.balance(agent.address)
-
-
 async def test_a_job_is_paid_and_its_recording_is_at_hand(market: Market, forklift: Forklift) -> None:
     async with market.robot(forklift):
-        person, before = await market.person(), await xrt_of(forklift)
+        person, before = await market.person(), await market.balance(forklift)
         outcome = await market.order(forklift, [("/lift", 1.5), ("/lift", 2.0)], by=person, cost="5 XRT")
 
         assert_paid(outcome)
         assert outcome.recording.values("/height") == [1.5, 2.0]
         assert outcome.recording.published == [("/height", 1.5), ("/height", 2.0)]
         assert outcome.robot == forklift.address
-        assert await xrt_of(forklift) == before + XRT.parse("5 XRT")
-        assert await xrt_of(person) == XRT.parse("995 XRT")
+        assert await market.balance(forklift) == before + XRT.parse("5 XRT")
+        assert await market.balance(person) == XRT.parse("995 XRT")
 
 
 async def test_a_failed_job_and_a_declined_one_say_why(market: Market, forklift: Forklift) -> None:
@@ -105,7 +101,7 @@ async def test_markets_that_follow_each_other_know_nothing_of_each_other(
     for _ in range(2):
         async with Market(market_chain) as market, market.robot(forklift):
             assert_paid(await market.order(forklift, [("/lift", 1.0)], cost=PRICE))
-            seen.append((market.lighthouse, market.endpoint, forklift.address, await xrt_of(forklift)))
+            seen.append((market.lighthouse, market.endpoint, forklift.address, await market.balance(forklift)))
     (first, second) = seen
     assert not set(first[:3]) & set(second[:3])
     assert first[3] == second[3] == XRT.parse("1003 XRT")
@@ -133,7 +129,7 @@ async def test_a_killed_robot_goes_on_where_it_was_and_is_paid_once(market: Mark
     async with market.robot(forklift):
         contract = await market.demand(forklift, [("/lift", 1.0), ("/lift", 0.0)], cost=PRICE)
         await market.running(contract)
-        address, before = forklift.address, await xrt_of(forklift)
+        address, before = forklift.address, await market.balance(forklift)
         await market.kill(forklift)
         assert not forklift.is_open
         with pytest.raises(AiraError) as caught:
@@ -143,7 +139,7 @@ async def test_a_killed_robot_goes_on_where_it_was_and_is_paid_once(market: Mark
         forklift.released.set()
         await market.restart(forklift)
         assert_paid(await market.outcome(contract))
-        assert (forklift.address, await xrt_of(forklift)) == (address, before + PRICE)
+        assert (forklift.address, await market.balance(forklift)) == (address, before + PRICE)
 
 
 async def test_a_killed_robot_says_nothing_more(market: Market) -> None:
@@ -170,13 +166,13 @@ async def test_a_contract_that_a_reorganisation_reverts_is_made_again_and_paid_o
     market: Market, forklift: Forklift
 ) -> None:
     async with market.robot(forklift):
-        before = await xrt_of(forklift)
+        before = await market.balance(forklift)
         contract = await market.demand(forklift, [("/lift", 0.0)], cost=PRICE)
         await market.running(contract)
         await market.reorg(1)
         forklift.released.set()
         assert_paid(await market.outcome(contract))
-        assert await xrt_of(forklift) == before + PRICE
+        assert await market.balance(forklift) == before + PRICE
 
 
 async def test_a_reorganisation_can_not_take_the_market_away(market: Market) -> None:
@@ -223,7 +219,7 @@ async def test_a_job_that_ends_without_a_node_is_paid_when_the_node_is_back(mark
         await market.running(contract)
         async with market.node_down():
             with pytest.raises(NodeUnreachable):
-                await xrt_of(forklift)
+                await market.balance(forklift)
             forklift.released.set()
         assert_paid(await market.outcome(contract))
 
