@@ -981,8 +981,11 @@ class Signer(Lifecycle):
         return protocol.PolicyInUse(hash=self.policy.hash, words=self.policy.words(), since=time_text(self.since))
 
     async def _do_use_policy(self, asked: protocol.UsePolicy) -> protocol.PolicyInUse:
-        data = await asyncio.to_thread(read_policy_file, self._policy_path)
-        self.policy = parse_policy(data, unit=self._unit, name=self._policy_path.name)
+        try:
+            data = await asyncio.to_thread(read_policy_file, self._policy_path)
+            self.policy = parse_policy(data, unit=self._unit, name=self._policy_path.name)
+        except ConfigurationError as error:
+            raise SignerError(str(error), hint=error.hint, code=error.code) from None
         self.budget.trust_clock()
         self.since = self.budget.now()
         self.log.add("policy-used", policy=self.policy.hash)

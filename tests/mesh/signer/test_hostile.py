@@ -148,11 +148,17 @@ async def test_a_policy_that_was_swapped_counts_only_when_the_owner_says_so(pers
             await door.order(model=driver.model, messages=[GOOD], cost="8 XRT", idempotency_key="k")
         assert caught.value.code == "too-expensive"
         person.policy.chmod(0o666)
-        with pytest.raises(SignerError) as caught:
+        with pytest.raises(SignerError, match="others may write to it") as caught:
             await owner.use_policy()
-        assert caught.value.code == "policy-unsafe"
-        assert (await owner.policy()).hash == before.hash
+        assert (caught.value.code, "chmod" in caught.value.hint) == ("policy-unsafe", True)
         person.policy.chmod(0o600)
+        text = person.policy.read_text()
+        person.policy.write_text(text.replace("per_hour", "per_our"))
+        with pytest.raises(SignerError, match="did you mean per_hour") as caught:
+            await owner.use_policy()
+        assert (caught.value.code, "policy check" in caught.value.hint) == ("invalid-policy", True)
+        person.policy.write_text(text)
+        assert (await owner.policy()).hash == before.hash
         used = await owner.use_policy()
         assert used.hash != before.hash
         assert (await owner.log()).entries[-1].facts == {"policy": used.hash}
