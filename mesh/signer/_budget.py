@@ -16,7 +16,7 @@ import msgspec
 from mesh.base.database import SyncedDatabase
 from mesh.errors import ConfigurationError
 from mesh.signer.policy import DAY, HOUR, Spending
-from mesh.signer.protocol import OVER, JobState, OrderJob, SignerFailure
+from mesh.signer.protocol import OVER, JobState, OnStop, OrderJob, SignerFailure
 from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
@@ -104,9 +104,8 @@ class KeptJob(msgspec.Struct, frozen=True, kw_only=True):
     """When no demand is signed any more."""
     contract: str = ""
     result: str = ""
-    on_stop: str = ""
+    on_stop: OnStop = ""
     consent: str = ""
-    has_consent: bool = False
     stopped_why: str | None = None
     error: SignerFailure | None = None
     created: float

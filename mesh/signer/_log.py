@@ -59,10 +59,6 @@ class SignedEntry(msgspec.Struct, frozen=True, kw_only=True):
         return self.digest.hex()
 
 
-class LogUnusable(AiraError, code="log-unusable"):
-    """The log can't be written, or is not the one that the database says. Nothing is ordered without it."""
-
-
 class SignerLog:
     """The log in a folder, signed by an account. `budget` is the open database that has its head."""
 
@@ -82,7 +78,7 @@ class SignerLog:
         self._files = files
 
     def open(self) -> None:
-        """Write the last entry to its file if a crash kept it from that. Raises `LogUnusable`, `OSError`."""
+        """Write the last entry to its file if a crash kept it from that. Raises `AiraError`, `OSError`."""
         make_private_folder(self.folder)
         head = self._budget.log_head()
         if not head.last:
@@ -102,9 +98,10 @@ class SignerLog:
             sync_file(path)
             sync_directory(self.folder)
             return
-        raise LogUnusable(
+        raise AiraError(
             f"the signer's log was changed: entry {head.last} is not the last one",
             hint="`aira mcp log --verify` says where; keep the folder for inquiry, and begin with another --data-dir",
+            code="log-unusable",
         )
 
     def add(self, event: str, **facts: Any) -> SignedEntry:
@@ -123,7 +120,7 @@ class SignerLog:
         return entry
 
     def entries(self, first: int | None = None, limit: int = 100) -> list[SignedEntry]:
-        """Up to `limit` entries from a number on, or the latest. Blocks on the disk. Raises `LogUnusable`."""
+        """Up to `limit` entries from a number on, or the latest. Blocks on the disk. Raises `AiraError`."""
         head = self._budget.log_head()
         start = max(head.first, head.last - limit + 1 if first is None else first)
         found: list[SignedEntry] = []
@@ -134,7 +131,8 @@ class SignerLog:
             for line in _lines(path):
                 entry = _decoded(line)
                 if entry is None:
-                    raise LogUnusable("the signer's log was changed", hint="`aira mcp log --verify` says where")
+                    hint = "`aira mcp log --verify` says where"
+                    raise AiraError("the signer's log was changed", hint=hint, code="log-unusable")
                 if entry.number >= start:
                     found.append(entry)
                 if len(found) == limit:

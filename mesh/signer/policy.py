@@ -11,7 +11,6 @@ import os
 import re
 import stat
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from mesh.amounts import XRT, InvalidAmount, Unit
@@ -27,6 +26,8 @@ from schemas.model import Effort
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
+
+    from mesh.signer.protocol import Verdict
 
 LARGEST_POLICY: Final = 1 << 18
 """Bytes of a policy's file."""
@@ -51,18 +52,10 @@ class InvalidPolicy(ConfigurationError, code="invalid-policy"):
         self.faults = faults
 
 
-class PolicyVerdict(StrEnum):
-    """What a policy says to an order."""
-
-    ALLOWED = "allowed"
-    NEEDS_CONSENT = "needs-consent"
-    REFUSED = "refused"
-
-
 class Decision(NamedTuple):
-    """A verdict. A refusal has a `code` of `protocol.REFUSALS`; `why` is a line for people, `next` what to do."""
+    """A verdict. A refusal has a `code`; `why` is a line for people, `next` what to do."""
 
-    verdict: PolicyVerdict
+    verdict: Verdict
     code: str = ""
     why: str = ""
     next: str = ""
@@ -169,10 +162,10 @@ class Policy:
                 why = f"{shown(cost)} is more than is left of the budget of the last {period}, {left}"
                 return _refused(code, why, f"order for less, or later; {owner}")
         if has_consent or self.consent_above is None or cost <= self.consent_above:
-            return Decision(PolicyVerdict.ALLOWED)
+            return Decision("allowed")
         above = self.consent_above
         why = "each order needs a person's yes" if above < 0 else f"orders above {shown(above)} need a person's yes"
-        return Decision(PolicyVerdict.NEEDS_CONSENT, "", why, "")
+        return Decision("needs-consent", "", why, "")
 
     def words(self) -> tuple[str, ...]:
         """What it allows, in plain words, a line each."""
@@ -462,7 +455,7 @@ class _Reader:
 
 
 def _refused(code: str, why: str, hint: str) -> Decision:
-    return Decision(PolicyVerdict.REFUSED, code, why, hint)
+    return Decision("refused", code, why, hint)
 
 
 def _telling(before: ValueFault | None, found: ValueFault) -> ValueFault:

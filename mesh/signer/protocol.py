@@ -74,6 +74,10 @@ JobState: TypeAlias = Literal[
 - `denied`: a person did not allow it; nothing was signed.
 - `expired`: nobody allowed it, or took it, in time; nothing was paid.
 """
+OnStop: TypeAlias = Literal["refund", "paid", ""]
+"""What becomes of the cost of a job that is stopped; empty if no description says it."""
+Verdict: TypeAlias = Literal["allowed", "needs-consent", "refused"]
+"""What a policy says to an order."""
 OVER: Final = frozenset({"done", "failed", "refunded", "withdrawn", "stopped", "denied", "expired"})
 """The states after which no other comes."""
 
@@ -137,8 +141,7 @@ class FoundRobot(SignerAnswer, frozen=True, kw_only=True):
     """After which a new job would begin, estimated."""
     record: RobotRecord | None
     """None if the chain could not be read."""
-    on_stop: Literal["refund", "paid", ""]
-    """What becomes of the cost of a job that is stopped; empty if no description says it."""
+    on_stop: OnStop
     is_allowed: bool
     """Whether the policy has a rule for this robot and its model."""
 
@@ -202,7 +205,7 @@ class DescribedModel(SignerAnswer, frozen=True, kw_only=True):
     results: tuple[DescribedTopic, ...] = ()
     price: str = ""
     seconds: float | None = None
-    on_stop: Literal["refund", "paid", ""] = ""
+    on_stop: OnStop = ""
 
 
 class Message(SignerRequest, frozen=True, kw_only=True):
@@ -234,7 +237,7 @@ class FoundQuote(SignerAnswer, frozen=True, kw_only=True):
     duration_seconds: float | None
     valid_until: str
     """Estimated from the time that blocks take."""
-    verdict: Literal["allowed", "needs-consent", "refused"]
+    verdict: Verdict
     """What the policy would say to an order at this cost now."""
     code: str = ""
     """Why it would be refused."""
@@ -328,7 +331,7 @@ class Job(SignerAnswer, frozen=True, kw_only=True):
     """Its address, when there is one."""
     result: str = ""
     """The CID of the recording, when there is one."""
-    on_stop: Literal["refund", "paid", ""] = ""
+    on_stop: OnStop = ""
     progress: JobProgress | None = None
     latest: tuple[LatestValue, ...] = ()
     consent: NeededConsent | None = None
@@ -609,22 +612,6 @@ OWNER: Final[Mapping[str, Operation]] = MappingProxyType(
     }
 )
 """What only the owner may ask for, on `OWNER_SOCKET`."""
-
-REFUSALS: Final = frozenset(
-    {
-        "model-not-allowed",
-        "robot-not-allowed",
-        "topic-not-allowed",
-        "field-not-allowed",
-        "value-not-allowed",
-        "too-expensive",
-        "hour-budget-spent",
-        "day-budget-spent",
-        "too-many-jobs",
-        "outside-hours",
-    }
-)
-"""The codes with which a policy refuses an order."""
 
 
 class SignerError(AiraError, code="signer-error"):

@@ -20,7 +20,7 @@ import socket
 import struct
 import time
 from collections import Counter
-from contextlib import nullcontext, suppress
+from contextlib import asynccontextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -73,7 +73,7 @@ from mesh.signer._answers import (
 )
 from mesh.signer._budget import Budget, BudgetHold, ConsentRecord, KeptJob
 from mesh.signer._log import SignerLog, log_files, time_text, verify_log
-from mesh.signer.policy import Decision, PolicyVerdict, parse_policy, read_policy_file
+from mesh.signer.policy import Decision, parse_policy, read_policy_file
 from mesh.signer.protocol import DOOR, OWNER, Job, SignerError, SignerFailure
 from mesh.validator.verification import Claim, JobFiles, check_end, verify
 from schemas import parse_address, parse_cid, parse_key
@@ -87,7 +87,7 @@ from schemas.model import InvalidDescription
 from schemas.payloads import payload_type
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
     from contextlib import AsyncExitStack
     from pathlib import Path
 
@@ -212,7 +212,8 @@ class Signer(Lifecycle):
         await self.budget.sync()
         self._tasks = await stack.enter_async_context(Background())
         for job in self.budget.open_jobs():
-            self._resume(job)
+            if job.state != "needs-consent":
+                self._start(job)
         for consent in self.budget.consents():
             self._expire_later(consent)
         for name, operations in ((protocol.DOOR_SOCKET, DOOR), (protocol.OWNER_SOCKET, OWNER)):
@@ -321,7 +322,7 @@ class Signer(Lifecycle):
             decision = self.policy.decide(quote.cost, spending, now)
             if allowed is not None and quote.agent not in allowed:
                 why = "the policy does not allow this robot"
-                decision = Decision(PolicyVerdict.REFUSED, "robot-not-allowed", why)
+                decision = Decision("refused", "robot-not-allowed", why)
             quotes.append(
                 protocol.FoundQuote(
                     robot=quote.agent,
@@ -330,7 +331,7 @@ class Signer(Lifecycle):
                     start_seconds=quote.start,
                     duration_seconds=quote.seconds or None,
                     valid_until=time_text(now + await self._seconds_until(quote.until)),
-                    verdict=decision.verdict.value,
+                    verdict=decision.verdict,
                     code=decision.code,
                     why=decision.why,
                 )
@@ -366,7 +367,6 @@ class Signer(Lifecycle):
         robot = asked.robot if asked.robot in CHOICES else parse_address(asked.robot)
         named = "" if robot in CHOICES else robot
         cost = self._unit.parse(asked.cost)
-        _require(policy.refusal_of(model, named))
         _require(policy.decide(cost, self.budget.spending(), self.budget.now()))
         objective, robots = await self._objective(model, asked.messages, asked.objective, named)
         await self.agent.runtime.require_fit(objective, model)
@@ -393,7 +393,7 @@ class Signer(Lifecycle):
             changed=now,
         )
         facts = {"model": model, "objective": objective, "robot": robot, "cost": cost, "policy": policy.hash}
-        if decision.verdict is PolicyVerdict.NEEDS_CONSENT:
+        if decision.verdict == "needs-consent":
             if len(self.budget.consents()) >= CONSENTS:
                 raise SignerError(
                     f"{CONSENTS} orders wait for a person's yes already",
@@ -470,17 +470,13 @@ class Signer(Lifecycle):
         return None if None in named else frozenset[str]().union(*(one for one in named if one is not None))
 
     async def _begin(self, job: KeptJob) -> None:
-        """Order an allowed job, whose cost is bound from here on."""
+        """Order an allowed job, whose cost is bound from here on, also if the disk fails.
+
+        Nothing leaves before its hash is on the disk, either.
+        """
         try:
             await self.budget.sync()
-        except DISK_ERRORS:
-            self._start(job)  # nothing leaves before its hash is on the disk, either
-            raise
-        self._start(job)
-
-    def _resume(self, job: KeptJob) -> None:
-        """Go on with a job of an earlier run."""
-        if job.state != "needs-consent":
+        finally:
             self._start(job)
 
     def _start(self, job: KeptJob) -> None:
@@ -714,18 +710,50 @@ class Signer(Lifecycle):
         self._ticks[job_id] = self._ticks.get(job_id, 0) + 1
         self._tell(job_id)
 
-    def _latest_values(self, job: KeptJob) -> _Latest:
-        def keep(message: Played) -> None:
-            kept = self._latest.setdefault(job.id, {})
-            if message.topic in kept or len(kept) < LATEST_TOPICS:
-                text, _ = value_text(message, f"robot {job.robot}")
-                moment = time_text(message.log_time_ns / 1e9)
-                kept[message.topic] = protocol.LatestValue(topic=plain(message.topic, 200), value=text, time=moment)
-                self._tick_soon(job.id)
-
+    @asynccontextmanager
+    async def _latest_values(self, job: KeptJob) -> AsyncIterator[None]:
+        """Keep the latest values that the robot publishes in a job, meanwhile."""
+        limiter = RateLimiter(per_sender=Rate(per_second=20.0, burst=40))
         while len(self._latest) > 256:
             self._latest.pop(next(iter(self._latest)))
-        return _Latest(self.agent, job, keep)
+
+        def read(sample: zenoh.Sample) -> Played | None:
+            try:
+                key = parse_key(str(sample.key_expr))
+            except AiraError:
+                return None
+            if not isinstance(key, LiabilityTopicKey) or not limiter.allow(""):
+                return None
+            now = time.time_ns()
+            return Played(key.topic, sample.payload.to_bytes(), now, now, 0, payload_type(str(sample.encoding)))
+
+        async def take(pump: Pump[Played]) -> None:
+            async for message in pump:
+                with suppress(AiraError):
+                    self._keep_latest(job, message)
+
+        async with (
+            Pump(
+                self.agent.network.session,
+                job_selector(job.robot, job.contract),
+                read,
+                capacity=256,
+                capacity_bytes=4 << 20,
+                payload_limit=LARGEST_VALUE,
+                drops=self.agent.drops,
+            ) as pump,
+            Background() as tasks,
+        ):
+            tasks.start(take(pump), "latest values")
+            yield
+
+    def _keep_latest(self, job: KeptJob, message: Played) -> None:
+        kept = self._latest.setdefault(job.id, {})
+        if message.topic in kept or len(kept) < LATEST_TOPICS:
+            text, _ = value_text(message, f"robot {job.robot}")
+            moment = time_text(message.log_time_ns / 1e9)
+            kept[message.topic] = protocol.LatestValue(topic=plain(message.topic, 200), value=text, time=moment)
+            self._tick_soon(job.id)
 
     async def _do_job(self, asked: protocol.ReadJob) -> Job:
         job = self._known(asked.job_id)
@@ -890,7 +918,6 @@ class Signer(Lifecycle):
             msgspec.structs.replace(consent, answer="yes"),
             state="ordering",
             hold=BudgetHold.OPEN,
-            has_consent=True,
             until=now + job.request.deadline_seconds,
         )
         await self._begin(job)
@@ -1017,7 +1044,6 @@ class Signer(Lifecycle):
                 command=command,
                 by_client=self.policy.consent_by_client,
             )
-        on_stop: Any = job.on_stop
         return Job(
             job_id=job.id,
             state=job.state,
@@ -1032,7 +1058,7 @@ class Signer(Lifecycle):
             note=job.request.note,
             contract=job.contract,
             result=job.result,
-            on_stop=on_stop,
+            on_stop=job.on_stop,
             progress=self._progress.get(job.id),
             latest=tuple(self._latest.get(job.id, {}).values()),
             consent=needed,
@@ -1062,50 +1088,6 @@ class Signer(Lifecycle):
         block_time = await self.agent.chain.node.contract_blocks.seconds(MEASURED_BLOCKS)
         left = block - self.agent.parts.chain_head.contract_block
         return max(0.0, min(left * (block_time or 1.0), 86_400.0))
-
-
-class _Latest:
-    """Calls `keep` with what the robot publishes in a job, until it is left."""
-
-    def __init__(self, agent: Agent, job: KeptJob, keep: Callable[[Played], None]) -> None:
-        self._limiter = RateLimiter(per_sender=Rate(per_second=20.0, burst=40))
-        self._keep = keep
-        self._tasks = Background()
-        self._pump = Pump(
-            agent.network.session,
-            job_selector(job.robot, job.contract),
-            self._read,
-            capacity=256,
-            capacity_bytes=4 << 20,
-            payload_limit=LARGEST_VALUE,
-            drops=agent.drops,
-        )
-
-    def _read(self, sample: zenoh.Sample) -> Played | None:
-        try:
-            key = parse_key(str(sample.key_expr))
-        except AiraError:
-            return None
-        if not isinstance(key, LiabilityTopicKey) or not self._limiter.allow(""):
-            return None
-        now = time.time_ns()
-        return Played(key.topic, sample.payload.to_bytes(), now, now, 0, payload_type(str(sample.encoding)))
-
-    async def _take(self) -> None:
-        async for message in self._pump:
-            with suppress(AiraError):
-                self._keep(message)
-
-    async def __aenter__(self) -> None:
-        await self._pump.__aenter__()
-        await self._tasks.__aenter__()
-        self._tasks.start(self._take(), "latest values")
-
-    async def __aexit__(self, *exc_info: Any) -> None:
-        try:
-            await self._tasks.__aexit__(*exc_info)
-        finally:
-            await self._pump.__aexit__(*exc_info)
 
 
 def request_digest(asked: protocol.OrderJob) -> str:
@@ -1162,7 +1144,7 @@ def _check_peer(request: web.Request) -> None:
 
 
 def _require(decision: Decision | None) -> None:
-    if decision is not None and decision.verdict is PolicyVerdict.REFUSED:
+    if decision is not None and decision.verdict == "refused":
         raise _refusal(decision)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.errors import ConfigurationError
-from mesh.signer.policy import InvalidPolicy, PolicyVerdict, Spending, parse_policy, read_policy_file
+from mesh.signer.policy import InvalidPolicy, Spending, parse_policy, read_policy_file
 from tests.mesh.signer.hostile import OTHER_MODEL
 from tests.mesh.signer.signers import LIMITS, RULE
 
@@ -81,11 +81,11 @@ def test_hours_and_jobs_are_judged_before_money() -> None:
     policy = parse_policy(GOOD.replace(b"jobs_at_a_time = 8", b'jobs_at_a_time = 1\nhours = "Mon-Fri 08:00-18:00 UTC"'))
     monday = 1_795_424_400.0  # 2026-11-23 09:00 UTC
     nothing = Spending(0, 0, 0)
-    assert policy.decide(1, nothing, monday).verdict is PolicyVerdict.ALLOWED
+    assert policy.decide(1, nothing, monday).verdict == "allowed"
     assert policy.decide(1, nothing, monday + 10 * 3600).code == "outside-hours"
     assert policy.decide(1, Spending(0, 0, 1), monday).code == "too-many-jobs"
-    assert policy.decide(4 * 10**9, nothing, monday).verdict is PolicyVerdict.NEEDS_CONSENT
-    assert policy.decide(4 * 10**9, nothing, monday, has_consent=True).verdict is PolicyVerdict.ALLOWED
+    assert policy.decide(4 * 10**9, nothing, monday).verdict == "needs-consent"
+    assert policy.decide(4 * 10**9, nothing, monday, has_consent=True).verdict == "allowed"
     assert policy.decide(1, Spending(20 * 10**9, 20 * 10**9, 0), monday).code == "hour-budget-spent"
     assert policy.decide(1, Spending(0, 50 * 10**9, 0), monday).code == "day-budget-spent"
 

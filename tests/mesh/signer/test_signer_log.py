@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.errors import AiraError
 from mesh.signer._budget import Budget
-from mesh.signer._log import LogUnusable, SignerLog, log_files, verify_log
+from mesh.signer._log import SignerLog, log_files, verify_log
 from schemas import Signer, keccak256
 
 if TYPE_CHECKING:
@@ -126,5 +127,6 @@ def test_an_entry_that_a_crash_kept_from_the_file_is_written_when_it_is_opened(
     log.open()
     assert lines_of(folder) == lines
     path.write_bytes(b"".join(line + b"\n" for line in lines[:-2]))
-    with pytest.raises(LogUnusable):
+    with pytest.raises(AiraError) as caught:
         log.open()
+    assert caught.value.code == "log-unusable"
