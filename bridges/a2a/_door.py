@@ -393,7 +393,6 @@ def error_of(error: AiraError) -> A2AError:
     data = {"code": error.code, "next": public_text(error.hint)}
     if isinstance(error, SignerError) and error.from_strangers is not None:
         data |= {"from": error.from_strangers.author, "text": error.from_strangers.text}
-    kind = InvalidParamsError if isinstance(error, SignerError | InputError) else InternalError
-    if isinstance(error, SignerUnavailable):
-        kind = InternalError
+    is_theirs = isinstance(error, SignerError | InputError) and not isinstance(error, SignerUnavailable)
+    kind = InvalidParamsError if is_theirs else InternalError
     return kind(f"{error.code}: {public_text(error)}", data)
