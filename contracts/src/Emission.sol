@@ -23,19 +23,19 @@ abstract contract Emission {
 
     /// @notice wn that 100 units of counted gas are worth. Whoever deploys chooses it: a fork may make the same work
     /// take more gas than the schedule counts.
-    uint256 public immutable emissionPercent;
+    uint256 public immutable wnFor100Gas;
 
     /// @notice Gas of all liabilities that have ended.
     uint256 public totalGasConsumed;
 
-    constructor(XRT xrt_, uint256 emissionPercent_) {
+    constructor(XRT xrt_, uint256 wnFor100Gas_) {
         xrt = xrt_;
-        emissionPercent = emissionPercent_;
+        wnFor100Gas = wnFor100Gas_;
     }
 
     /// @notice wn that this much gas is worth.
     function wnFromGas(uint256 gas) public view returns (uint256) {
-        return gas * emissionPercent / 100;
+        return gas * wnFor100Gas / 100;
     }
 
     /// @notice Generation 3's name of `totalGasConsumed`.

@@ -38,9 +38,9 @@ contract Factory is
     /// @notice Blocks after a liability's creation until its promisee may have the money back.
     uint256 public immutable refundDelay;
     /// @notice Implementation behind the liabilities.
-    address public immutable liabilityCode;
+    address private immutable _liabilityCode;
     /// @notice Implementation behind the lighthouses.
-    address public immutable lighthouseCode;
+    address private immutable _lighthouseCode;
 
     /// @notice Generation 5: the nonce that an account's next order is signed with.
     mapping(address account => uint256) public nonceOf;
@@ -62,14 +62,14 @@ contract Factory is
     /// @param ens_ registry in which this factory owns the parents of the lighthouses' names.
     /// @param xrt_ token that has, or will have, this factory as its minter.
     /// @param refundDelay_ in blocks; longer than any work is to take.
-    /// @param emissionPercent_ wn that providers are paid for 100 units of gas.
-    constructor(IENS ens_, XRT xrt_, uint256 refundDelay_, uint256 emissionPercent_)
+    /// @param wnFor100Gas_ wn that providers are paid for 100 units of gas.
+    constructor(IENS ens_, XRT xrt_, uint256 refundDelay_, uint256 wnFor100Gas_)
         LighthouseNames(ens_)
-        Emission(xrt_, emissionPercent_)
+        Emission(xrt_, wnFor100Gas_)
     {
         refundDelay = refundDelay_;
-        liabilityCode = address(new Liability(address(xrt_)));
-        lighthouseCode = address(new Lighthouse(xrt_));
+        _liabilityCode = address(new Liability(address(xrt_)));
+        _lighthouseCode = address(new Lighthouse(xrt_));
     }
 
     /// @notice Makes a lighthouse and registers its names; anybody may.
@@ -84,7 +84,7 @@ contract Factory is
         if (timeoutInBlocks == 0 || timeoutInBlocks > type(uint32).max) revert InvalidTimeout(timeoutInBlocks);
         _requireFree(name);
         bytes memory arguments = abi.encodePacked(uint128(minimalStake), uint32(timeoutInBlocks), name);
-        lighthouse = Clone.create(lighthouseCode, _lighthouseKind, arguments);
+        lighthouse = Clone.create(_lighthouseCode, _lighthouseKind, arguments);
         _give(name, lighthouse);
         // slither-disable-next-line reentrancy-events (the registry is chosen by who deploys)
         emit NewLighthouse(lighthouse, name);
@@ -250,7 +250,7 @@ contract Factory is
     /// Takes the money for what was agreed, and makes the liability.
     function _make(Terms memory terms) private {
         _collect(terms, _provider());
-        address liability = Clone.create(liabilityCode, LIABILITY, TermsCode.pack(terms, address(xrt)));
+        address liability = Clone.create(_liabilityCode, LIABILITY, TermsCode.pack(terms, address(xrt)));
         // slither-disable-next-line reentrancy-events (nobody but the token was called, and it changes nothing here)
         emit NewLiability(liability);
     }
@@ -328,13 +328,13 @@ contract Factory is
 
     /// Ends the liability, then pays: the promisor for success, or the promisee; and the validator for judging.
     function _end(address liability, Terms memory terms, bytes32 digest, bool success) private {
-        Liability(liability).settle(digest, success);
+        Liability(liability).settleByFactory(digest, success);
         _payOut(terms, success ? terms.promisor : terms.promisee, terms.validator);
     }
 
     /// Ends the liability without a result; nobody has judged anything, so the promisee gets the validator's fee too.
     function _giveBack(address liability, Terms memory terms) private {
-        Liability(liability).settle(0, false);
+        Liability(liability).settleByFactory(0, false);
         _payOut(terms, terms.promisee, terms.promisee);
         _credit(terms, false, address(0));
     }

@@ -64,8 +64,9 @@ contract Liability is RobonomicsErrors {
     }
 
     /// @notice Ends the liability, once; the factory pays.
+    /// @dev Functions are looked up in the order of their selectors, and few come before this name's.
     /// @param digest sha2-256 of the result, zero when there is none.
-    function settle(bytes32 digest, bool success) external onlyFactory {
+    function settleByFactory(bytes32 digest, bool success) external onlyFactory {
         if (isFinalized()) revert AlreadyFinalized(address(this));
         if (success) _succeeded = digest;
         else _failed = digest == 0 ? REFUNDED : digest;

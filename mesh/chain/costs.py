@@ -27,11 +27,11 @@ class JobTransaction(NamedTuple):
 
 
 STEPS: Final = (
-    JobTransaction("create_cost", "create the contract", "the provider", (206_700, 163_300), 450),
-    JobTransaction("finalize_cost", "finalize it", "the provider", (112_700, 111_600), 130),
+    JobTransaction("create_cost", "create the contract", "the provider", (206_600, 163_300), 450),
+    JobTransaction("finalize_cost", "finalize it", "the provider", (112_400, 111_300), 130),
     JobTransaction("approve", "approve the factory", "the customer, once for many jobs", (45_900, 45_900), 45),
-    JobTransaction("create_permit", "create it with a permit", "the provider, instead", (218_100, 174_700), 590),
-    JobTransaction("refund", "refund it", "the customer, if nobody finalizes", (78_400, 78_900), 25),
+    JobTransaction("create_permit", "create it with a permit", "the provider, instead", (218_000, 174_600), 590),
+    JobTransaction("refund", "refund it", "the customer, if nobody finalizes", (78_100, 78_500), 25),
     JobTransaction("withdraw_order", "withdraw an order on the chain", "its maker, if asked for", (46_200, 28_300), 37),
 )
 """Each job has the first two."""

@@ -157,7 +157,7 @@ async def _fitting(node: Node, owner: str, plan: DeploymentPlan, found: Mapping[
             del fits["XRT"]
     if "Factory" in fits:
         factory = node.contract("Factory", fits["Factory"])
-        calls = factory.ens(), factory.xrt(), factory.refundDelay(), factory.emissionPercent()
+        calls = factory.ens(), factory.xrt(), factory.refundDelay(), factory.wnFor100Gas()
         has = [await node.read(call) for call in calls]
         if has != [ens, fits.get("XRT"), plan.refund_delay, plan.emission_percent]:
             del fits["Factory"]

@@ -241,7 +241,7 @@ class Provider(Role):
         emission, is_ours = 100, await self._chain.has_mesh_contracts()
         if is_ours:
             node = self._chain.node
-            emission = await node.read(node.contract("Factory", self._chain.factory).emissionPercent())
+            emission = await node.read(node.contract("Factory", self._chain.factory).wnFor100Gas())
         self.free = FreeContracts(
             self.address,
             self._chain.xrt,

@@ -105,6 +105,10 @@ class Suite:
         (event,) = self.factory.events.NewLighthouse().process_receipt(receipt, errors=DISCARD)
         return self.contract("Lighthouse", event["args"]["lighthouse"])
 
+    def implementation(self, clone: Contract) -> str:
+        """The contract whose code a lighthouse or liability runs (EIP-1167)."""
+        return self.chain.web3.to_checksum_address(self.chain.web3.eth.get_code(clone.address)[10:30])
+
     def join(self, lighthouse: Contract, provider: Person, stake: int) -> None:
         """Make a person a provider with that stake in wn."""
         self.fund(provider, stake, lighthouse.address)

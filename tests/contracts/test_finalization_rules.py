@@ -85,11 +85,10 @@ def test_an_early_refund_is_refused(market: Market, liability: Contract) -> None
     assert market.refusal(refund) == ("RefundTooEarly", created + REFUND_DELAY)
 
 
-def test_only_liabilities_of_the_factory_can_end(market: Market) -> None:
+def test_only_liabilities_of_the_factory_can_end(market: Market, liability: Contract) -> None:
     suite = market.suite
     signature = bytes(65).hex()
-    implementation = suite.factory.functions.liabilityCode().call()
-    for address in (SOMEBODY, market.lighthouse.address, suite.xrt.address, implementation):
+    for address in (SOMEBODY, market.lighthouse.address, suite.xrt.address, suite.implementation(liability)):
         result = Result(liability=address, result=OTHER, success=True, signature=signature)
         assert market.refusal(market.finalization(result)) == ("NotALiability", result.liability)
         assert market.refusal(suite.factory.functions.refund(result.liability)) == ("NotALiability", result.liability)
@@ -114,7 +113,10 @@ def test_the_factory_and_the_liability_take_no_results_from_outsiders(market: Ma
     assert market.refusal(judged, market.outsider) == ("NotALiability", outsider)
     verdict = liability.functions.finalize(data, True, signature, True)
     assert market.refusal(verdict, market.outsider) == ("NotTheValidator", outsider)
-    for settle in (liability.functions.settle(data[2:], True), liability.functions.askValidator(SOMEBODY, SOMEBODY)):
+    for settle in (
+        liability.functions.settleByFactory(data[2:], True),
+        liability.functions.askValidator(SOMEBODY, SOMEBODY),
+    ):
         assert market.refusal(settle, market.outsider) == ("NotTheFactory", outsider)
 
 

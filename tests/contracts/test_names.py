@@ -56,7 +56,8 @@ def test_a_new_lighthouse_is_announced_and_known(suite: Suite) -> None:
 
 def test_implementations_and_other_addresses_are_not_lighthouses(suite: Suite) -> None:
     factory = suite.factory.functions
-    for address in (factory.lighthouseCode().call(), suite.xrt.address, suite.deployer.address, ZERO):
+    implementation = suite.implementation(suite.create_lighthouse(name="cloned"))
+    for address in (implementation, suite.xrt.address, suite.deployer.address, ZERO):
         assert not factory.isLighthouse(address).call()
         assert not factory.isLiability(address).call()
 

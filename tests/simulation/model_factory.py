@@ -53,12 +53,6 @@ class ModelFactory(ModelEscrow):
     def refundDelay(self) -> int:
         return int(self.get("delay"))
 
-    def liabilityCode(self) -> bytes:
-        return bytes(self.get("Liability"))
-
-    def lighthouseCode(self) -> bytes:
-        return bytes(self.get("Lighthouse"))
-
     def nonceOf(self, account: bytes) -> int:
         return int(self.get("nonce", account))
 
@@ -71,11 +65,11 @@ class ModelFactory(ModelEscrow):
     def totalGasUtilizing(self) -> int:
         return self.totalGasConsumed()
 
-    def emissionPercent(self) -> int:
+    def wnFor100Gas(self) -> int:
         return int(self.get("percent"))
 
     def wnFromGas(self, gas: int) -> int:
-        return checked(gas * self.emissionPercent()) // 100
+        return checked(gas * self.wnFor100Gas()) // 100
 
     def isLighthouse(self, account: bytes) -> bool:
         return bool(self.get("lighthouse", account))
@@ -111,7 +105,7 @@ class ModelFactory(ModelEscrow):
             raise refused("NameTaken", name)
         salt = keccak256(word(2) + word(self.run.chain_id))
         arguments = stake.to_bytes(16, "big") + timeout.to_bytes(4, "big") + name
-        lighthouse = self._clone(ModelLighthouse, self.lighthouseCode(), salt, arguments)
+        lighthouse = self._clone(ModelLighthouse, bytes(self.get("Lighthouse")), salt, arguments)
         self.set("lighthouse", lighthouse, True)
         made = {"factory": self.address, "xrt": self.xrt(), "minimal stake": stake, "timeout": timeout, "name": name}
         for variable, value in made.items():
@@ -143,7 +137,7 @@ class ModelFactory(ModelEscrow):
 
     def _make(self, terms: ModelTerms) -> None:
         self._collect(terms, self.data[-20:])
-        liability = self._clone(ModelLiability, self.liabilityCode(), word(1), terms.pack(self.xrt()))
+        liability = self._clone(ModelLiability, bytes(self.get("Liability")), word(1), terms.pack(self.xrt()))
         self.set("liability", liability, True)
         self.run.set(liability, "terms", terms)
         self.run.set(liability, "factory", self.address)
@@ -281,11 +275,11 @@ class ModelFactory(ModelEscrow):
         self._credit(terms, success, provider)
 
     def _end(self, liability: bytes, terms: ModelTerms, digest: bytes, success: bool) -> None:
-        ModelLiability(self.run, liability, self.address).settle(digest, success)
+        ModelLiability(self.run, liability, self.address).settleByFactory(digest, success)
         self._pay_out(terms, terms.promisor if success else terms.promisee, terms.validator)
 
     def _give_back(self, liability: bytes, terms: ModelTerms) -> None:
-        ModelLiability(self.run, liability, self.address).settle(bytes(32), False)
+        ModelLiability(self.run, liability, self.address).settleByFactory(bytes(32), False)
         self._pay_out(terms, terms.promisee, terms.promisee)
         self._credit(terms, False, NOBODY)
 

@@ -259,7 +259,7 @@ class ModelHistory:
         calls = {
             "refund": (self.known["factory"], call_of("Factory", "refund", liability)),
             "cancel": (self.known["factory"], call_of("Factory", "cancel", liability, *signatures)),
-            "settle": (liability, call_of("Liability", "settle", RESULT[2:], True)),
+            "settle": (liability, call_of("Liability", "settleByFactory", RESULT[2:], True)),
             "ask": (
                 liability,
                 call_of("Liability", "askValidator", self.known[self.pick("jury", "panel")], self.person()),

@@ -32,7 +32,7 @@ class ModelLiability(ModelContract):
         factory.finalizeByValidator(self.sender, result, success, signature, agree)
         return True
 
-    def settle(self, digest: bytes, success: bool) -> None:
+    def settleByFactory(self, digest: bytes, success: bool) -> None:
         self._only_factory()
         if self.isFinalized():
             raise refused("AlreadyFinalized", self.address)
