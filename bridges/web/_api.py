@@ -223,6 +223,7 @@ class Api(Lifecycle):
             post("/api/v1/pairs/offers", self.robot_offer),
             get("/api/v1/orders", self.orders),
             post("/api/v1/orders", self.post_order),
+            post("/api/v1/permits", self.post_permit),
             get("/api/v1/orders/{hash}", self.order),
             post("/api/v1/local/orders", self.local_order),
             post("/api/v1/local/withdrawals", self.local_withdrawal),
@@ -353,6 +354,10 @@ class Api(Lifecycle):
     async def post_order(self, request: web.Request) -> web.Response:
         order = await self._publisher.post(await request.read())
         return answer(self._market.posted_json(order), status=202)
+
+    async def post_permit(self, request: web.Request) -> web.Response:
+        await self._publisher.post_permit(await request.read())
+        return answer({}, status=202)
 
     async def robot_offer(self, request: web.Request) -> web.Response:
         wanted = AcceptDemand.decode(await request.read())

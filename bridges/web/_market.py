@@ -572,7 +572,7 @@ class Sent(msgspec.Struct):
     pair: OrderPair | None = None
     """With it, the message is for one robot alone, and goes to the providers only."""
     permit: Permit | None = None
-    """It travels before the message, a demand. That of a pair is in the pair."""
+    """It travels before the message, a demand. That of a pair is in the pair, unless its maker has signed another."""
 
 
 class OrderPublisher(Lifecycle):
@@ -638,6 +638,27 @@ class OrderPublisher(Lifecycle):
         self._send_due()
         self._market.changed(order, order.state(self._market.head))
         return order
+
+    async def post_permit(self, payload: bytes) -> None:
+        """Publish a new permit for the posted demands of its owner in its token, and send those again.
+
+        Raises `InvalidMessage`, `WebError` without such a demand, or if the permit is not better than a known one.
+        """
+        permit = (await asyncio.to_thread(verify, payload)).message
+        if not isinstance(permit, Permit):
+            raise unusable("kind", "only permits are posted here")
+        waiting = [
+            sent
+            for sent in self._sent.values()
+            if isinstance(sent.message, Demand) and (sent.signer, sent.message.token) == (permit.owner, permit.token)
+        ]
+        if not waiting:
+            raise WebError("no open demand was posted here that the permit could pay", code="page-not-found")
+        if not self._parts.chain.funds.note(permit):
+            raise unusable("permit", "the permit is not for this market, or no better than the last one")
+        for sent in waiting:
+            sent.permit, sent.backoff, sent.next_at = permit, Backoff(RESEND), 0.0
+        self._send_due()
 
     async def _send_pair(self, pair: OrderPair) -> None:
         session, providers = self._parts.network.session, sorted(await self._market.providers())[:PROVIDERS]
@@ -751,9 +772,9 @@ class OrderPublisher(Lifecycle):
             if not self._is_wanted(sent.message, key[:64]):
                 del self._sent[key]
             elif sent.next_at <= now and self._parts.network.connected:
+                if sent.permit is not None:
+                    self._parts.channel.publish(sent.permit)
                 if sent.pair is None:
-                    if sent.permit is not None:
-                        self._parts.channel.publish(sent.permit)
                     self._parts.channel.publish(sent.message)
                 else:
                     self._tasks.start(self._send_pair(sent.pair), f"pair {key[:64]}")

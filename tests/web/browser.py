@@ -119,9 +119,13 @@ class Wallet:
     def give(self, address: str, *, wei: int = 0, token: str = "", units: int = 0) -> None:
         """Send an account ether, or units of a token; it has them when this returns."""
         if token:
-            sent = self._send({"to": token, "data": f"0xa9059cbb{int(address, 16):064x}{units:064x}"})
+            self.transact({"to": token, "data": f"0xa9059cbb{int(address, 16):064x}{units:064x}"})
         else:
-            sent = self._send({"to": address, "data": "0x", "value": wei})
+            self.transact({"to": address, "data": "0x", "value": wei})
+
+    def transact(self, call: dict[str, Any]) -> None:
+        """Send a transaction, and wait until it is in a block."""
+        sent = self._send(call)
         wait_until(lambda: self.rpc("eth_getTransactionReceipt", sent), what="the transaction's receipt")
 
     def _send(self, call: dict[str, Any]) -> Any:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import secrets
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from schemas.model import parse_description
 from tests.web.browser import Browser
 from tests.web.steps import anybody, check, facts, fill_in, order, sign
+from tests.web.test_order_form import put
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
+    from tests.web.browser import Wallet
     from tests.web.conftest import Site
 
+NUMBERS = Path(__file__).parent / "number_model.json"
 PEOPLE, OPERATORS = "a token of people 123", "a token of operators 456"
 FORBIDDEN = """
 const [robot, liability, done] = arguments;
@@ -120,6 +124,65 @@ def test_a_person_without_ether_orders_and_the_job_is_paid(site: Site, pictures:
     assert (account["transactions"], int(account["token"]["balance"])) == (0, 10**10 - int(job["cost"]))
     blocks = range(first, int(rich.rpc("eth_blockNumber"), 16) + 1)
     assert {rich.rpc("eth_getBalance", wallet.address, hex(block)) for block in blocks} == {"0x0"}
+
+
+def use_permit(wallet: Wallet, rich: Wallet, market: dict[str, Any]) -> None:
+    """Let the token take another permit of the wallet's account, as that of an order from elsewhere is taken."""
+    token, owner, spender = market["token"]["address"], wallet.address, market["factory"]
+    nonce = int(rich.rpc("eth_call", {"to": token, "data": f"0x7ecebe00{int(owner, 16):064x}"}, "latest"), 16)
+    domain = {"name": "Robonomics", "version": "1", "chainId": market["chainId"], "verifyingContract": token}
+    fields = {"owner": "address", "spender": "address", "value": "uint256", "nonce": "uint256", "deadline": "uint256"}
+    types = {"Permit": [{"name": name, "type": kind} for name, kind in fields.items()]}
+    message = {"owner": owner, "spender": spender, "value": 0, "nonce": nonce, "deadline": 2**40}
+    signed = wallet.account.sign_typed_data(domain, types, message)
+    words = (int(owner, 16), int(spender, 16), 0, 2**40, signed.v, signed.r, signed.s)
+    rich.transact({"to": token, "data": "0xd505accf" + "".join(f"{word:064x}" for word in words)})
+
+
+@pytest.mark.parametrize("is_private", [True, False], ids=["one robot", "anybody"])
+def test_a_permit_that_another_order_used_before_the_signature_is_signed_anew(site: Site, is_private: bool) -> None:
+    wallet, rich = site.poor_wallet(), site.wallet()
+    rich.give(wallet.address, token=facts(site, "market")["token"]["address"], units=10**10)
+    with Browser(site.url, wallet) as browser:
+        browser.go()
+        browser.connect()
+        fill_in(browser, site)
+        if not is_private:
+            anybody(browser)
+        browser.click("#order:not([disabled])")
+        browser.find("#permit")
+        use_permit(wallet, rich, facts(site, "market"))
+        browser.click("#sign")
+        browser.sees("Another order of yours has used this permit. Sign a new one.")
+        browser.click("#sign")
+        browser.sees("the robot was paid")
+    assert [one["message"]["nonce"] for one in wallet.typed_data[-2:]] == ["0", "1"]
+
+
+def test_a_permit_of_an_order_that_waits_is_signed_again_if_another_order_used_it(site: Site) -> None:
+    wallet, rich, token = site.poor_wallet(), site.wallet(), facts(site, "market")["token"]["address"]
+    rich.give(wallet.address, token=token, units=10**10)
+    told = "{kind: 'rejected', agent: body.order.signer, code: 'ERC20InsufficientAllowance', detail: '', at: 1}"
+    model = put(site, parse_description(NUMBERS.read_bytes()).encode())  # no robot has it
+    with Browser(site.url, wallet) as browser:
+        browser.lie(r"orders\/[0-9a-f]{64}$", f"body.statements.push({told})")
+        browser.go()
+        browser.connect()
+        browser.go(f"order/model/{model}")
+        browser.find(".form input")
+        browser.type("You pay", "2")
+        browser.click("#order:not([disabled])")
+        price = browser.find("dialog[open] strong").text
+        browser.click("#sign")
+        browser.sees("Another order of yours has used the permit of this one.")
+        use_permit(wallet, rich, facts(site, "market"))
+        assert f"take up to {price} from your account until " in browser.find("#another-permit").text
+        browser.click("#sign-permit")
+        browser.sees("Another order of yours has used this permit. Sign a new one.")
+        browser.click("#sign-permit")
+        browser.sees("The new permit is on its way to the providers.")
+    first, second = wallet.typed_data[0]["message"], wallet.typed_data[-1]["message"]
+    assert (second["nonce"], second["value"]) == ("1", first["value"])
 
 
 NO_PERMITS = r"accounts\/0x\w+$", "body.permits = false"

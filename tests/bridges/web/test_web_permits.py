@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
-from mesh.chain import Account
+from mesh.chain import Account, TransactionSender
+from mesh.chain._permits import permit_arguments
 from mesh.chain.deploy import XRT
 from schemas import encode
 from schemas.rpc import AcceptDemand, OrderPair, SendDemand, SendOffer, SendPermit
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.chain import Chain
+    from schemas import Permit
     from tests.support.market import Place
 
 
@@ -92,6 +94,34 @@ async def test_a_pair_has_its_permit(place: Place, serve: Any) -> None:
         await browser.post("pairs", forged.signed_by(signer).encode(), status=400)
         posted = await browser.post("pairs", pair.signed_by(signer).encode(), status=202)
         assert (await paid(browser, posted["order"]["hash"]))["liability"]["promisor"] == robot.address
+
+
+async def used_up(place: Place, permit: Permit) -> None:
+    """Let the token take a permit, as that of an order from elsewhere is taken."""
+    node, account = place.chains["provider"].node, place.chains["provider"].account
+    assert account is not None
+    value, deadline, v, r, s = permit_arguments(permit)
+    call = node.contract("XRT", permit.token).permit(permit.owner, permit.spender, value, deadline, v, r, s)
+    await TransactionSender(node, account).send(to=permit.token, data=call.data)
+
+
+async def test_a_permit_that_another_order_used_is_posted_anew(place: Place, serve: Any) -> None:
+    async with place.provider(), serve("person") as browser, penniless(place) as (account, chain):
+        demand = await signed_demand(browser, account, await made(browser))
+        first, other = await chain.permits.sign(chain.xrt, COST), await chain.permits.sign(chain.xrt, 0)
+        assert first is not None
+        assert other is not None
+        await browser.post("permits", encode(first), status=404)  # for no order
+        posted = await browser.post("orders", together(first, demand), status=202)
+        await used_up(place, other)
+        second = await chain.permits.sign(chain.xrt, COST)
+        assert second is not None
+        await browser.post("permits", encode(replace(second, value=COST + 1)), status=400)
+        await browser.post("permits", demand, status=400)
+        await browser.post("permits", encode(second), status=202)
+        assert (await browser.post("permits", encode(second), status=400))["error"]["reason"] == "permit"
+        async with working(place.agent("robot")):
+            await paid(browser, posted["order"]["hash"])
 
 
 async def test_the_local_account_orders_by_a_permit(place: Place, serve: Any) -> None:

@@ -7,7 +7,7 @@ import type { Account } from "./app";
 import { calls, nonceOf } from "./contracts";
 import { canonicalSignature, encodeWire, orderFields, orderHash, randomNonce, recordHash, signerOf, withdrawalHash } from "./messages";
 import type { Demand } from "./messages";
-import { PermitRefused, nextPermit, permitFields, permitMessage, permitSigner, typedData } from "./permits";
+import { PermitRefused, PermitUsed, domainOf, nextPermit, permitFields, permitMessage, permitSigner, typedData } from "./permits";
 import type { Domain, Permit, SignedPermit } from "./permits";
 import { texts } from "./texts";
 import { ServerLies, checkAsked, checkOrder, ownOrders, readerFor, rememberContract, rememberOrder } from "./trust";
@@ -72,9 +72,13 @@ export function priceOf({ cost, validator, validatorFee }: Pick<Wish, "cost" | "
 
 /** The same for an order and all others of the account that may still become contracts: an allowance is for all of them. */
 export function neededFor(wish: Wish, state: AccountState, market: Market): bigint {
-  const others = state.orders.map(({ order }) => order).filter((order) => order.kind === "demand" && order.token === market.token.address);
+  return priceOf(wish, market) + neededForOthers(state, market);
+}
+
+function neededForOthers(state: AccountState, market: Market): bigint {
+  const orders = state.orders.map(({ order }) => order).filter((order) => order.kind === "demand" && order.token === market.token.address);
   const fee = (order: Order) => BigInt(order.validatorFee ?? "0");
-  return others.reduce((sum, order) => sum + priceOf({ ...order, cost: BigInt(order.cost), validatorFee: fee(order) }, market), priceOf(wish, market));
+  return orders.reduce((sum, order) => sum + priceOf({ ...order, cost: BigInt(order.cost), validatorFee: fee(order) }, market), 0n);
 }
 
 /** Makes the objective, and the order that names it; with a permit if the token has such (`domain`) and it needs one. */
@@ -139,7 +143,25 @@ export async function signAndPost({ demand, hash: shown, permit, draft: { robot 
   return own;
 }
 
-/** Lets the wallet sign a permit. Throws `PermitRefused` if the token does not take it as the account's next one. */
+/** A new permit for the account's open orders, if the contracts may not take what they cost; null if they may. */
+export async function permitForOpen(account: Account, market: Market): Promise<Permit | null> {
+  const state = await get<AccountState>(`accounts/${account.address}`);
+  const needed = neededForOthers(state, market);
+  if (BigInt(state.token.allowance) >= needed) return null;
+  const { reader } = readerFor(account, market);
+  const domain = await domainOf(market.token.address, market.chainId, reader);
+  return domain && nextPermit(domain, account.address, market.factory, needed, reader);
+}
+
+/** Lets the wallet sign a permit for orders that wait, and sends it. */
+export async function signForOpen(permit: Permit, account: Account, market: Market): Promise<void> {
+  const signed = await signPermit(permit, account, market);
+  await postText("permits", encodeWire(signed));
+  rememberContract(market);
+  for (const order of ownOrders()) if (order.wire.startsWith("[")) rememberOrder({ ...order, wire: `[${encodeWire(signed)}${order.wire.slice(order.wire.indexOf("},{") + 1)}` });
+}
+
+/** Lets the wallet sign a permit. Throws `PermitRefused` if the token does not take it as the account's next one, `PermitUsed` if it has had that. */
 async function signPermit(permit: Permit, account: Account, market: Market): Promise<SignedPermit> {
   if (account.kind !== "wallet") throw new Error(texts.needsWallet);
   const { domain, owner, spender, value, nonce, deadline } = permit;
@@ -150,7 +172,7 @@ async function signPermit(permit: Permit, account: Account, market: Market): Pro
     await reader(domain.verifyingContract, calls.permit(owner, spender, value, deadline, `0x${signature}`));
   } catch {
     if ((await nonceOf(reader, domain.verifyingContract, owner)) === nonce) throw new PermitRefused(texts.permitRefused);
-    throw new Error(texts.changedLookAgain); // another order has become a contract with the last permit
+    throw new PermitUsed(texts.permitUsed);
   }
   return permitMessage(permit, signature);
 }

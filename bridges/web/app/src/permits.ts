@@ -29,6 +29,9 @@ export interface Permit {
 /** A token has not taken a permit that is signed as its standard says. */
 export class PermitRefused extends Error {}
 
+/** Another order has become a contract with the account's last permit. */
+export class PermitUsed extends Error {}
+
 const LIFETIME = 7 * 86_400;
 /** Characters of a token's name and version, which the wallet shows. */
 const LONGEST_NAME = 96;

@@ -3,7 +3,9 @@ import { post } from "../api";
 import { useApp, useData, useModel, useTopic } from "../app";
 import { amount, duration, plain, short } from "../format";
 import { Replay } from "../live";
-import { withdraw } from "../ordering";
+import { permitForOpen, signForOpen, withdraw } from "../ordering";
+import { permitWords } from "../permits";
+import type { Permit } from "../permits";
 import { texts } from "../texts";
 import { checkAnswer, checkOrder } from "../trust";
 import type { Answer, PostedOrder, Quote, Summary } from "../types";
@@ -36,6 +38,7 @@ export function FollowPage(props: { hash: string }) {
             {answers.map((answer) => <AnswerView key={answer.signature} order={order} answer={answer} />)}
             <StatementList statements={statements} />
             {state === "open" && statements.some((one) => one.kind === "declined") ? <WhatWouldWork order={order} changed={posted.reload} /> : null}
+            {state === "open" ? <AnotherPermit order={order} told={lastShort(statements)} /> : null}
             <OrderFacts order={order} />
             {state === "open" && account?.address === order.signer ? (
               <p class="row">
@@ -48,6 +51,42 @@ export function FollowPage(props: { hash: string }) {
         )}
       </Show>
     </>
+  );
+}
+
+/** When a provider last said that the contracts may not take the price; 0 if none did. */
+function lastShort(statements: PostedOrder["statements"]): number {
+  return Math.max(0, ...statements.filter((one) => one.code === "ERC20InsufficientAllowance").map((one) => one.at));
+}
+
+/** Offers to sign a permit again, if providers have `told` that another order has used that of this one. */
+function AnotherPermit({ order, told }: { order: PostedOrder["order"]; told: number }) {
+  const { account, market, notify } = useApp();
+  const [permit, setPermit] = useState<Permit | null>(null);
+  const signer = told && order.token === market.token.address && account?.kind === "wallet" && account.chainId === market.chainId && account.address === order.signer ? account : null;
+  useEffect(() => {
+    let current = true;
+    setPermit(null);
+    if (signer) permitForOpen(signer, market).then((found) => current && setPermit(found), () => {});
+    return () => {
+      current = false;
+    };
+  }, [signer, told]);
+  if (!signer || !permit) return null;
+  const sign = async () => {
+    await signForOpen(permit, signer, market).catch(async (problem) => {
+      setPermit(await permitForOpen(signer, market));
+      throw problem;
+    });
+    setPermit(null);
+    notify(texts.permitSigned);
+  };
+  return (
+    <div class="callout warn" id="another-permit">
+      <p>{texts.permitUsedByOther}</p>
+      <p>{permitWords(permit, market.token)} {texts.permitFor} <Name text={permit.spender} label={permit.spender} /></p>
+      <Action id="sign-permit" class="button" run={sign}>{texts.signPermit}</Action>
+    </div>
   );
 }
 

@@ -9,7 +9,7 @@ import { amount, duration, ether, plain } from "../format";
 import { parseAmount } from "../numbers";
 import { RobotDeclined, blocksOf, contractsOf, neededFor, orderLocally, prepare, priceOf, signAndPost } from "../ordering";
 import type { Prepared, Wish } from "../ordering";
-import { PermitRefused, domainOf, permitWords } from "../permits";
+import { PermitRefused, PermitUsed, domainOf, permitWords } from "../permits";
 import type { Domain } from "../permits";
 import { texts } from "../texts";
 import { allowedContract, readerFor, rememberContract } from "../trust";
@@ -274,7 +274,7 @@ export function OrderButton(props: { wish: Wish | null; declined?: (error: Robot
       </p>
       {account.kind === "local" ? <p class="hint">{texts.localSigns}</p> : null}
       <Dialog title={account.kind === "local" ? texts.whatYouOrder : texts.whatYouSign} open={review !== null && isCurrent(review)} onClose={() => setReview(null)}>
-        {review ? <Review of={review} isWanted={() => opened.current === review && isCurrent(review)} close={() => setReview(null)} declined={props.declined} refused={() => { setRefused(market.token.address); setReview(null); notify(texts.permitRefused, "bad"); }} /> : null}
+        {review ? <Review of={review} isWanted={() => opened.current === review && isCurrent(review)} close={() => setReview(null)} declined={props.declined} refused={() => { setRefused(market.token.address); setReview(null); notify(texts.permitRefused, "bad"); }} again={async () => { await open(); notify(texts.permitUsed); }} /> : null}
       </Dialog>
     </div>
   );
@@ -314,14 +314,18 @@ function needsOf(draft: Wish, state: AccountState, market: Market): Need[] {
 }
 
 /** What is ordered in words, and on demand the terms exactly as they are signed, with the hash that the browser made. */
-function Review(props: { of: Prepared; isWanted: () => boolean; close: () => void; declined?: (error: RobotDeclined) => void; refused: () => void }) {
+function Review(props: { of: Prepared; isWanted: () => boolean; close: () => void; declined?: (error: RobotDeclined) => void; refused: () => void; again: () => Promise<void> }) {
   const { block, robotAt } = useApp();
   const { draft, demand, hash, permit, market, account, objective, wish } = props.of;
   const [error, setError] = useState("");
   const robot = draft.robot ? robotAt(draft.robot) : undefined;
   const sign = async () => {
     setError("");
-    const order = demand ? await signAndPost(props.of, props.isWanted) : await orderLocally(draft, account.address, market);
+    const order = demand ? await signAndPost(props.of, props.isWanted).catch((problem) => {
+      if (problem instanceof PermitUsed) return props.again().then(() => null);
+      throw problem;
+    }) : await orderLocally(draft, account.address, market);
+    if (order === null) return;
     props.close();
     forgetTyped();
     location.hash = `#/order/${order}`;
