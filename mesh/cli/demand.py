@@ -25,14 +25,23 @@ from mesh.amounts import XRT
 from mesh.base.background import Background, in_daemon_thread
 from mesh.chain import permit_fee as permit_fee_of
 from mesh.cli.chain_client import check_balance
-from mesh.cli.files import file_or_cid, model_named, require_writable
+from mesh.cli.files import NamedModel, model_named, objective_given, objective_of, require_writable
 from mesh.cli.liability import device_lines
-from mesh.cli.options import ADDRESS, PATH, SECONDS, AmountText, TokenAmountText, with_json, with_settings
+from mesh.cli.options import (
+    ADDRESS,
+    PATH,
+    SECONDS,
+    AmountText,
+    TokenAmountText,
+    with_json,
+    with_objective,
+    with_settings,
+)
 from mesh.cli.order import withdraw_orders, withdrawal_lines
 from mesh.cli.output import format_duration, plural, print_json, print_line, printable, progress, wait_for_broken_pipe
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
-from mesh.watching.robots import labelled, robot_address
+from mesh.watching.robots import RobotDirectory, labelled, robot_address
 from schemas import Demand
 from schemas.address import ZERO_ADDRESS
 from schemas.decoding import decode_json
@@ -41,7 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
     from mesh import AnnouncedValidator
-    from mesh.agent.agent import Agent
+    from mesh.agent.agent import Agent, Messages
     from mesh.agent.contracts import Contract, Outcome, Progress
     from mesh.agent.trade import Order
     from mesh.agent.validators import ValidatorDirectory
@@ -480,8 +489,10 @@ async def agreed_fee(
 
 
 @click.command("demand")
-@click.option("--model", required=True, help="model, the behaviour that you order: its file, CID or ENS name")
-@click.option("--objective", required=True, help="objective to play: a file or a CID")
+@click.option(
+    "--model", help="model, the behaviour that you order: its file, CID or ENS name [that of --robot NAME|ADDRESS]"
+)
+@with_objective
 @click.option(
     "--cost",
     type=TokenAmountText(),
@@ -550,7 +561,9 @@ async def agreed_fee(
 async def demand(
     settings: Settings,
     *,
-    objective: str,
+    model: str | None,
+    objective: str | None,
+    messages: Messages,
     validator_fee: str | None,
     permit_fee: str | None = None,
     out: Path | None,
@@ -594,9 +607,14 @@ async def demand(
     from mesh.agent.agent import CHOICES as BY_QUOTE
     from mesh.agent.agent import Agent
 
-    model = await asyncio.to_thread(model_named, terms.pop("model"))
+    if model is None and robot in ("", *BY_QUOTE):
+        raise InputError(
+            "give --model, or --robot with a name or an address",
+            hint="`aira robots` lists the robots; `aira robots NAME` shows what one does",
+            code="invalid-options",
+        )
+    source = await asyncio.to_thread(objective_given, objective, messages)
     settings.keyfile_and_password()
-    source = await asyncio.to_thread(file_or_cid, objective)
     fee = None if validator_fee is None else XRT.parse(validator_fee)
     if fee and not terms["validator"]:
         raise InputError(
@@ -610,9 +628,10 @@ async def demand(
         )
     if out is not None:
         await asyncio.to_thread(require_writable, out)
+    named_model = await _model_of(settings, robot) if model is None else await asyncio.to_thread(model_named, model)
     checked = await asyncio.to_thread(_check_objective, settings, source) if isinstance(source, Path) else None
     # A server with the same settings may run beside this and serve metrics at the same port.
-    async with Agent(model.name, settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
+    async with Agent(named_model.name, settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
         given = [permit_fee or 0, terms["cost"], *([] if max_cost is None else [max_cost])]
         token, unit, amounts = await agent.parts.chain.tokens.amounts(*given, default=agent.settings.erc20_token)
         for_permit, cost, most = amounts[0], amounts[1], amounts[-1]
@@ -623,9 +642,9 @@ async def demand(
             tasks.start(wait_for_broken_pipe(), "readers of stdout")
             tasks.start(_say_how_far_it_read(agent), "catching up")
             printer.line(f"demand by {agent.address} for {agent.model}")
-            if model.file is not None:  # for robots and pages that read its description
-                await agent.add(model.file)
-            cid = source if isinstance(source, str) else await agent.add(source)
+            if named_model.file is not None:  # for robots and pages that read its description
+                await agent.add(named_model.file)
+            cid = await objective_of(agent, source)
             if most < cost:
                 raise InputError("--max-cost is less than --cost", hint="omit one of them", code="invalid-options")
             named = await _address_of(agent, robot) if robot and robot not in BY_QUOTE else ""
@@ -655,6 +674,19 @@ async def demand(
                 click.echo("aira: --retry and --start-within are only for new demands", err=True)
             contract = await _contract(agent, order, printer, withdraw_on_exit=withdraw_on_exit, wait=wait)
             await _wait_for_end(agent, contract, printer, out, withdraw_on_exit=withdraw_on_exit)
+
+
+async def _model_of(settings: Settings, robot: str) -> NamedModel:
+    """The model of a robot, by its name or address. Raises as `RobotDirectory.named`."""
+    from mesh.role.composition import watching
+
+    async with watching(settings) as (network, channel):
+        found = await RobotDirectory(network.session, channel).named(robot)
+    if not found.model:
+        raise InputError(
+            f"{labelled(found.address, found.name)} has no model", hint="give --model", code="model-missing"
+        )
+    return NamedModel(found.model)
 
 
 def _check_objective(settings: Settings, path: Path) -> Objective:

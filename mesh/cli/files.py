@@ -7,6 +7,7 @@ import os
 from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
@@ -16,6 +17,7 @@ from mesh.cli.chain_client import own_address
 from mesh.cli.output import printable, progress, short_address
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError, InputError
+from mesh.recording import pack_described
 from mesh.settings import NetworkSettings
 from schemas import InvalidCid, cid_of_file, parse_cid
 from schemas.address import is_ens_name
@@ -25,6 +27,7 @@ from schemas.model import MAX_MODEL_SIZE, is_description, parse_description, rea
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
+    from mesh.agent.agent import Agent, Messages
     from mesh.network import Network
     from mesh.settings import Settings
     from schemas.model import ModelDescription
@@ -104,6 +107,33 @@ def file_or_cid(text: str) -> Path | str:
             code="not-a-file-or-cid",
         ) from None
     return text
+
+
+def objective_given(objective: str | None, messages: Messages) -> Path | str | Messages:
+    """What `--objective` names, or the messages of `--message`: one of them has to be given. Raises `InputError`."""
+    if (objective is None) == (not messages):
+        raise InputError(
+            "give --objective or --message, and not both",
+            hint="""--objective FILE, or as often as needed --message '/topic {"field": 1}'""",
+            code="invalid-options",
+        )
+    return messages if objective is None else file_or_cid(objective)
+
+
+async def objective_of(agent: Agent, given: Path | str | Messages) -> str:
+    """The CID of what `objective_given` returned, once the agent's store has the file. Raises `InputError`.
+
+    Messages get the types that the description of the agent's model says.
+    """
+    if isinstance(given, str):
+        return given
+    if isinstance(given, Path):
+        return await agent.add(given)
+    description = await agent.runtime.models.find(await agent.parts.chain.names.model(agent.model))
+    with TemporaryDirectory(prefix="aira-messages-") as folder:
+        path = Path(folder) / "objective.mcap"
+        await asyncio.to_thread(pack_described, given, path, description)
+        return await agent.add(path)
 
 
 class NamedModel(NamedTuple):

@@ -140,7 +140,7 @@ def show(settings: Settings, model: str, as_json: bool) -> None:
             text = without_mark(file.read(MAX_MODEL_SIZE)).decode(errors="replace")
         print_line("\n".join(printable(line.expandtabs()) for line in text.splitlines()))
     else:
-        _print_description(description)
+        print_description(description)
 
 
 @command.command("schema", short_help="print the JSON Schema of descriptions")
@@ -149,7 +149,8 @@ def schema() -> None:
     click.echo(description_schema(), nl=False)
 
 
-def _print_description(description: ModelDescription) -> None:
+def print_description(description: ModelDescription) -> None:
+    """Print what a model does, and the topics of objectives and results, for people."""
     print_line(description.title)
     if description.description:
         print_line(f"\n{description.description}\n")

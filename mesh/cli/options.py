@@ -11,9 +11,14 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from mesh.amounts import AMOUNT, TOKEN_AMOUNT, XRT, InvalidAmount
+from mesh.cli.output import printable
+from mesh.errors import InputError
 from mesh.role.running import run_to_end
 from mesh.settings import DEFAULTS, MEANING, AccountSettings, load, options_of
+from schemas import InvalidKey
 from schemas.address import parse_address_or_name
+from schemas.decoding import InvalidData, decode_json
+from schemas.keys import topic_chunks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -72,6 +77,41 @@ CHAIN_SETTINGS: Final = (
 """The settings that name a chain, and the contracts on it."""
 TRANSACTION_SETTINGS: Final = ("data_dir", "max_fee_gwei", "confirmations", "poll_interval")
 """The settings for sending transactions."""
+
+
+class MessageText(click.ParamType[tuple[str, Any]]):
+    """A message of an objective: a topic and, in JSON, its value; None if there is no value. Raises `InputError`."""
+
+    name = "topic [json]"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, Any]:
+        """Return the topic and the value."""
+        topic, _, text = str(value).strip().partition(" ")
+        try:
+            return str(topic_chunks(topic)), decode_json(text) if text.strip() else None
+        except (InvalidKey, InvalidData) as error:
+            raise InputError(
+                f"{printable(str(value)[:60])!r} is not a topic and its value in JSON: {error}",
+                hint="""a message is like '/blink {"times": 2}', or '/blink' without a value""",
+                code="invalid-line",
+            ) from None
+
+
+def with_objective(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options that say what is done: `objective`, or `messages`; see `objective_given`."""
+    options = (
+        click.option("--objective", help="objective to play: a file or a CID"),
+        click.option(
+            "--message",
+            "messages",
+            type=MessageText(),
+            multiple=True,
+            help="""instead of --objective: a message to play, as '/blink {"times": 2}' (may be repeated)""",
+        ),
+    )
+    for option in reversed(options):
+        function = option(function)
+    return function
 
 
 class AddressText(click.ParamType[str]):

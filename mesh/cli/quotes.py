@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mesh.cli.files import file_or_cid, model_named
-from mesh.cli.options import with_json, with_settings, with_timeout
+from mesh.cli.files import model_named, objective_given, objective_of
+from mesh.cli.options import with_json, with_objective, with_settings, with_timeout
 from mesh.cli.output import format_duration, print_json, print_line, print_table, printable
 from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
 from mesh.watching.robots import labelled
@@ -18,6 +18,7 @@ from schemas.decoding import decode_json
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from mesh.agent.agent import Messages
     from mesh.amounts import Unit
     from mesh.settings import Settings
     from schemas.rpc import Quote
@@ -25,11 +26,13 @@ if TYPE_CHECKING:
 
 @click.command("quotes")
 @click.option("--model", required=True, help="model of the robots: its file, CID or ENS name")
-@click.option("--objective", required=True, help="objective that they would play: a file or a CID")
+@with_objective
 @with_timeout()
 @with_json
 @with_settings(NetworkSettings, "lighthouse_contract", "erc20_token", AccountSettings, ChainSettings)
-async def command(settings: Settings, model: str, objective: str, timeout: float, as_json: bool) -> None:
+async def command(
+    settings: Settings, model: str, objective: str | None, messages: Messages, timeout: float, as_json: bool
+) -> None:
     """Ask the robots of a model what they want for a job, when they would begin, and how long it takes.
 
     The cheapest is listed first, of each token that robots want to be paid in; those that want the token of the
@@ -40,9 +43,9 @@ async def command(settings: Settings, model: str, objective: str, timeout: float
 
     named = await asyncio.to_thread(model_named, model)
     settings.keyfile_and_password()
-    source = await asyncio.to_thread(file_or_cid, objective)
+    given = await asyncio.to_thread(objective_given, objective, messages)
     async with Agent(named.name, settings=replace(settings, metrics_listen="")) as agent:
-        quotes = await agent.quotes(agent.model, source, timeout=timeout)
+        quotes = await agent.quotes(agent.model, await objective_of(agent, given), timeout=timeout)
         units = await agent.parts.chain.tokens.units(quote.token for quote in quotes if quote.token)
         names = {quote.agent: agent.parts.robots.name(quote.agent) for quote in quotes}
     if as_json:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+import json
+import shlex
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 import msgspec
 
 from mesh.amounts import split_amount
 from mesh.cli.chain_client import open_chain
-from mesh.cli.files import model_named
+from mesh.cli.files import FETCH_SETTINGS, model_named, opened_store
 from mesh.cli.options import CHAIN_SETTINGS, with_json, with_settings, with_timeout
-from mesh.cli.output import format_duration, plural, print_json, print_line, print_table
+from mesh.cli.output import format_duration, plural, print_facts, print_json, print_line, print_table
 from mesh.errors import ChainError
-from mesh.settings import NetworkSettings
 from schemas.address import is_ens_name, parse_address, shortened
+from schemas.model import InvalidDescription, ValueSchema
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -26,16 +29,23 @@ if TYPE_CHECKING:
     from mesh.network import Channel
     from mesh.settings import Settings
     from mesh.watching import Robot
+    from schemas.model import ModelDescription, ModelTopic
+
+
+MODELS_READ: Final = 32
+"""Models whose descriptions are read for a list of robots."""
 
 
 @click.command("robots")
+@click.argument("robot", required=False)
 @click.option("--model", help="list only robots of this model: its file, CID or ENS name")
 @with_timeout()
 @with_json
-@with_settings(NetworkSettings, "lighthouse_contract", *CHAIN_SETTINGS)
-async def command(settings: Settings, model: str | None, timeout: float, as_json: bool) -> None:
-    """List the robots that are present on the lighthouse's channel: name, address, what each is doing, what a job
-    costs, and how its latest contracts ended.
+@with_settings(*FETCH_SETTINGS, "lighthouse_contract", *CHAIN_SETTINGS)
+async def command(settings: Settings, robot: str | None, model: str | None, timeout: float, as_json: bool) -> None:
+    """List the robots that are present on the lighthouse's channel: name, address, what each does and is doing, what a
+    job costs, and how its latest contracts ended. With ROBOT, a name or an address, show that one with all that can be
+    ordered of it, and the command that orders it.
 
     Names, places and prices are the owners' words: anybody may choose any name, so the address says who it is. The
     record counts the contracts of about a week, the 500 latest, that paid the robot or were refunded, also under its
@@ -45,33 +55,45 @@ async def command(settings: Settings, model: str | None, timeout: float, as_json
 
     named = None if model is None else (await asyncio.to_thread(model_named, model)).name
     async with watching(settings) as (network, channel):
-        robots, prices = await _list(settings, network.session, channel, named, timeout=timeout)
+        robots, prices = await _list(settings, network.session, channel, robot, named, timeout=timeout)
+        models = await _descriptions(settings, network.session, {one.model for one in robots} - {""})
     if as_json:
-        print_json({"lighthouse": channel.lighthouse, "robots": [msgspec.to_builtins(robot) for robot in robots]})
+        print_json({"lighthouse": channel.lighthouse, "robots": [msgspec.to_builtins(one) for one in robots]})
+    elif robot is not None:
+        for one in robots:
+            _print_robot(one, models.get(one.model), prices.get(one.price, one.price))
     elif robots:
         rows = [
             (
-                robot.name,
-                robot.address,
-                doing(robot),
-                prices.get(robot.price, robot.price),
-                record_of(robot),
-                robot.place,
-                reads(robot),
+                one.name,
+                one.address,
+                models[one.model].title if one.model in models else "",
+                doing(one),
+                prices.get(one.price, one.price),
+                record_of(one),
+                one.place,
+                reads(one),
             )
-            for robot in robots
+            for one in robots
         ]
-        print_table(("name", "address", "doing", "price", "record", "place", "reads"), rows)
+        print_table(("name", "address", "does", "now", "price", "record", "place", "reads"), rows)
     else:
         print_line(f"no robots{' of this model' if named else ''} on {channel.lighthouse}")
 
 
 async def _list(
-    settings: Settings, session: zenoh.Session, channel: Channel, model: str | None, *, timeout: float
+    settings: Settings,
+    session: zenoh.Session,
+    channel: Channel,
+    named: str | None,
+    model: str | None,
+    *,
+    timeout: float,
 ) -> tuple[list[Robot], Mapping[str, str]]:
-    """The robots with their records, and their prices for people where these name a token by its address.
+    """The robots, or the one that is named, with their records, and their prices where these name a token by its
+    address, for people.
 
-    As far as the node answers. Raises `UnknownName` and its like for a model.
+    As far as the node answers. Raises `UnknownName` and its like for a model, and as `RobotDirectory.named`.
     """
     from mesh.watching import RobotDirectory
 
@@ -79,13 +101,99 @@ async def _list(
     if model is not None and is_ens_name(model):
         async with open_chain(settings) as chain:
             model = await chain.names.model(model)
-    robots = await directory.present(model or "", timeout=timeout)
+    robots = (
+        await directory.present(model or "", timeout=timeout)
+        if named is None
+        else [await directory.named(named, model=model or "", timeout=timeout)]
+    )
     try:
         async with open_chain(settings) as chain:
             return await directory.count(chain, robots), await _prices(chain, robots)
     except ChainError as error:
         click.echo(f"aira: no records: {error}", err=True)
         return robots, {}
+
+
+async def _descriptions(
+    settings: Settings, session: zenoh.Session, models: Iterable[str]
+) -> Mapping[str, ModelDescription]:
+    """The descriptions of models, by CID, as far as the store has them or somebody serves them now."""
+    from mesh.content import Exchange
+    from mesh.role.models import Models
+
+    found = {}
+    async with opened_store(settings) as store, Exchange(session, store) as exchange:
+        known = Models(store, exchange)
+        for cid in sorted(models)[:MODELS_READ]:
+            with suppress(InvalidDescription):
+                if (description := await known.find(cid)) is not None:
+                    found[cid] = description
+    return found
+
+
+def _print_robot(robot: Robot, model: ModelDescription | None, price: str) -> None:
+    """A robot, what can be ordered of it, and how, for people."""
+    from mesh.cli.model import print_description
+
+    print_facts(
+        {
+            "robot": robot.name or None,
+            "address": robot.address,
+            "about": robot.about or None,
+            "now": doing(robot),
+            "price": price or None,
+            "record": record_of(robot),
+            "place": robot.place or None,
+            "reads": reads(robot) or None,
+        }
+    )
+    if model is None:
+        print_line(f"\nmodel {robot.model or 'none'}, which nobody here describes")
+        return
+    print_line("")
+    print_description(model)
+    if model.objective:
+        topics = [topic for topic in model.objective if topic.required] or list(model.objective[:1])
+        messages = " ".join(f"--message {shlex.quote(message_like(topic))}" for topic in topics)
+        cost = f" --cost {shlex.quote(robot.price)}" if robot.price else ""
+        print_line(f"\nto order it:  aira demand --robot {robot.address}{cost} {messages}")
+
+
+def message_like(topic: ModelTopic) -> str:
+    """A message that a topic allows, as `--message` takes it: defaults, or the least that is required."""
+    value = None if topic.value is None else example(topic.value)
+    return topic.topic if value is None else f"{topic.topic} {json.dumps(value, ensure_ascii=False)}"
+
+
+def example(schema: ValueSchema) -> Any:
+    """A value that a schema allows."""
+    if schema.default is not None:
+        return schema.default
+    if schema.enum:
+        return schema.enum[0]
+    match schema.type:
+        case "object":
+            return {name: example(schema.properties[name]) for name in schema.required if name in schema.properties}
+        case "array":
+            return [example(schema.items or ValueSchema())] * (schema.min_items or 0)
+        case "string":
+            return "x" * (schema.min_length or 0)
+        case "boolean":
+            return True
+        case "integer" | "number":
+            return _number_like(schema)
+    return None
+
+
+def _number_like(schema: ValueSchema) -> float:
+    if schema.minimum is not None:
+        return schema.minimum
+    if schema.exclusive_minimum is not None:
+        above = schema.exclusive_minimum + 1
+        most = schema.maximum if schema.exclusive_maximum is None else schema.exclusive_maximum
+        return above if most is None or above < most else (schema.exclusive_minimum + most) / 2
+    least = [0, schema.maximum, None if schema.exclusive_maximum is None else schema.exclusive_maximum - 1]
+    return min(number for number in least if number is not None)
 
 
 async def _prices(chain: Chain, robots: Iterable[Robot]) -> Mapping[str, str]:

@@ -9,6 +9,7 @@ from mesh.recording._converting import (
     described_line,
     messages_in,
     pack,
+    pack_described,
     pack_values,
     recording_file,
     recording_files,

@@ -162,6 +162,12 @@ def pack_values(
     return pack(messages, target, metadata=metadata)
 
 
+def pack_described(values: Iterable[tuple[str, Any]], target: Path, model: ModelDescription | None) -> PackSummary:
+    """Write JSON values on topics to an MCAP file, in order, all at time 0, with the types that the model's description
+    says. Raises `InputError`, and as `pack` does."""
+    return pack(messages_in(described_line(topic, value, model) for topic, value in values), target)
+
+
 def _payload(line: _ObjectiveLine) -> tuple[bytes, PayloadType]:
     value = line.value
     match line.type:

@@ -168,6 +168,39 @@ class RobotDirectory:
             self._rests_until = now + silent * (1 + REST)
         return profile
 
+    async def named(self, text: str, *, model: str = "", timeout: float = TIMEOUT) -> Robot:
+        """The robot that is present with that name or address, of the `model` (CID) if one is given.
+
+        Upper and lower case are the same. Raises `InputError`: `robot-unknown` if none has this name or address,
+        `robot-ambiguous` if several have it; `InvalidAddress`.
+        """
+        if text[:2].lower() == "0x":
+            profile = await self.find(parse_address(text))
+            if profile is None:
+                raise InputError(
+                    f"the robot {text} does not say what it is",
+                    hint="`aira robots` lists those that do",
+                    code="robot-unknown",
+                )
+            return robot_of(profile)
+        robots = await self.present(model, timeout=timeout)
+        found = [robot for robot in robots if robot.name.casefold() == text.strip().casefold()] if text.strip() else []
+        if len(found) == 1:
+            return found[0]
+        shown = [f"{robot.name or 'without a name'} {robot.address}" for robot in (found or robots)[:LISTED]]
+        if found:
+            raise InputError(
+                f"{len(found)} robots are called {text[:80]!r}: {', '.join(shown)}",
+                hint="give the address of the one that you mean",
+                code="robot-ambiguous",
+            )
+        there = f"these are present: {', '.join(shown)}" if shown else "no robot is present that says who it is"
+        raise InputError(
+            f"no robot is called {text[:80]!r}",
+            hint=f"{there}; `aira robots` lists them",
+            code="robot-unknown",
+        )
+
     def name(self, address: str) -> str:
         """What the robot at an address calls itself, as far as that is known; or an empty text."""
         profile, _ = self._known.get(address, (None, 0.0))
@@ -188,28 +221,7 @@ class RobotDirectory:
 
 
 async def robot_address(session: zenoh.Session, channel: Channel, named: str, *, model: str = "") -> str:
-    """The address (EIP-55) of the robot with a name, or an address as it is given.
-
-    A name is that of a robot that is present now, of the `model` (CID) if one is given; upper and lower case are the
-    same. Raises `InputError`: `robot-unknown` if none has this name, `robot-ambiguous` if several have it;
-    `InvalidAddress`.
-    """
+    """The address (EIP-55) of the robot with a name, as `RobotDirectory.named`, or an address as it is given."""
     if named[:2].lower() == "0x":
         return parse_address(named)
-    robots = await RobotDirectory(session, channel).present(model)
-    found = [robot for robot in robots if robot.name.casefold() == named.strip().casefold()] if named.strip() else []
-    if len(found) == 1:
-        return found[0].address
-    shown = [f"{robot.name or 'without a name'} {robot.address}" for robot in (found or robots)[:LISTED]]
-    if found:
-        raise InputError(
-            f"{len(found)} robots are called {named[:80]!r}: {', '.join(shown)}",
-            hint="give the address of the one that you mean",
-            code="robot-ambiguous",
-        )
-    there = f"these are present: {', '.join(shown)}" if shown else "no robot is present that says who it is"
-    raise InputError(
-        f"no robot is called {named[:80]!r}",
-        hint=f"{there}; `aira robots` lists them",
-        code="robot-unknown",
-    )
+    return (await RobotDirectory(session, channel).named(named, model=model)).address
