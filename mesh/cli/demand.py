@@ -561,9 +561,9 @@ async def agreed_fee(
 async def demand(
     settings: Settings,
     *,
-    model: str | None,
-    objective: str | None,
-    messages: Messages,
+    model: str | None = None,
+    objective: str | None = None,
+    messages: Messages = (),
     validator_fee: str | None,
     permit_fee: str | None = None,
     out: Path | None,
@@ -613,6 +613,7 @@ async def demand(
             hint="`aira robots` lists the robots; `aira robots NAME` shows what one does",
             code="invalid-options",
         )
+    named_model = None if model is None else await asyncio.to_thread(model_named, model)
     source = await asyncio.to_thread(objective_given, objective, messages)
     settings.keyfile_and_password()
     fee = None if validator_fee is None else XRT.parse(validator_fee)
@@ -628,7 +629,7 @@ async def demand(
         )
     if out is not None:
         await asyncio.to_thread(require_writable, out)
-    named_model = await _model_of(settings, robot) if model is None else await asyncio.to_thread(model_named, model)
+    named_model = named_model or await _model_of(settings, robot)
     checked = await asyncio.to_thread(_check_objective, settings, source) if isinstance(source, Path) else None
     # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(named_model.name, settings=replace(settings, metrics_listen="")) as agent, Background() as tasks:
@@ -684,7 +685,7 @@ async def _model_of(settings: Settings, robot: str) -> NamedModel:
         found = await RobotDirectory(network.session, channel).named(robot)
     if not found.model:
         raise InputError(
-            f"{labelled(found.address, found.name)} has no model", hint="give --model", code="model-missing"
+            f"{labelled(found.address, found.name)} names no model", hint="give --model", code="robot-unknown"
         )
     return NamedModel(found.model)
 

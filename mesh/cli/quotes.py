@@ -42,8 +42,8 @@ async def command(
     from mesh.agent.agent import Agent
 
     named = await asyncio.to_thread(model_named, model)
-    settings.keyfile_and_password()
     given = await asyncio.to_thread(objective_given, objective, messages)
+    settings.keyfile_and_password()
     async with Agent(named.name, settings=replace(settings, metrics_listen="")) as agent:
         quotes = await agent.quotes(agent.model, await objective_of(agent, given), timeout=timeout)
         units = await agent.parts.chain.tokens.units(quote.token for quote in quotes if quote.token)

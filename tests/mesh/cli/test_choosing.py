@@ -125,6 +125,31 @@ async def test_quotes_list_the_cheapest_first_and_refusals_with_their_reasons_be
         assert offer.endswith(f"Lift 1  {lifts.address('Lift 1')}")
 
 
+async def test_a_robot_is_hired_by_its_name_and_a_message_without_any_file(lifts: Lifts) -> None:
+    lifts.may_end.set()
+    person = lifts.site.variables("person")
+
+    async def typed(*words: str) -> Any:
+        return await asyncio.to_thread(aira, *words, **person)
+
+    async with lifts.site.provider(), lifts.at_work("9wn", "4wn"):
+        message = ("--message", '/say "two words"')
+        quotes = await typed("quotes", "--model", str(lifts.model), *message)
+        assert [line.split()[0] for line in quotes.stdout.splitlines()[1:]] == ["0.000000004", "0.000000009"]
+        done = await typed("demand", "--robot", "lift 2", "--cost", "4wn", *message)
+        assert f" with {lifts.short('Lift 2')}\n" in done.stdout
+        shown = await typed("objective", "cat", done.stdout.split("recording ")[1].strip())
+        assert shown.stdout.split()[2:] == ["/say", "(objective)", '"two', 'words"']
+        unfit = await typed("demand", "--robot", "lift 2", "--message", "/say 5")
+        assert unfit.returncode == 2
+        assert unfit.stderr.endswith("value must be a string, not 5 [objective-unfit]\n")
+        refused(await typed("demand", "--robot", "lift 2", "--message", "/say five"), "invalid-line")
+        refused(await typed("demand", "--robot", "lift 3", *message), "robot-unknown")
+        refused(await typed("demand", "--robot", "cheapest", *message), "invalid-options")
+        refused(await typed("demand", "--robot", "lift 2"), "invalid-options")
+        refused(await lifts.call("demand", *message), "invalid-options")
+
+
 async def test_the_cheapest_robot_is_hired_and_the_order_names_it_with_its_price(lifts: Lifts) -> None:
     lifts.may_end.set()
     async with lifts.site.provider(), lifts.at_work("9wn", "4wn"):

@@ -54,7 +54,9 @@ MISTAKES: Final = (
     Mistake(f"rpc {LIGHTHOUSE}", "invalid-usage", "--list"),
     Mistake("completion tcsh", "invalid-usage", "'tcsh'"),
     # what is missing
-    Mistake(f"demand --model {CID}", "invalid-usage", "--objective"),
+    Mistake(f"demand --model {CID}", "invalid-options", "--objective"),
+    Mistake("demand --objective objective.mcap", "invalid-options", "--robot"),
+    Mistake("demand --robot lift --message go", "invalid-line", "'go'"),
     Mistake("cid", "invalid-usage", "FILES"),
     Mistake("router config", "invalid-usage", "--out"),
     Mistake("router acl", "roster-missing", "--roster"),

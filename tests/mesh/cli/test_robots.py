@@ -5,16 +5,22 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import shlex
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
+import pytest
+
 from mesh.cli import status as commands
-from mesh.cli.robots import command, doing, record_of
+from mesh.cli.options import MessageText
+from mesh.cli.robots import command, doing, message_like, record_of
 from mesh.cli.watch import watch
+from mesh.errors import InputError
 from mesh.network import Endpoints, Network
 from mesh.watching.robots import Robot
 from schemas import ProfileKey
 from schemas.address import shortened
+from schemas.model import ModelTopic, ValueSchema
 from tests.mesh.agent.test_own_model import DRIVE, driving
 from tests.mesh.agent.test_profile import robot_at
 from tests.support.commands import coroutine
@@ -22,12 +28,11 @@ from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.orders import ROBOT
 from tests.support.ports import free_port
+from tests.support.raising import raises_with
 from tests.support.waiting import until, until_answered
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
-
-    import pytest
 
     from mesh.agent.agent import Agent
     from mesh.settings import Settings
@@ -48,19 +53,67 @@ async def lift(place: Place) -> AsyncIterator[tuple[Agent, Settings]]:
 
 async def test_robots_are_listed_also_without_a_node(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with lift(place) as (robot, settings):
-        await coroutine(command)(settings, None, timeout=60.0, as_json=False)
+        await coroutine(command)(settings, None, None, timeout=60.0, as_json=False)
         shown = capsys.readouterr()
         head, row = shown.out.splitlines()
-        assert cells(head) == ["name", "address", "doing", "price", "record", "place", "reads"]
-        assert cells(row) == ["Lift 1", robot.address, "idle", "5 XRT", "unknown", "Hall 3"]
+        assert cells(head) == ["name", "address", "does", "now", "price", "record", "place", "reads"]
+        assert cells(row) == ["Lift 1", robot.address, DRIVE.title, "idle", "5 XRT", "unknown", "Hall 3"]
         assert shown.err.startswith("aira: no records: ")
-        await coroutine(command)(settings, DRIVE.cid, timeout=60.0, as_json=True)
+        await coroutine(command)(settings, None, DRIVE.cid, timeout=60.0, as_json=True)
         (found,) = json.loads(capsys.readouterr().out)["robots"]
         assert (found["name"], found["address"], found["model"]) == ("Lift 1", robot.address, DRIVE.cid)
         assert (found["state"], found["queue"], found["wait"]) == ("idle", 0, 0)
         assert (found["paid"], found["refunded"]) == (None, None)
-        await coroutine(command)(settings, MODEL, timeout=60.0, as_json=False)
+        await coroutine(command)(settings, None, MODEL, timeout=60.0, as_json=False)
         assert capsys.readouterr().out == f"no robots of this model on {place.market.deployment.lighthouse_name}\n"
+
+
+async def test_a_robot_is_shown_with_the_command_that_orders_it(
+    place: Place, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with lift(place) as (robot, settings):
+        await coroutine(command)(settings, "LIFT 1", None, timeout=60.0, as_json=False)
+        shown = capsys.readouterr().out
+        assert cells(shown.splitlines()[1]) == ["address", robot.address]
+        assert DRIVE.title in shown.splitlines()
+        (order,) = re.findall("^to order it:  aira (.+)$", shown, re.MULTILINE)
+        named = shlex.split(order)
+        assert named[:-1] == ["demand", "--robot", robot.address, "--cost", "5 XRT", "--message"]
+        topic, value = MessageText().convert(named[-1], None, None)
+        described = DRIVE.topic(topic)
+        assert described is not None
+        assert described.value is not None
+        assert described.value.fault(value) == ""
+        with raises_with(InputError, code="robot-unknown"):
+            await coroutine(command)(settings, "Lift 2", None, timeout=60.0, as_json=False)
+        with raises_with(InputError, code="robot-unknown"):
+            await coroutine(command)(settings, place.address("person"), None, timeout=60.0, as_json=False)
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [
+        ValueSchema(),
+        ValueSchema(type="boolean"),
+        ValueSchema(type="integer", minimum=1, maximum=100),
+        ValueSchema(type="integer", maximum=-3),
+        ValueSchema(type="number", exclusive_minimum=0, maximum=0.5),
+        ValueSchema(type="number", exclusive_minimum=2),
+        ValueSchema(type="number", exclusive_maximum=-1),
+        ValueSchema(type="number", minimum=1, default=5),
+        ValueSchema(type="string", min_length=3),
+        ValueSchema(type="string", enum=("left", "right")),
+        ValueSchema(type="array", items=ValueSchema(type="integer", minimum=2), min_items=2),
+        ValueSchema(
+            type="object",
+            properties={"x": ValueSchema(type="number"), "note": ValueSchema(type="string")},
+            required=("x",),
+        ),
+    ],
+)
+def test_the_message_that_is_shown_is_one_that_the_robot_takes(schema: ValueSchema) -> None:
+    topic, value = MessageText().convert(message_like(ModelTopic(topic="/go", value=schema)), None, None)
+    assert (topic, schema.fault(value)) == ("/go", "")
 
 
 def cells(line: str) -> list[str]:
