@@ -163,6 +163,8 @@ async def test_a_person_without_ether_pays_in_both_tokens_by_permits(market: Two
         for block in range(first, await chain.block_number() + 1):
             assert await chain.node.request("eth_getBalance", person, hex(block)) == "0x0"
         assert await chain.node.transaction_count(person, block="pending") == sent
+        left = [await chain.tokens.allowance(person, chain.factory, token=token) for token in (chain.xrt, USDC)]
+        assert left == [0, 0], [one.stdout + one.stderr for one in done]
     five, half = 5 * 10**XRT.decimals, 7 * DOLLAR // 2
     assert await market.balances("robot") == (robot[0] + five, 0)
     assert await market.balances("rival") == (rival[0], half)
