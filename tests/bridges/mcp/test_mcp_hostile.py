@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mesh.testing import MarketChain
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
-GUIDE = Path(__file__).parents[3] / "docs" / "guides" / "mcp.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "door-attacks.md"
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
@@ -230,12 +230,12 @@ async def test_at_the_end_the_log_holds(world: World) -> None:
     assert checked.holds, checked.fault
 
 
-async def test_the_guide_has_the_cases() -> None:
-    assert table() in GUIDE.read_text(encoding="utf-8")
+async def test_the_page_has_the_cases() -> None:
+    assert table() in PAGE.read_text(encoding="utf-8")
     assert len(CALLS) + len(HIDDEN_TOOLS) + len(URIS) + len(STORIES) >= 60
 
 
 @pytest.mark.parametrize("story", STORIES, ids=[one.tried for one in STORIES])
-async def test_each_story_of_the_guide_has_its_test(story: Story) -> None:
+async def test_each_story_of_the_page_has_its_test(story: Story) -> None:
     module, _, name = story.test.rpartition(".")
     assert callable(getattr(import_module(f"tests.{module}"), name))
