@@ -12,15 +12,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.cli import status as commands
+from mesh.cli.files import objective_of
 from mesh.cli.options import MessageText
 from mesh.cli.robots import command, doing, message_like, record_of
 from mesh.cli.watch import watch
 from mesh.errors import InputError
 from mesh.network import Endpoints, Network
+from mesh.recording import open_objective
 from mesh.watching.robots import Robot
 from schemas import ProfileKey
 from schemas.address import shortened
-from schemas.model import ModelTopic, ValueSchema
+from schemas.model import ModelDescription, ModelTopic, ValueSchema
 from tests.mesh.agent.test_own_model import DRIVE, driving
 from tests.mesh.agent.test_profile import robot_at
 from tests.support.commands import coroutine
@@ -114,6 +116,15 @@ async def test_a_robot_is_shown_with_the_command_that_orders_it(
 def test_the_message_that_is_shown_is_one_that_the_robot_takes(schema: ValueSchema) -> None:
     topic, value = MessageText().convert(message_like(ModelTopic(topic="/go", value=schema)), None, None)
     assert (topic, schema.fault(value)) == ("/go", "")
+
+
+async def test_messages_get_the_types_that_the_model_says(place: Place) -> None:
+    volume = ModelTopic(topic="/volume", encoding="application/json;Volume", value=ValueSchema(type="integer"))
+    model = place.save(ModelDescription(title="Speaker", objective=(volume,)).encode(), "model.json")
+    async with place.agent("person", model) as person:
+        cid = await objective_of(person, [MessageText().convert("/volume 5", None, None)])
+        (message,) = open_objective(await person.fetch(cid)).messages()
+        assert (message.topic, message.payload, message.type.schema_name) == ("/volume", b"5", "Volume")
 
 
 def cells(line: str) -> list[str]:
