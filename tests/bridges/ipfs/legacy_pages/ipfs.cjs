@@ -6,8 +6,20 @@ const { join } = require('path')
 
 async function open(url, packages) {
   if (!packages) return opened2018(url)
-  const ipfs = await (url.startsWith('http') ? client(url, packages) : node(url, packages))
-  return { ipfs, add: async (bytes) => String((await ipfs.add(bytes)).cid) }
+  const isClient = url.startsWith('http')
+  const ipfs = await (isClient ? client(url, packages) : node(url, packages))
+  const add = async (bytes) => String((await ipfs.add(bytes)).cid)
+  return { ipfs, add, heard: () => isClient ? null : heard(ipfs) }
+}
+
+// Wait until the node at the other end says that it listens to what this one does: what is sent before reaches nobody.
+async function heard(ipfs) {
+  for (;;) {
+    const topics = await ipfs.pubsub.ls()
+    const peers = await Promise.all(topics.map((topic) => ipfs.pubsub.peers(topic)))
+    if (peers.length && peers.every((known) => known.length)) return
+    await new Promise((resolve) => setTimeout(resolve, 100))
+  }
 }
 
 async function client(url, packages) {
@@ -37,7 +49,7 @@ function opened2018(url) {
     }
     return hash
   }
-  return { ipfs, add }
+  return { ipfs, add, heard: () => null }
 }
 
 module.exports = { open }

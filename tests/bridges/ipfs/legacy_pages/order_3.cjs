@@ -20,7 +20,7 @@ const report = (name, value) => console.log(JSON.stringify({ name, value }))
 async function main() {
   const web3 = new Web3(new Web3.providers.HttpProvider(url))
   const account = web3.eth.accounts[2]
-  const { ipfs, add } = await open(ipfsUrl, packages)
+  const { ipfs, add, heard } = await open(ipfsUrl, packages)
   report('daemon', [(await ipfs.version()).version, (await ipfs.id()).id])
   const hash = await add(Buffer.from(content, 'base64'))
   const provider = new MessageProviderIpfsApi(ipfs)
@@ -36,6 +36,7 @@ async function main() {
   const made = new Promise((resolve) => robonomics.watchLiability(null, resolve))
   // What it returns looks at blocks only from when the demand is sent, and waits for a callback that today's js-ipfs does
   // not call.
+  await heard()
   robonomics.postDemand(model, terms)
   const liability = await made
   report('liability', liability.address)

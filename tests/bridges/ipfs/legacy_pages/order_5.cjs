@@ -13,7 +13,7 @@ const report = (name, value) => console.log(JSON.stringify({ name, value }))
 async function main() {
   const web3 = new Web3(new Web3.providers.WebsocketProvider(url.replace('http', 'ws')))
   const address = (await web3.eth.getAccounts())[2]
-  const { ipfs, add } = await open(ipfsUrl, packages)
+  const { ipfs, add, heard } = await open(ipfsUrl, packages)
   const hash = await add(Buffer.from(content, 'base64'))
   const Provider = ipfsUrl.startsWith('http') ? MessageProviderIpfsApi : MessageProviderIpfs
   const robonomics = new Robonomics({
@@ -29,6 +29,7 @@ async function main() {
   // What its `sendDemand` returns subscribes to contracts only when the demand is sent: a quick market has made it by then.
   const made = new Promise((resolve, reject) =>
     robonomics.onLiability((error, liability) => error ? reject(error) : resolve(liability)))
+  await heard()
   await robonomics.sendDemand({
     model, objective: hash, token: robonomics.xrt.address, lighthouse: robonomics.lighthouse.address, cost: 42,
     deadline: 100000000
