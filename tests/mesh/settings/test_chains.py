@@ -48,7 +48,7 @@ def test_times_are_counted_in_the_blocks_that_contracts_see() -> None:
 
 
 def test_the_page_has_the_table() -> None:
-    page = (ROOT / "docs" / "guides" / "chains.md").read_text()
+    page = (ROOT / "docs" / "reference" / "chains.md").read_text()
     table = page.partition("| `chain` | network |")[2].partition("\n\n")[0]
     rows = [
         tuple(cell.strip() for cell in line.strip("|").split("|")) for line in table.splitlines() if line[:3] == "| `"
