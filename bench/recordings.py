@@ -17,7 +17,7 @@ from common import SPAWN, process, router
 from mesh.agent.jobs import JobRecordings, JobRun
 from mesh.agent.ledger import Ledger
 from mesh.network import Endpoints, Network
-from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, open_objective, play
+from mesh.recording import AT_ONCE, Recorder, RecordingAbout, open_objective, play
 from schemas import ZERO_ADDRESS, Liability, cid_of_bytes
 from schemas.payloads import JSON
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.handlers import Job
-    from mesh.recording import Pace, Played
+    from mesh.recording import Played
 
 ROUNDS: Final = 3
 KEY: Final = "aira/bench/topic"
@@ -76,10 +76,10 @@ def measure_job(folder: Path, seconds: int) -> dict[str, float]:
     with router() as (endpoint, _):
         late, rate = float("inf"), 0.0
         for number in range(ROUNDS):
-            times = asyncio.run(_work(endpoint, folder / f"job-{number}", path, RecordedTimes()))
+            times = asyncio.run(_work(endpoint, folder / f"job-{number}", path, 1.0))
             expected = (moment - times[0] - step / HERTZ for step, moment in enumerate(times))
             late = min(late, statistics.quantiles(expected, n=100)[98])
-            times = asyncio.run(_work(endpoint, folder / f"at-once-{number}", path, AtOnce()))
+            times = asyncio.run(_work(endpoint, folder / f"at-once-{number}", path, AT_ONCE))
             rate = max(rate, count / (times[-1] - times[0]))
     return {"p99_ms": round(late * 1e3, 3), "messages_per_s": round(rate)}
 
@@ -166,7 +166,7 @@ async def _play(path: Path) -> list[float]:
     return late
 
 
-async def _work(endpoint: str, folder: Path, path: Path, pace: Pace) -> list[float]:
+async def _work(endpoint: str, folder: Path, path: Path, speed: float) -> list[float]:
     """When the handler of a job got each message of the objective at `path`."""
     times: list[float] = []
     objective = await asyncio.to_thread(open_objective, path)
@@ -178,7 +178,7 @@ async def _work(endpoint: str, folder: Path, path: Path, pace: Pace) -> list[flo
         await ledger.add_job(LIABILITY)
         (job,) = await ledger.jobs()
         recorder = await JobRecordings(folder, ZERO_ADDRESS).open(LIABILITY)
-        run = JobRun(network.session, ZERO_ADDRESS, job, recorder, objective=objective, pace=pace)
+        run = JobRun(network.session, ZERO_ADDRESS, job, recorder, objective=objective, speed=speed)
         run.open()
         await run.play_and_save(handle, ledger)
         await run.suspend(ledger)

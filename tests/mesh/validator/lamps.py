@@ -16,7 +16,7 @@ from msgspec import Meta
 from mesh.agent.jobs import JobRecordings, JobRun
 from mesh.agent.ledger import Ledger
 from mesh.base.clock import SYSTEM_CLOCK
-from mesh.recording import AtOnce, RecordedTimes, Recorders, open_objective
+from mesh.recording import AT_ONCE, Recorders, open_objective
 from mesh.validator.judging import Case, Judgement, judge
 from mesh.validator.policies import own_policy, policy_of
 from schemas import (
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from mesh.agent.handlers import Job
     from mesh.base.clock import Clock
-    from mesh.recording import Pace, Played
+    from mesh.recording import Played
     from mesh.validator.policies import Evidence, Policy
 
     Handler = Callable[[Job, Played], Awaitable[object]]
@@ -195,13 +195,13 @@ class LampRobot:
         liability, since = liability or contract(name, objective, robot=self._robot), time.time_ns()
         self.folder.mkdir(parents=True, exist_ok=True)
         recorded = frozenset(topics.split(",")) if topics else None
-        pace = AtOnce() if playback == "at-once" else RecordedTimes()
+        speed = AT_ONCE if playback == "at-once" else 1.0
         async with Ledger(self.folder / "ledger.sqlite") as ledger:
             await ledger.add_job(liability)
             recording = None
             while recording is None:
                 with suppress(Crashed, Stopped):
-                    recording = await self._run(ledger, pace, recorded, liability, objective, handler)
+                    recording = await self._run(ledger, speed, recorded, liability, objective, handler)
         return FinishedJob(
             liability=liability,
             objective=objective,
@@ -214,7 +214,7 @@ class LampRobot:
     async def _run(
         self,
         ledger: Ledger,
-        pace: Pace,
+        speed: float,
         topics: frozenset[str] | None,
         liability: Liability,
         objective: Path,
@@ -231,7 +231,7 @@ class LampRobot:
             job,
             await recordings.open(liability),
             objective=await asyncio.to_thread(open_objective, objective),
-            pace=pace,
+            speed=speed,
             recorded=topics,
         )
         run.open()
