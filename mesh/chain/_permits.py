@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
 from mesh.base.clock import SYSTEM_CLOCK
@@ -22,7 +23,7 @@ LIFETIME: Final = 7 * 86_400
 OWNERS: Final = 2048
 """Accounts whose permits are remembered."""
 PER_OWNER: Final = 8
-"""Tokens of one owner for which permits are remembered."""
+"""Permits of one owner that are remembered."""
 TOKEN_GAS: Final = 100_000
 """Gas for each question to a token."""
 _WORD: Final = 32
@@ -49,15 +50,16 @@ def permit_arguments(permit: Permit) -> PermitArguments:
 
 
 class Permits:
-    """Signs the account's permits for the factory, and remembers the last one of each owner and token.
+    """Signs the account's permits for the factory, and remembers the best one of each owner, token and nonce.
 
-    A permit is for the token whose domain it has: its signature covers that, and not the token that it names.
+    A permit is for the token whose domain it has: its signature covers that, and not the token that it names. Those of
+    earlier nonces stay while there is room: a reorganisation may undo that the token has taken a later one.
     """
 
     def __init__(self, contracts: Contracts, *, clock: Clock = SYSTEM_CLOCK) -> None:
         self._contracts, self._node, self._clock = contracts, contracts.node, clock
-        self._known: BoundedDict[str, dict[str, Permit]] = BoundedDict(OWNERS)
-        """By owner and domain."""
+        self._known: BoundedDict[str, dict[tuple[str, int], Permit]] = BoundedDict(OWNERS)
+        """By owner, then by domain and nonce."""
         self._signed: BoundedDict[str, Permit] = BoundedDict(OWNERS)
         """The account's own, by token."""
 
@@ -75,29 +77,38 @@ class Permits:
     def note(self, permit: Permit) -> bool:
         """Remember a signed permit, whose signer is its owner; whether it is better than what was known.
 
-        One is better with a later nonce or, with the same, if it approves more or for longer; any is better than an
-        expired one. It must be for the factory.
+        With the same nonce, one is better if it approves more or for longer; any is better than an expired one. It must
+        be for the factory. If an owner has too many, an expired one makes room, or one whose nonce is not the last.
         """
         is_taken = self._contracts.version.takes_permits and permit.spender == self._contracts.factory
         if not is_taken or self._is_over(permit):
             return False
-        permits = self._known.get(permit.owner, {})
-        known = permits.get(permit.domain)
-        if len(permits) >= PER_OWNER if known is None else _rank(known) >= _rank(permit) and not self._is_over(known):
+        known = self._known.get(permit.owner, {}).get((permit.domain, permit.nonce))
+        if known is not None and _rank(known) >= _rank(permit) and not self._is_over(known):
             return False
-        self._known[permit.owner] = permits | {permit.domain: permit}
+        return self._keep(permit)
+
+    def _keep(self, permit: Permit) -> bool:
+        """Remember a permit, perhaps instead of another one; whether there is room for it."""
+        permits, key = self._known.get(permit.owner, {}).copy(), (permit.domain, permit.nonce)
+        permits[key] = permit
+        if len(permits) > PER_OWNER:
+            last = dict(sorted(permits))  # the last nonce of each domain
+            spare = [one for one, known in permits.items() if self._is_over(known) or one[1] < last[one[0]]]
+            dropped = min(spare, key=itemgetter(1), default=key)
+            if dropped == key:
+                return False
+            del permits[dropped]
+        self._known[permit.owner] = permits
         return True
 
     def has_any_of(self, owner: str) -> bool:
         """Whether a permit of this owner is known, for whatever token."""
         return owner in self._known
 
-    def of(self, owner: str, domain: bytes | None) -> Permit | None:
-        """The last known permit of an owner for the token with this domain, unless it is expired.
-
-        The token may have taken it already.
-        """
-        permit = None if domain is None else self._known.get(owner, {}).get(domain.hex())
+    def of(self, owner: str, domain: bytes, nonce: int) -> Permit | None:
+        """The known permit of an owner with this nonce for the token with this domain, unless it is expired."""
+        permit = self._known.get(owner, {}).get((domain.hex(), nonce))
         return None if permit is None or self._is_over(permit) else permit
 
     def own(self, token: str) -> Permit | None:
@@ -136,7 +147,7 @@ class Permits:
         except (Reverted, NoContracts):
             return None
         self._signed[token] = permit
-        self._known[owner] = self._known.get(owner, {}) | {permit.domain: permit}
+        self._keep(permit)
         return permit
 
     async def are_taken(self, token: str) -> bool:
@@ -174,5 +185,5 @@ def _domain_of(name: bytes, version: bytes, chain_id: int, token: str) -> bytes 
     return keccak256(b"".join((_DOMAIN_TYPE, *texts, *words)))
 
 
-def _rank(permit: Permit) -> tuple[int, int, int]:
-    return permit.nonce, permit.value, permit.deadline
+def _rank(permit: Permit) -> tuple[int, int]:
+    return permit.value, permit.deadline

@@ -166,13 +166,13 @@ class Funds:
         except (Reverted, NoContracts):
             return None
         allowed, nonce, domain = answers
-        permit = self._permits.of(owner, domain)
-        if permit is None or allowed is None or nonce is None:
+        if allowed is None or nonce is None or domain is None:
             return None
-        if int.from_bytes(nonce) == permit.nonce:
+        count = int.from_bytes(nonce)
+        if (permit := self._permits.of(owner, domain, count)) is not None:
             return permit if fee or int.from_bytes(allowed) < cost else None
         # Somebody has brought it to the token, so the allowance stands; it still says that its owner pays the fee.
-        return permit if fee and int.from_bytes(nonce) == permit.nonce + 1 else None
+        return self._permits.of(owner, domain, count - 1) if fee else None
 
     async def shortages(self, orders: Sequence[Verified[Order]], *, fresh: bool = False) -> list[str]:
         """What each order's maker lacks to pay what the order costs it, as the contracts call it; empty if nothing.
@@ -223,10 +223,10 @@ class Funds:
         self, holder: str, funding: Funding, nonce: bytes | None = None, domain: bytes | None = None
     ) -> Funding:
         """Funding with the holder's permit as the allowance, if the token takes it by its nonce and domain."""
-        permit = self._permits.of(holder, domain)
-        if permit is None or funding == NO_TOKEN or nonce != permit.nonce.to_bytes(_WORD, "big"):
+        if funding == NO_TOKEN or nonce is None or domain is None or len(nonce) != _WORD:
             return funding
-        return funding._replace(allowance=max(funding.allowance, permit.value))
+        permit = self._permits.of(holder, domain, int.from_bytes(nonce))
+        return funding if permit is None else funding._replace(allowance=max(funding.allowance, permit.value))
 
 
 async def asked_together(

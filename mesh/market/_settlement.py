@@ -766,9 +766,10 @@ class Settlement:
 
     def note_permit(self, permit: Verified[Permit]) -> None:
         """Remember a permit beside a demand: its maker can pay by it. It is sent again as often as the demand is."""
-        if permit.signer in self.blocked or not self._parts.chain.funds.note(permit.message):
-            known = self._parts.chain.permits.of(permit.signer, bytes.fromhex(permit.message.domain))
-            if permit.signer in self.blocked or known != permit.message:
+        message, is_blocked = permit.message, permit.signer in self.blocked
+        if is_blocked or not self._parts.chain.funds.note(message):
+            known = self._parts.chain.permits.of(permit.signer, bytes.fromhex(message.domain), message.nonce)
+            if is_blocked or known != message:
                 self._parts.drops.count("permits", permit.signer)
             self._parts.forget(permit, after=self._pause)
 

@@ -91,6 +91,29 @@ async def test_permits_of_one_owner_are_bounded(market: DeployedMarket) -> None:
         assert len(chain.permits) == PER_OWNER
 
 
+async def test_permits_of_earlier_nonces_stay_while_there_is_room(market: DeployedMarket) -> None:
+    async with market.chain() as chain:
+        many = [permit_of(market.stranger, chain, nonce=number) for number in range(PER_OWNER)]
+        other = permit_of(market.stranger, chain, domain=keccak256(b"another token").hex())
+        assert all(chain.permits.note(permit) for permit in (*many, other))
+        assert [*chain.permits] == [*many[1:], other]
+        assert not chain.permits.note(many[0])
+        assert [chain.permits.of(one.owner, bytes.fromhex(one.domain), one.nonce) for one in many] == [None, *many[1:]]
+
+
+async def test_a_permit_is_known_again_after_a_reorganisation(market: DeployedMarket) -> None:
+    """The token has taken a permit, the next one is signed, and the chain goes back: only the first one helps."""
+    person = market.stranger
+    async with market.chain(person) as signing, market.chain() as chain:
+        first = await signing.permits.sign(signing.xrt, 1000)
+        assert first is not None
+        later = permit_of(person, chain, token=chain.xrt, domain=first.domain, nonce=first.nonce + 1)
+        assert all(chain.permits.note(permit) for permit in (later, first))
+        demand = verify_message(orders.demand(signer=person.signer, token=chain.xrt, cost=1000))
+        assert await chain.funds.permit_for(demand) == first
+        assert "Allowance" not in (await chain.funds.shortages([demand]))[0]
+
+
 async def test_a_permit_takes_the_place_of_one_that_is_expired(market: DeployedMarket) -> None:
     clock = SetClock(time.time_ns())
     async with market.chain() as chain:
