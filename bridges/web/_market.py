@@ -25,7 +25,7 @@ from mesh.base.background import Background
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.retry import Backoff
-from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation
+from mesh.chain import Finalized, NewLiability, Reorganisation
 from mesh.cli.demand import JudgedTerms
 from mesh.cli.liability import liability_json as record_json
 from mesh.cli.liability import refund_words
@@ -506,10 +506,7 @@ class Market(Lifecycle):
             news = {address: self._unread.pop(address) for address in some}
             if not self._unread:
                 self._has_unread.clear()
-            try:
-                found = await parts.chain.retrying(partial(parts.chain.liabilities.get_all_with_orders, some))
-            except NoContracts:  # reverted meanwhile: the reorganisation comes next
-                continue
+            found = await parts.chain.retrying(partial(parts.chain.liabilities.read_existing, some))
             for liability, hashes in found:
                 await self.labels.learn(liability.token)
                 await self._take_contract(liability, hashes, news[liability.address])

@@ -274,7 +274,7 @@ class Liabilities:
             self._version.recognise(address)
         found = []
         for start in range(0, len(addresses), READ_AT_ONCE):
-            found += [record for record, _ in await self._read_existing(addresses[start : start + READ_AT_ONCE])]
+            found += [record for record, _ in await self.read_existing(addresses[start : start + READ_AT_ONCE])]
         return found
 
     async def outcomes(self, *, blocks: int, most: int) -> dict[str, tuple[int, int]]:
@@ -294,12 +294,12 @@ class Liabilities:
                 found[promisor] = (paid + 1, refunded) if is_success else (paid, refunded + 1)
         return found
 
-    async def _read_existing(self, addresses: Sequence[str]) -> Sequence[tuple[Liability, tuple[bytes, bytes]]]:
-        """As `_read_all`, without those that a reorganisation has reverted."""
+    async def read_existing(self, addresses: Sequence[str]) -> Sequence[tuple[Liability, tuple[bytes, bytes]]]:
+        """As `get_all_with_orders`, of addresses from events, without those that a reorganisation has reverted."""
         try:
             return await _read_all(self._node, addresses)
         except NoContracts:
-            some = [await self._read_existing([address]) for address in addresses] if len(addresses) > 1 else []
+            some = [await self.read_existing([address]) for address in addresses] if len(addresses) > 1 else []
             return [one for found in some for one in found]
 
     async def watch(self, address: str) -> Liability:

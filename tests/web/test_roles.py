@@ -91,18 +91,23 @@ def test_an_owner_sees_health_money_jobs_and_logs(browser: Browser, site: Site) 
     assert browser.violations() == []
 
 
+def order_terms(browser: Browser, site: Site, *, is_private: bool) -> None:
+    """With the wallet, come to the dialog that shows the order before it is signed: for one robot, or for anybody."""
+    browser.go()
+    browser.connect()
+    fill_in(browser, site)
+    if not is_private:
+        anybody(browser)
+    browser.click("#order:not([disabled])")
+
+
 @pytest.mark.parametrize("is_private", [True, False], ids=["one robot", "anybody"])
 def test_a_person_without_ether_orders_and_the_job_is_paid(site: Site, pictures: Path, is_private: bool) -> None:
     wallet, rich, market = site.poor_wallet(), site.wallet(), facts(site, "market")
     first = int(rich.rpc("eth_blockNumber"), 16)
     rich.give(wallet.address, token=market["token"]["address"], units=10**10)
     with Browser(site.url, wallet) as browser:
-        browser.go()
-        browser.connect()
-        fill_in(browser, site)
-        if not is_private:
-            anybody(browser)
-        browser.click("#order:not([disabled])")
+        order_terms(browser, site, is_private=is_private)
         price = browser.find("dialog[open] strong").text
         words = browser.find("#permit").text
         assert f"lets the market's contract take up to {price} from your account until " in words
@@ -144,12 +149,7 @@ def test_a_permit_that_another_order_used_before_the_signature_is_signed_anew(si
     wallet, rich = site.poor_wallet(), site.wallet()
     rich.give(wallet.address, token=facts(site, "market")["token"]["address"], units=10**10)
     with Browser(site.url, wallet) as browser:
-        browser.go()
-        browser.connect()
-        fill_in(browser, site)
-        if not is_private:
-            anybody(browser)
-        browser.click("#order:not([disabled])")
+        order_terms(browser, site, is_private=is_private)
         browser.find("#permit")
         use_permit(wallet, rich, facts(site, "market"))
         browser.click("#sign")

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
+import pytest_asyncio
 from aiohttp import ClientSession
 
 from bridges.web._access import WebOptions
 from bridges.web.components import opened
 from bridges.web.server import PageServer
+from mesh.testing import MarketChain
 from tests.bridges.web.openapi import check, check_answer
 
 if TYPE_CHECKING:
@@ -57,6 +59,13 @@ async def _checked(method: str, path: str, response: ClientResponse, status: int
     else:
         check({"$ref": "#/components/schemas/Error"}, body, path)
     return body
+
+
+@pytest_asyncio.fixture(scope="package", loop_scope="package")
+async def market_chain() -> AsyncIterator[MarketChain]:
+    """One of these tests' own: a page shows the jobs and accounts of a whole chain."""
+    async with MarketChain() as chain:
+        yield chain
 
 
 @pytest.fixture

@@ -154,6 +154,7 @@ async def test_a_job_goes_from_orders_to_payment(market: DeployedMarket, generat
         strange = [market.promisee.address, market.stranger.address]
         assert await chain.liabilities.find_all([*strange, created.liability]) == {created.liability: made}
         assert await chain.liabilities.find_open([*strange, created.liability]) == {created.liability: made}
+        assert await chain.liabilities.read_existing([*strange, created.liability]) == [(made, hashes)]
         assert (made.model, made.objective, made.result) == (demand.model, demand.objective, "")
         assert (made.promisee, made.promisor, made.lighthouse) == (*people, market.deployment.lighthouse)
         assert (made.token, made.cost, made.lighthouse_fee) == (market.deployment.xrt, cost, fee)
