@@ -164,7 +164,8 @@ async def test_the_stream_tells_each_step_of_a_job(place: Place, serve: Any) -> 
                         kinds.append(event["kind"])
                         if event["kind"] == "matched":
                             address = event["data"]["liability"]["address"]
-                await socket.send_json({"subscribe": [f"liability/{address}"], "after": 0})
+                from_the_start = {"after": 0, "stream": browser.server.api.stream.id}
+                await socket.send_json({"subscribe": [f"liability/{address}"]} | from_the_start)
                 while "paid" not in kinds:
                     kinds += [event["kind"] for event in json.loads((await socket.receive()).data)]
         assert kinds.index("order") < kinds.index("matched") < kinds.index("paid")
