@@ -101,6 +101,11 @@ class Account:
                 "`aira account import NEW-FILE --from-keyfile`",
                 code="keyfile-retired",
             )
+        return cls.from_retired_keyfile(keyfile, password_file)
+
+    @classmethod
+    def from_retired_keyfile(cls, keyfile: Path | str, password_file: Path | str) -> Account:
+        """The same, also of a keyfile that `retire_keyfile` has written."""
         return cls(_open_keyfile(Path(keyfile), _read_password(Path(password_file)), password_from=password_file))
 
     def sign_transaction(self, fields: Mapping[str, Any]) -> SignedTransaction:

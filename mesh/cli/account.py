@@ -120,16 +120,19 @@ def show(settings: Settings, file: Path | None, password_file: Path | None, bala
 
 @command.command("rotate", short_help="give a robot or a provider a new key")
 @click.option("--dry-run", is_flag=True, help="only show what would be done")
-@with_timeout(None, meaning="seconds to wait until the contracts have ended [no limit]")
+@with_timeout(None, meaning="seconds to wait for contracts and providers [no limit]")
 @with_json
 @with_settings(NetworkSettings, "lighthouse_contract", AccountSettings, ChainSettings)
 async def rotate(settings: Settings, dry_run: bool, timeout: float | None, as_json: bool) -> None:
     """Move the robot or the provider of the settings to a new key, which takes the place of the old one in its keyfile.
 
     The robot takes no new jobs, its open orders are withdrawn on the chain, and its contracts end: let it run
-    meanwhile. Then the tokens, the coin and the stake at the lighthouse move, and both keys sign that this is the same
-    robot. The old keyfile stays beside the new one, and no role uses it any more. Start the robot or the provider again
-    after that; a provider must be stopped before.
+    meanwhile. Both keys sign that this is the same robot, the new keyfile takes its place, and the tokens, the coin and
+    the stake at the lighthouse move. The old keyfile stays beside the new one, and no role uses it any more. Start the
+    robot again after that.
+
+    Let a provider run, too: the command says when to start a second one, which has the new key, and when to stop the
+    first. Without the XRT for two stakes stop it before, and start it again after that.
 
     If it is interrupted, repeat the command: it goes on where it stopped.
     """
@@ -144,6 +147,7 @@ async def rotate(settings: Settings, dry_run: bool, timeout: float | None, as_js
             "withdraws": plural(plan.orders, "open order"),
             "waits for": plural(plan.contracts, "contract"),
             "moves the stake": XRT.show(plan.stake) if plan.stake else None,
+            "lacks for two stakes": XRT.show(plan.missing) if plan.missing else None,
             "moves": ", ".join([*names.values(), f"{ETH.show(plan.coin)}, less the price of its transactions"]),
         }
         print_result(_in_texts(plan), facts, as_json=as_json)
@@ -155,7 +159,7 @@ async def rotate(settings: Settings, dry_run: bool, timeout: float | None, as_js
         "keyfile": done.keyfile,
         "old keyfile": done.retired,
         "left behind": ETH.show(done.left) if done.left else None,
-        "now": "start the robot or the provider again",
+        "now": "start the robot or the provider, unless it runs under the new key",
     }
     print_result(_in_texts(done), facts, as_json=as_json)
 
@@ -164,7 +168,7 @@ def _in_texts(rotation: Rotated | RotationPlan) -> dict[str, Any]:
     """For JSON: amounts are text, in the smallest units."""
     facts: dict[str, Any] = to_builtins(rotation)
     facts["tokens"] = {token: str(amount) for token, amount in rotation.tokens.items()}
-    return facts | {name: str(facts[name]) for name in ("stake", "coin", "left") if name in facts}
+    return facts | {name: str(facts[name]) for name in ("stake", "missing", "coin", "left") if name in facts}
 
 
 async def _shown(settings: Settings, token: str, amount: int) -> str:

@@ -79,15 +79,19 @@ async def serve(settings: Settings) -> None:
 async def _open_provider(
     settings: Settings, account: Account, telemetry: Telemetry
 ) -> AsyncIterator[tuple[Network, Provider]]:
-    """The provider with its chain and network, and its metrics. Raises `AiraError` for what is not ready yet."""
+    """The provider with its chain and network, and its metrics. Raises `AiraError` for what is not ready yet.
+
+    While a rotation gives it a new key, it may start without a stake: that is moved to it once it is at work.
+    """
     from mesh.market.provider import ProviderProcess, check_account, provider_of
     from mesh.network import Network
     from mesh.role.composition import chain_of, endpoints_of
-    from mesh.role.handover import check_not_retired
+    from mesh.role.handover import check_not_retired, rotation_file
 
     check_not_retired(settings.state_directory, account.address)
     async with chain_of(settings, account) as chain:
-        await check_account(chain, settings.lighthouse_contract)
+        if not rotation_file(settings.keyfile_and_password()[0]).exists():
+            await check_account(chain, settings.lighthouse_contract)
         async with (
             Network(endpoints_of(settings)) as network,
             await provider_of(settings, network.session, chain) as provider,

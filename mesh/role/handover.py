@@ -24,6 +24,11 @@ HANDOVERS: Final = "handovers.json"
 RETIRED: Final = "retired.json"
 
 
+def rotation_file(keyfile: Path) -> Path:
+    """The file beside a keyfile that says, until the end, how far the rotation of its key is."""
+    return keyfile.with_name(f"{keyfile.name}.rotation")
+
+
 def handovers_to(state: Path, address: str) -> tuple[Handover, ...]:
     """The handovers that brought a robot to this address, oldest first. Raises `ConfigurationError`."""
     return _read(state / address / HANDOVERS, tuple[Handover, ...]) or ()

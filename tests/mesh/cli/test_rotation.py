@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from contextlib import AsyncExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
 from mesh.agent.agent import Agent
-from mesh.chain import Account, KeyfileError
+from mesh.chain import XRT, Account, KeyfileError, keyfile_address
 from mesh.errors import ConfigurationError
 from mesh.network import Endpoints, Network
 from schemas import ProfileKey, cid_of_bytes
@@ -20,27 +22,27 @@ from tests.support.commands import aira, refused, run
 from tests.support.development import ServedChain, serve_embedded
 from tests.support.objectives import objective as recorded
 from tests.support.raising import raises_with
-from tests.support.waiting import until, until_answered
+from tests.support.waiting import until, until_answered, until_found
 
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import AsyncIterator
-    from pathlib import Path
 
     from tests.support.routers import EmbeddedRouter
 
 COST: Final = 1000
 TIMEOUT: Final = 120.0
+TIMEOUT_BLOCKS: Final = 6
 BEFORE_THE_END: Final = ("begun", "paused", "withdrawn")
 AFTER_THE_END: Final = (
     "ended",
+    "handed-over",
+    "retired",
+    "exchanged",
     "stake-withdrawn",
     "tokens-moved",
     "coin-moved",
-    "handed-over",
     "staked",
-    "retired",
-    "exchanged",
 )
 """The steps of a rotation, before and after the end of the contracts."""
 KILLED: Final = """
@@ -178,26 +180,110 @@ async def the_old_key_is_refused(site: Site, retired: str, old: str, new: str) -
             pass
 
 
+async def test_a_robot_that_its_owner_has_paused_stays_paused(site: Site) -> None:
+    async with site.robot([]) as robot:
+        await robot.control(paused=True)
+    done = await rotate(site, "robot")
+    assert done.returncode == 0, done.stderr
+    async with Agent(MODEL, settings=site.settings("robot"), account=keyfile_of(site, "robot")) as moved:
+        assert moved.runtime.rules.closed() is not None, "it takes no jobs"
+
+
 @pytest.mark.full
-async def test_a_provider_moves_with_its_stake(site: Site) -> None:
+async def test_a_provider_without_xrt_for_two_stakes_is_stopped_and_moves_with_its_stake(site: Site) -> None:
+    await site.found_lighthouse("own", timeout_blocks=TIMEOUT_BLOCKS, provider=1)
+    await spend_all(site)
     old = site.address("provider")
     async with site.chain("provider") as chain:
-        (stake,) = (await chain.lighthouses.get(site.lighthouse)).stakes.values()
-        free, coin = await chain.tokens.balance(), await chain.tokens.eth_balance()
-    async with site.provider():
-        refused(await rotate(site, "provider"), "provider-running", old)
+        coin = await chain.tokens.eth_balance()
+        before = await chain.block_number()
+        async with site.provider():
+            hint = refused(await rotate(site, "provider"), "provider-running", old, "1 XRT are missing")
+        assert await chain.block_number() == before, "nothing was sent"
+    assert "five transactions" in hint
+    planned = await rotate(site, "provider", "--dry-run")
+    assert json.loads(planned.stdout)["missing"] == str(XRT)
     times = 0
     while await killed(site, "provider", "sent"):
         times += 1
     assert times >= 4, "withdrawal of the stake, XRT, coin, approval, stake"
     new = keyfile_of(site, "provider")
     assert new.address != old
-    async with site.chain("person") as chain:
-        assert (await chain.lighthouses.get(site.lighthouse)).stakes == {new.address: stake}
-        assert await chain.tokens.balance(old) == 0
-        assert await chain.tokens.balance(new.address) == free
-        left = await chain.tokens.eth_balance(old)
-        assert left < coin / 1000
-        assert await chain.tokens.eth_balance(new.address) > 0.99 * coin
+    await the_money_has_moved(site, old, new.address, stake=XRT, coin=coin)
     async with site.provider():
         pass
+
+
+@pytest.mark.full
+@pytest.mark.sample("stake")
+@pytest.mark.parametrize("stake", [1, 2])
+async def test_a_lighthouse_has_a_provider_at_work_in_each_block(site: Site, stake: int) -> None:
+    await site.found_lighthouse("own", timeout_blocks=TIMEOUT_BLOCKS, provider=stake)
+    if stake > 1:  # otherwise the second stake is free
+        await spend_all(site)
+    done: list[str] = []
+    old, coin = site.address("provider"), (await holdings(site, site.address("provider")))[1]
+    keyfile = Path(site.variables("provider")["AIRA_KEYFILE"])
+    async with (
+        asyncio.timeout(5 * TIMEOUT),
+        site.chain("person") as chain,
+        site.provider() as first,
+        site.robot(done),
+        site.agent("person") as person,
+        AsyncExitStack() as stack,
+    ):
+
+        async def has_left() -> bool:
+            return old not in (await chain.lighthouses.get(site.lighthouse)).stakes
+
+        async def job(word: str) -> None:
+            contract = await person.demand(await asyncio.to_thread(site.job, word), cost=COST)
+            assert (await contract.outcome()).success
+
+        async def operate() -> tuple[int, int]:
+            """Start the second provider when it has the new key, stop the first when it has no stake any more.
+
+            Returns when the second had begun and when the first still worked, block numbers.
+            """
+            await until(lambda: keyfile_address(keyfile) != old, what="the new keyfile", seconds=TIMEOUT)
+            await job("of the first")
+            await stack.enter_async_context(site.provider())
+            begun = await chain.block_number()
+            await until_found(has_left, what="the withdrawal of the old stake", seconds=TIMEOUT)
+            await job("of the second")
+            ended = await chain.block_number()
+            await asyncio.to_thread(first.stop)
+            return begun, ended
+
+        start = await chain.block_number()
+        operator = asyncio.create_task(operate())
+        times = 0
+        while await killed(site, "provider", "sent"):
+            times += 1
+        begun, ended = await operator
+        end = await chain.block_number()
+        assert times >= 7, "coin, XRT, approval and stake ahead, withdrawal, XRT, coin"
+        new = keyfile_of(site, "provider").address
+        await job("after it")
+        lighthouse = chain.node.contract("Lighthouse", await chain.names.lighthouse(site.lighthouse))
+        at_work = {old: range(start, ended + 1), new: range(begun, end + 1)}
+        for block in range(start, end + 1):
+            stakes = {one: await chain.node.read(lighthouse.stakes(one), block=block) for one in at_work}
+            assert any(stakes[one] and block in blocks for one, blocks in at_work.items()), (block, stakes, at_work)
+    assert done == ["of the first", "of the second", "after it"], "each once"
+    await the_money_has_moved(site, old, new, stake=stake * XRT, coin=coin)
+
+
+async def spend_all(site: Site) -> None:
+    """Leave the provider no XRT but its stakes."""
+    async with site.chain("provider") as chain:
+        await chain.tokens.transfer(site.address("person"), await chain.tokens.balance())
+
+
+async def the_money_has_moved(site: Site, old: str, new: str, *, stake: int, coin: int) -> None:
+    """All XRT, the stake, and the coin but for the price of transactions."""
+    async with site.chain("person") as chain:
+        assert (await chain.lighthouses.get(site.lighthouse)).stakes == {new: stake}
+    xrt, left = await holdings(site, old)
+    assert (xrt, left < coin / 1000) == (0, True)
+    assert (await holdings(site, new))[1] > 0.99 * coin
