@@ -86,11 +86,12 @@ async def _open_provider(
     from mesh.market.provider import ProviderProcess, check_account, provider_of
     from mesh.network import Network
     from mesh.role.composition import chain_of, endpoints_of
-    from mesh.role.handover import check_not_retired, rotation_file
+    from mesh.role.handover import check_not_retired, handovers_to, rotation_file
 
     check_not_retired(settings.state_directory, account.address)
     async with chain_of(settings, account) as chain:
-        if not rotation_file(settings.keyfile_and_password()[0]).exists():
+        is_moving = rotation_file(settings.keyfile_and_password()[0]).exists()
+        if not (is_moving and handovers_to(settings.state_directory, account.address)):
             await check_account(chain, settings.lighthouse_contract)
         async with (
             Network(endpoints_of(settings)) as network,

@@ -334,14 +334,16 @@ class Rotation:
 
         If the old one has too little XRT besides its stake, it withdraws a part, and stays a provider.
         """
+        lighthouse = await self._lighthouse(chain)
+        if self._journal.old not in lighthouse.stakes:  # it has left since it was asked
+            return
+        least, stake = lighthouse.minimal_stake, lighthouse.stakes[self._journal.old]
+        self._remember_stake(lighthouse)
         if self._journal.coin_ahead is None:
             self._remember(coin_ahead=await chain.tokens.eth_balance() // 2)
         if not await chain.tokens.eth_balance(new.address):
             assert self._journal.coin_ahead is not None
             await chain.tokens.send_eth(new.address, self._journal.coin_ahead)
-        lighthouse = await self._lighthouse(chain)
-        least, stake = lighthouse.minimal_stake, lighthouse.stakes[self._journal.old]
-        self._remember_stake(lighthouse)
         if (lacks := least - await _xrt(chain, lighthouse, new.address)) > 0:
             if await chain.tokens.balance() < lacks:
                 # The same when it is repeated: then a transaction that may still be mined is waited for.
@@ -414,7 +416,9 @@ class Rotation:
             with suppress(NotOffered):
                 if await chain.liabilities.owed(token):
                     await chain.liabilities.claim(token)
-            while amount := await chain.tokens.balance(token=token):  # again, if an equal one was waited for
+            for _ in range(2):  # the second time, if an equal one from before was waited for
+                if not (amount := await chain.tokens.balance(token=token)):
+                    break
                 await chain.tokens.transfer(self._journal.new, amount, token=token)
                 self._moved[token] = self._moved.get(token, 0) + amount
                 self._report(f"moved {(await chain.tokens.unit(token)).show(amount)}")
