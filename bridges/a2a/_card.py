@@ -72,7 +72,7 @@ class CardKey:
                 hint="remove the file: a new one is made",
                 code="card-key-unusable",
             )
-        self._key = key
+        self._pem = content
         public = ECAlgorithm.to_jwk(key.public_key(), as_dict=True)
         self._public = {name: public[name] for name in ("crv", "kty", "x", "y")}
         thumbprint = json.dumps(self._public, sort_keys=True, separators=(",", ":")).encode()
@@ -81,9 +81,8 @@ class CardKey:
 
     def sign(self, card: AgentCard, url: str) -> AgentCard:
         """Sign a card, of a door at a URL."""
-        pem = self._key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
         head: Any = {"alg": ALGORITHM, "kid": self.name, "typ": "JOSE", "jku": f"{url}{KEYS_PATH}"}
-        return create_agent_card_signer(pem, head)(card)
+        return create_agent_card_signer(self._pem, head)(card)
 
     def published(self) -> dict[str, Any]:
         """The public key, as a JSON Web Key Set."""
