@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 LONGEST_ID: Final = 200
 """Characters of a client's message and context ids."""
-MOST_PARTS: Final = 8
 LARGEST_WHOLE: Final = 2**53
 """From here on a number of JSON loses digits, so whole numbers are written as text."""
 MEDIA_TYPES: Final = frozenset({"", "application/json", "text/plain"})
@@ -71,8 +70,6 @@ def wanted_of(message: Message) -> Wanted | None:
     """What a message asks for; None for prose. Raises `InvalidParamsError`, `ContentTypeNotSupportedError`."""
     if len(message.message_id) > LONGEST_ID or len(message.context_id) > LONGEST_ID:
         raise InvalidParamsError(f"an id has at most {LONGEST_ID} characters")
-    if not 1 <= len(message.parts) <= MOST_PARTS:
-        raise InvalidParamsError(f"a message has 1 to {MOST_PARTS} parts here")
     found: list[dict[str, Any]] = []
     for part in message.parts:
         if part.media_type.partition(";")[0].strip().lower() not in MEDIA_TYPES:
