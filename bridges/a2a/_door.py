@@ -39,6 +39,7 @@ from a2a.utils.task import (
     validate_page_size,
 )
 
+from bridges.a2a._following import UNKNOWN, changes
 from bridges.a2a._tasks import (
     HELP,
     STATES,
@@ -79,8 +80,6 @@ if TYPE_CHECKING:
 
 MOST_FOLLOWED: Final = 64
 """Streams, and messages whose answer waits for the end of a job."""
-WAIT: Final = 25.0
-"""Seconds of one look at a job."""
 LONGEST_WAIT: Final = 600.0
 """Seconds for which the answer to a message waits for the end of its job; then it is the task as it is."""
 PAGE: Final = 50
@@ -92,10 +91,6 @@ CROSSED: Final = frozenset({"already-a-contract", "not-a-contract", "order-under
 CANCEL_ATTEMPTS: Final = 5
 CANCEL_WAIT: Final = 5.0
 """Seconds for which such a job may go on before the next attempt."""
-UNKNOWN: Final = frozenset({"invalid-request", "unknown-job"})
-"""The codes of errors for a job that there is none of."""
-OUTAGES: Final = frozenset({"signer-unavailable", "too-many-calls", "too-many-requests"})
-"""The codes of errors after which who follows a job asks again."""
 
 
 class A2aDoor(RequestHandler):
@@ -119,8 +114,7 @@ class A2aDoor(RequestHandler):
         if not params.configuration.return_immediately:
             with self._following(), contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LONGEST_WAIT):
-                    async for changed_job in self._changes(answer):
-                        job = changed_job
+                    async for job in self._changes(answer.job_id):
                         if job.state == "needs-consent":
                             break
         return await self._task(job)
@@ -136,7 +130,7 @@ class A2aDoor(RequestHandler):
             if isinstance(answer, Message):
                 yield answer
                 return
-            async for event in self._events(answer):
+            async for event in self._events(answer.job_id):
                 yield event
 
     @validate_request_params
@@ -148,7 +142,7 @@ class A2aDoor(RequestHandler):
             job = await self._job(params.id)
             if job.is_over:
                 raise UnsupportedOperationError("the task is over: nothing follows")
-            async for event in self._events(job):
+            async for event in self._events(job.job_id):
                 yield event
 
     @validate_request_params
@@ -172,7 +166,7 @@ class A2aDoor(RequestHandler):
             raise InvalidParamsError("the page token is not one of this agent")
         listed = await self._ask("jobs", {"limit": LISTED})
         assert isinstance(listed, Jobs)
-        found: list[tuple[tuple[bool, int, str], Job]] = []
+        found: list[tuple[ListTasksCursor, Job]] = []
         for job in listed.jobs:
             if params.context_id and self._store.context(job.job_id) != params.context_id:
                 continue
@@ -183,17 +177,15 @@ class A2aDoor(RequestHandler):
                 tzinfo=moment.tzinfo
             ):
                 continue
-            place = ListTasksCursor(round(moment.timestamp() * 1e9), job.job_id)
-            found.append((place.sort_key(), job))
-        found.sort(key=lambda one: one[0], reverse=True)
-        rest = [one for one in found if cursor is None or one[0] < cursor.sort_key()]
+            found.append((ListTasksCursor(round(moment.timestamp() * 1e9), job.job_id), job))
+        found.sort(key=lambda one: one[0].sort_key(), reverse=True)
+        rest = [one for one in found if cursor is None or one[0].sort_key() < cursor.sort_key()]
         page = rest[:size]
         tasks = [task_of(job, self._store.context(job.job_id)) for _, job in page]
         if not params.include_artifacts:
             for task in tasks:
                 task.ClearField("artifacts")
-        last = page[-1][0] if len(rest) > size else None
-        token = "" if last is None else encode_list_tasks_cursor(ListTasksCursor(last[1], last[2]))
+        token = encode_list_tasks_cursor(page[-1][0]) if len(rest) > size else ""
         return ListTasksResponse(tasks=tasks, next_page_token=token, page_size=size, total_size=len(found))
 
     @validate_request_params
@@ -215,7 +207,7 @@ class A2aDoor(RequestHandler):
                     raise (
                         known if isinstance(known, InternalError) else TaskNotCancelableError(known.message, known.data)
                     ) from None
-                job = await self._signer.job(job.job_id, revision=job.revision, wait_seconds=CANCEL_WAIT)
+                job = await self._job(job.job_id, revision=job.revision, wait_seconds=CANCEL_WAIT)
         return await self._task(job)
 
     @validate_request_params
@@ -277,13 +269,14 @@ class A2aDoor(RequestHandler):
         fields = {**wanted.fields, "idempotency_key": key_of(message)}
         if self._robot and fields.setdefault("robot", self._robot) != self._robot:
             raise InvalidParamsError(f"this agent orders from {self._robot} only", {"code": "robot-not-allowed"})
-        job = await self._asked_job("order", fields)
+        ordered = await self._ask("order", fields)
+        assert isinstance(ordered, Job)
         if message.context_id:
-            self._store.keep_context(job.job_id, message.context_id)
+            self._store.keep_context(ordered.job_id, message.context_id)
             await self._store.sync()
         if params.configuration.HasField("task_push_notification_config"):
-            await self._push(job, params.configuration.task_push_notification_config)
-        return job
+            await self._push(ordered, params.configuration.task_push_notification_config)
+        return ordered
 
     async def _read(self, wanted: Wanted) -> SignerAnswer:
         fields = dict(wanted.fields)
@@ -310,38 +303,31 @@ class A2aDoor(RequestHandler):
         self._pusher.watch(job.job_id)
         return config
 
-    async def _events(self, job: Job) -> AsyncIterator[Event]:
+    async def _events(self, identity: str) -> AsyncIterator[Event]:
         """A job's task, then what changes of it, until it is over."""
-        context = self._store.context(job.job_id)
-        yield await self._task(job)
-        has_artifact = bool(job.result)
-        async for now in self._changes(job):
-            if now is job:
-                continue
-            if now.result and not has_artifact:
-                has_artifact = True
-                artifact = artifact_of(now, await self._recording(now))
-                yield TaskArtifactUpdateEvent(
-                    task_id=now.job_id, context_id=context, artifact=artifact, last_chunk=True
-                )
-            event = TaskStatusUpdateEvent(task_id=now.job_id, context_id=context, status=status_of(now, context))
-            event.metadata.CopyFrom(task_of(now, context).metadata)
-            yield event
+        context = self._store.context(identity)
+        before: Job | None = None
+        async for job in self._changes(identity):
+            if before is None:
+                yield await self._task(job)
+            else:
+                if job.result and not before.result:
+                    artifact = artifact_of(job, await self._recording(job))
+                    yield TaskArtifactUpdateEvent(
+                        task_id=identity, context_id=context, artifact=artifact, last_chunk=True
+                    )
+                event = TaskStatusUpdateEvent(task_id=identity, context_id=context, status=status_of(job, context))
+                event.metadata.CopyFrom(task_of(job, context).metadata)
+                yield event
+            before = job
 
-    async def _changes(self, job: Job) -> AsyncIterator[Job]:
-        """A job each time it has changed, first as it is; the last time when it is over. Outages are waited out."""
-        yield job
-        while not job.is_over:
-            try:
-                now = await self._signer.job(job.job_id, revision=job.revision, wait_seconds=WAIT)
-            except AiraError as error:
-                if error.code not in OUTAGES:
-                    raise error_of(error) from None
-                await asyncio.sleep(1.0)
-                continue
-            if now.revision != job.revision or now.is_over:
-                job = now
+    async def _changes(self, identity: str) -> AsyncIterator[Job]:
+        """See `changes`; raises `A2AError` only."""
+        try:
+            async for job in changes(self._signer, identity):
                 yield job
+        except AiraError as error:
+            raise error_of(error) from None
 
     @contextlib.contextmanager
     def _following(self) -> Any:
@@ -367,18 +353,13 @@ class A2aDoor(RequestHandler):
         except AiraError:
             return None
 
-    async def _job(self, identity: str) -> Job:
+    async def _job(self, identity: str, *, revision: int = -1, wait_seconds: float = 0.0) -> Job:
         try:
-            return await self._signer.job(identity)
+            return await self._signer.job(identity, revision=revision, wait_seconds=wait_seconds)
         except AiraError as error:
             if error.code in UNKNOWN:
                 raise TaskNotFoundError from None
             raise error_of(error) from None
-
-    async def _asked_job(self, operation: str, fields: Mapping[str, Any]) -> Job:
-        job = await self._ask(operation, fields)
-        assert isinstance(job, Job)
-        return job
 
     async def _ask(self, operation: str, fields: Mapping[str, Any]) -> SignerAnswer:
         """Raises `A2AError` only."""

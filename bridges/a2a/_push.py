@@ -11,6 +11,7 @@ import asyncio
 import ipaddress
 import logging
 import socket
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
@@ -20,6 +21,7 @@ from a2a.utils.errors import InvalidParamsError
 from aiohttp.abc import AbstractResolver, ResolveResult
 from google.protobuf.json_format import MessageToDict
 
+from bridges.a2a._following import changes
 from bridges.a2a._tasks import task_of
 from mesh.base.background import Background
 from mesh.base.lifecycle import Lifecycle
@@ -39,11 +41,8 @@ log = logging.getLogger(__name__)
 LONGEST_URL: Final = 2_000
 LONGEST_SECRET: Final = 2_000
 POST_SECONDS: Final = 10.0
-ATTEMPTS: Final = 4
-"""How often a change is posted to an address that does not take it."""
-RETRY: Final = RetryPolicy(initial=1.0, ceiling=20.0)
-WAIT: Final = 25.0
-"""Seconds of one look at a job."""
+RETRY: Final = RetryPolicy(initial=1.0, ceiling=20.0, attempts=4)
+"""How a change is posted to an address that does not take it."""
 AT_ONCE: Final = 16
 """Posts at once."""
 
@@ -94,7 +93,7 @@ class Pusher(Lifecycle):
     """Pushes the changes of tasks: `async with Pusher(signer, store) as pusher`.
 
     Entering takes up the tasks of before. Each change is posted at least once, in order, to each of a task's addresses;
-    one that does not take it `ATTEMPTS` times misses it. `anywhere` lets it post into private networks.
+    one that does not take it misses it in the end, see `RETRY`. `anywhere` lets it post into private networks.
     """
 
     title = "push notifications"
@@ -107,9 +106,7 @@ class Pusher(Lifecycle):
         self._posts = asyncio.Semaphore(AT_ONCE)
 
     async def _open(self, stack: AsyncExitStack) -> None:
-        connector = aiohttp.TCPConnector(
-            resolver=None if self._anywhere else PublicResolver(), limit=AT_ONCE, force_close=True
-        )
+        connector = aiohttp.TCPConnector(resolver=None if self._anywhere else PublicResolver(), force_close=True)
         timeout = aiohttp.ClientTimeout(total=POST_SECONDS)
         self._session = await stack.enter_async_context(
             aiohttp.ClientSession(connector=connector, timeout=timeout, cookie_jar=aiohttp.DummyCookieJar())
@@ -146,24 +143,11 @@ class Pusher(Lifecycle):
             self._tasks.start(self._follow(job), f"push {job}")
 
     async def _follow(self, identity: str) -> None:
-        revision, backoff = -1, Backoff(RETRY)
         try:
-            while self._store.pushes(identity):
-                try:
-                    job = await self._signer.job(identity, revision=revision, wait_seconds=WAIT)
-                except AiraError as error:
-                    if error.code == "unknown-job":
-                        self._store.over(identity)
-                        return
-                    await asyncio.sleep(backoff.next_delay() or 0.0)
-                    continue
-                backoff = Backoff(RETRY)
-                if job.is_over or job.revision != revision:
-                    revision = job.revision
+            with suppress(AiraError):  # a signer with another state has no such job
+                async for job in changes(self._signer, identity):
                     await asyncio.gather(*(self._post(job, one) for one in self._store.pushes(identity)))
-                if job.is_over:
-                    self._store.over(identity)
-                    return
+            self._store.over(identity)
         finally:
             self._watched.discard(identity)
 
@@ -175,14 +159,14 @@ class Pusher(Lifecycle):
         if config.authentication.scheme and config.authentication.credentials:
             headers["Authorization"] = f"{config.authentication.scheme} {config.authentication.credentials}"
         backoff = Backoff(RETRY)
-        for attempt in range(ATTEMPTS):
-            if attempt:
-                await asyncio.sleep(backoff.next_delay() or 0.0)
+        while True:
             try:
                 if await self._posted(config.url, body, headers):
                     return
             except (aiohttp.ClientError, OSError, TimeoutError, ValueError) as error:
                 log.debug("a push notification failed: %s", type(error).__name__)
+            if not await backoff.wait():
+                break
         facts = log_event("push-not-delivered", job=job.job_id, state=job.state)
         log.warning("the address of a push notification takes none", extra=facts)
 
