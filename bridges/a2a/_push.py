@@ -18,7 +18,6 @@ from urllib.parse import urlsplit
 import aiohttp
 from a2a.types import StreamResponse, TaskPushNotificationConfig
 from a2a.utils.errors import InvalidParamsError
-from aiohttp.abc import AbstractResolver, ResolveResult
 from google.protobuf.json_format import MessageToDict
 
 from bridges.a2a._following import changes
@@ -31,6 +30,8 @@ from mesh.errors import AiraError
 
 if TYPE_CHECKING:
     from contextlib import AsyncExitStack
+
+    from aiohttp.abc import ResolveResult
 
     from bridges.a2a._store import TaskStore
     from mesh.signer.client import SignerClient
@@ -62,31 +63,17 @@ def is_public(address: str) -> bool:
     return found.is_global and not found.is_multicast
 
 
-class PublicResolver(AbstractResolver):
+class PublicResolver(aiohttp.ThreadedResolver):
     """Resolves names to public addresses only."""
 
     async def resolve(
         self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_INET
     ) -> list[ResolveResult]:
         """The public addresses of a host. Raises `OSError` if it has none."""
-        found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM, family=family)
-        public = [one for one in found if is_public(str(one[4][0]))]
+        public = [one for one in await super().resolve(host, port, family) if is_public(one["host"])]
         if not public:
             raise OSError("no public address")
-        return [
-            ResolveResult(
-                hostname=host,
-                host=str(address[0]),
-                port=port,
-                family=kind,
-                proto=number,
-                flags=socket.AI_NUMERICHOST,
-            )
-            for kind, _, number, _, address in public
-        ]
-
-    async def close(self) -> None:
-        """Nothing is open."""
+        return public
 
 
 class Pusher(Lifecycle):
