@@ -24,7 +24,6 @@ from a2a.types import (
 )
 from a2a.utils.errors import (
     A2AError,
-    ExtendedAgentCardNotConfiguredError,
     InternalError,
     InvalidParamsError,
     TaskNotCancelableError,
@@ -249,7 +248,7 @@ class A2aDoor(RequestHandler):
         self, params: GetExtendedAgentCardRequest, context: ServerCallContext
     ) -> AgentCard:
         """There is none: the card has everything."""
-        raise ExtendedAgentCardNotConfiguredError
+        raise UnsupportedOperationError("there is no other card than the public one")
 
     async def _received(self, params: SendMessageRequest) -> Message | Job:
         """Do what a message asks for: its answer, or the job that it orders."""

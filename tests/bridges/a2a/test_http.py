@@ -54,6 +54,13 @@ async def test_a_request_of_an_older_protocol_is_refused(tmp_path: Path) -> None
     assert (status, json.loads(text)["error"]["code"]) == (200, -32009), "no version means 0.3"
 
 
+async def test_an_extended_card_which_there_is_none_of_is_not_supported(tmp_path: Path) -> None:
+    call = CALL | {"method": "GetExtendedAgentCard", "params": {}}
+    async with serving(NOWHERE, tmp_path) as door:
+        _, text = await asked(door.url, call, **AUTHORIZED)
+    assert json.loads(text)["error"]["code"] == -32004
+
+
 async def test_what_is_not_sent_as_json_is_of_a_type_that_is_not_supported(tmp_path: Path) -> None:
     headers = AUTHORIZED | {"Content-Type": "text/plain"}
     async with serving(NOWHERE, tmp_path) as door:
