@@ -18,17 +18,17 @@ from bridges.a2a._card import KEYS_PATH
 from bridges.serving import guarded
 
 if TYPE_CHECKING:
+    from a2a.server.request_handlers import RequestHandler
     from starlette.requests import Request
     from starlette.responses import Response
 
     from bridges.a2a._card import Card, CardKey
-    from bridges.a2a._door import A2aDoor
     from bridges.serving import DoorOptions
     from mesh.base.asgi_server import AsgiApplication, Message, Receive, Send
 
 
-def application(door: A2aDoor, card: Card, key: CardKey, options: DoorOptions) -> AsgiApplication:
-    """The ASGI application of the door."""
+def application(door: RequestHandler, card: Card, key: CardKey, options: DoorOptions) -> AsgiApplication:
+    """The ASGI application of a door."""
 
     async def keys(request: Request) -> Response:
         return JSONResponse(key.published())

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from a2a.client import Client
+    from a2a.server.request_handlers import RequestHandler
     from a2a.types import Task
 
     from mesh.base.asgi_server import AsgiApplication
@@ -80,15 +81,17 @@ async def serving(
     limits: DoorLimits = DoorLimits(),  # noqa: B008
     port: int = 0,
     wrap: Callable[[AsgiApplication], AsgiApplication] = lambda app: app,
+    handler: RequestHandler | None = None,
 ) -> AsyncIterator[Served]:
-    """The door of the signer on a socket, which keeps its state in a folder; `wrap` stands before it."""
+    """The door of the signer on a socket, which keeps its state in a folder; `wrap` stands before it, and a `handler`
+    takes the place of all that is behind HTTP."""
     async with AsyncExitStack() as stack:
         signer = await stack.enter_async_context(SignerClient(socket))
         key, store = CardKey(state / "key.pem"), TaskStore(state / "a2a.sqlite")
         store.open()
         stack.callback(store.close)
         pusher = await stack.enter_async_context(Pusher(signer, store, anywhere=push_anywhere))
-        door = A2aDoor(signer, store, pusher, robot=robot)
+        door = handler or A2aDoor(signer, store, pusher, robot=robot)
         card = Card(signer, key, robot=robot)
         app = application(door, card, key, DoorOptions(token=TOKEN, names=names))
         server = await stack.enter_async_context(AsgiServer(wrap(app), "127.0.0.1", port, limits=limits))
