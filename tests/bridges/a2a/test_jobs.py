@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -233,6 +233,22 @@ async def test_a_task_is_found_again_when_the_door_was_killed(person: Person, dr
             assert last.status_update.status.state == TaskState.TASK_STATE_COMPLETED
     assert len(driver.begun) == 1
     assert await person.spent() == 10**9
+
+
+async def test_a_stream_goes_on_after_the_signer_was_away(person: Person, driver: Driver) -> None:
+    driver.released.clear()
+    person.allow(driver.model)
+    async with AsyncExitStack() as first:
+        _, _, signer = await first.enter_async_context(person.at_work())
+        async with serving(signer.door, person.folder / "a2a") as door, door.client() as client:
+            followed = aiter(client.send_message(request(order(driver))))
+            await anext(followed)
+            await until(lambda: driver.begun)
+            await first.aclose()
+            driver.released.set()
+            async with person.at_work():
+                last = [event async for event in followed][-1]
+    assert last.status_update.status.state == TaskState.TASK_STATE_COMPLETED
 
 
 async def test_a_second_door_with_the_same_state_does_not_start(tmp_path: Path) -> None:
