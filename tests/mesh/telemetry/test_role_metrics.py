@@ -86,7 +86,8 @@ async def settled(url: str, **expected: float) -> Scrape:
 
 
 async def test_a_job_changes_exactly_these_metrics_of_its_provider(place: Place) -> None:
-    lighthouse = place.market.deployment.lighthouse_name
+    lighthouse, customer = place.market.deployment.lighthouse_name, place.chains["person"]
+    await customer.tokens.approve(customer.factory, 0)  # so that a permit is needed, whatever other tests have left
     async with provider_at(place) as url, blinking(place), place.agent("person") as person:
         before, eth = await scraped(url), await place.chains["provider"].tokens.eth_balance()
         contract = await person.demand(place.save(objective(("/go", Empty()))), model=MODEL, cost=COST)
