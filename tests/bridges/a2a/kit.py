@@ -16,7 +16,7 @@ import asyncio
 import json
 import signal
 import sys
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -188,14 +188,15 @@ async def scripted(port: int) -> AsyncIterator[Served]:
 
 
 async def main(*options: str) -> None:
-    """Serve until cancelled."""
+    """Serve until SIGINT or SIGTERM."""
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     ports = [int(option) for option in options if option != "--script"]
     async with (scripted if "--script" in options else hiring)(*ports or [0]) as door:
         print(door.url, flush=True)
-        await asyncio.Event().wait()
+        await stopped.wait()
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    with suppress(KeyboardInterrupt):
-        asyncio.run(main(*sys.argv[1:]))
+    asyncio.run(main(*sys.argv[1:]))
