@@ -11,7 +11,7 @@ signed; addresses may be ENS names, and a model may be given by its name.
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Self
 
 import msgspec
 
@@ -197,6 +197,32 @@ class PairTaken(Record, frozen=True, omit_defaults=True):
     detail: str = ""
 
 
+class PermitFeeRequest(Record, frozen=True, kw_only=True):
+    """Ask a provider what it wants for a contract that it creates with a permit of `maker` (EIP-55).
+
+    The demand costs `cost`, in the smallest unit of `token` (EIP-55), and has orders of this `generation`.
+    """
+
+    maker: str
+    generation: Literal[3, 5]
+    token: str
+    cost: UInt256
+
+    def __post_init__(self) -> None:
+        Record.__post_init__(self)
+        for field in ("maker", "token"):
+            _check_address(self, field)
+
+
+class PermitFee(Record, frozen=True):
+    """The least `permit_fee` for which the provider creates the contract now, in the smallest unit of the token.
+
+    0 if it wants none: it creates the contract without, or no fee in this token would make it do so.
+    """
+
+    fee: UInt256
+
+
 class QuoteRequest(SignedRecord, frozen=True, kw_only=True):
     """Ask a robot what it wants for an objective (CID) by a model (CID), signed by the `asker` (EIP-55)."""
 
@@ -241,17 +267,24 @@ class Quote(SignedRecord, frozen=True, kw_only=True, omit_defaults=True):
 
     def __post_init__(self) -> None:
         Record.__post_init__(self)
-        try:
-            if not self.code and parse_address(self.token) != self.token:
-                raise InvalidRecord("Quote", "token: expected the address in EIP-55 form")
-        except InvalidAddress as error:
-            raise InvalidRecord("Quote", f"token: {error}") from None
+        if not self.code:
+            _check_address(self, "token")
 
 
 class Published(Record, frozen=True):
     """The message was published; `hash` is its hash, 64 hexadecimal digits."""
 
     hash: str
+
+
+def _check_address(record: Record, field: str) -> None:
+    """Raise `InvalidRecord` unless a field has an address in EIP-55 form."""
+    name = type(record).__name__
+    try:
+        if parse_address(getattr(record, field)) != getattr(record, field):
+            raise InvalidRecord(name, f"{field}: expected the address in EIP-55 form")
+    except InvalidAddress as error:
+        raise InvalidRecord(name, f"{field}: {error}") from None
 
 
 def _count(nonce: str) -> int:
@@ -399,6 +432,7 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "logs": Service(ReadLogs, LogsRead),
         "accept": Service(AcceptDemand, Accepted),
         "pair": Service(OrderPair, PairTaken),
+        "permit-fee": Service(PermitFeeRequest, PermitFee),
         "quote": Service(QuoteRequest, Quote),
         "sign/demand": Service(SignDemand, Published),
         "sign/offer": Service(SignOffer, Published),

@@ -247,6 +247,7 @@ class Api(Lifecycle):
             get("/api/v1/liabilities/{address}/verification", self.verification),
             get("/api/v1/liabilities/{address}/live", self.live),
             get("/api/v1/accounts/{address}", self.account),
+            get("/api/v1/accounts/{address}/permit-fee", self.permit_fee),
             get("/api/v1/accounts/{address}/statement", self.statement),
             get("/api/v1/agents/{address}/readings", self.readings),
             get("/api/v1/agents/{address}/logs", self.logs),
@@ -515,6 +516,9 @@ class Api(Lifecycle):
 
     async def account(self, request: web.Request) -> web.Response:
         return answer(await self._views.account(address_in(request)))
+
+    async def permit_fee(self, request: web.Request) -> web.Response:
+        return answer(await self._views.permit_fee(address_in(request), amount(request.query.get("cost", ""))))
 
     async def statement(self, request: web.Request) -> web.Response:
         account, sender = address_in(request), request[SENDER]

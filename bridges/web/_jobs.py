@@ -12,17 +12,20 @@ import msgspec
 from bridges.web._market import liability_json, result_json
 from bridges.web._robots import LastSeen, profile_json
 from mesh.agent.contracts import refusal
+from mesh.agent.hiring import PROVIDERS
 from mesh.agent.jobs import ROBOT_STOPPED, STOPPED, read_reason
 from mesh.agent.trade import are_permits_carried
 from mesh.base.flood import BoundedDict
 from mesh.chain import NotOffered
-from mesh.errors import AiraError
+from mesh.errors import AiraError, RemoteError
+from mesh.network import call
 from mesh.telemetry.metrics import is_healthy
 from mesh.validator.verification import Claim, JobFiles, Verdict, check_end, verify
 from mesh.watching import present, statuses
 from mesh.watching.robots import accounts_of
 from schemas import ZERO_ADDRESS, encode, parse_cid
 from schemas.decoding import decode_json
+from schemas.rpc import PermitFeeRequest
 from schemas.status import BridgeStatus, Status
 
 if TYPE_CHECKING:
@@ -240,6 +243,24 @@ class Views:
             "spent": str(record.spent),
             "liabilities": [liability_json(job.liability, market.labels) for job in jobs[:LISTED]],
         }
+
+    async def permit_fee(self, address: str, cost: int) -> dict[str, Any]:
+        """The least fee for which a provider here creates the contract of an account's order with its permit now.
+
+        In the smallest unit of the token, as is `cost`; 0 also if no provider answers.
+        """
+        parts = self._parts
+        wanted = PermitFeeRequest(maker=address, generation=parts.settings.generation, token=parts.token, cost=cost)
+        present = {key.agent for key in await parts.channel.present("provider")}
+        asked = [one for one in await self._market.providers() if one.lower() in present][:PROVIDERS]
+        fees: list[int] = []
+
+        async def ask(provider: str) -> None:
+            with suppress(RemoteError):
+                fees.append((await call(parts.network.session, provider, "permit-fee", wanted, timeout=2.0)).fee)
+
+        await asyncio.gather(*map(ask, asked))
+        return {"fee": str(min(fees, default=0))}
 
     async def lighthouse(self) -> dict[str, Any]:
         """Providers, stakes, turns, quotas. Raises `ChainError`."""

@@ -49,7 +49,9 @@ if TYPE_CHECKING:
 
 OUTCOME_GETTERS: Final = ("promisor", "isFinalized", "isSuccess")
 FINALIZATION_DATA: Final = 130
-"""Bytes of the data of a finalization, about, without zeros."""
+"""Bytes of the data of a finalization, about, without zeros, …"""
+USUAL_DATA: Final = 660
+"""… and of both transactions of a contract with a permit."""
 READ_AT_ONCE: Final = 60
 """How many records a listing reads at a time, in ten calls."""
 ASKED_AT_ONCE: Final = 32
@@ -340,6 +342,10 @@ class Liabilities:
         """The gas for whose price the data of a contract's two transactions goes to Ethereum, on OP-type rollups."""
         data = order_abi(demand) + order_abi(offer) + b"\1" * FINALIZATION_DATA
         return await self._node.data_gas(data)
+
+    async def usual_data_gas(self) -> int:
+        """The same for a contract whose orders are not known yet, with a permit."""
+        return await self._node.data_gas(b"\1" * USUAL_DATA)
 
     async def withdraw(self, order: Order) -> Receipt:
         """Make a signed order of one's own unusable on the chain, for every provider.

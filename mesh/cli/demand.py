@@ -530,7 +530,8 @@ async def agreed_fee(
 @click.option(
     "--permit-fee",
     type=TokenAmountText(),
-    help="what the provider gets for creating the contract with a permit of yours, in the token of --cost [nothing]",
+    help="what the provider gets for creating the contract with a permit of yours, in the token of --cost; a provider "
+    "that wants more says how much [nothing]",
 )
 @click.option(
     "--lifetime",

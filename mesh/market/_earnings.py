@@ -20,6 +20,7 @@ from mesh.amounts import ETH, XRT
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import BoundedDict
 from mesh.base.log_context import liability_context, log_event
+from schemas import ZERO_ADDRESS
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
     from mesh.chain import Created, Reverted, Settled
     from mesh.market.book import Match
     from mesh.market.store import MarketStore
-    from schemas import Liability
+    from schemas import Demand, Liability
+    from schemas.rpc import PermitFeeRequest
 
 
 log = logging.getLogger(__name__)
@@ -163,6 +165,8 @@ GAS_OF_FEE: Final = 19_500
 """… this if the offer has a fee, and …"""
 GAS_OF_PERMIT_FEE: Final = 16_300
 """… this if the demand has a fee for its permit."""
+DATA_MARGIN: Final = 2
+"""How many times the fee for data may grow until the contract is created for which a fee for its permit is wanted."""
 
 A_DAY: Final = 100
 """Free contracts a day, by default."""
@@ -220,16 +224,24 @@ class FreeContracts:
         `data_gas` is what its data costs besides, as gas; nothing is minted for that. `permit_fee` is what the
         demand pays for its permit, in its token; it counts if that is XRT.
         """
-        demand, offer = match.demand.message, match.offer.message
-        cost, fee = demand.cost, offer.lighthouse_fee
-        worth = self._worth(_gas(demand.generation, cost, fee))
-        strangers = len({match.demand.signer, match.offer.signer, self._account}) == 3
-        is_minted = demand.token == self._xrt and strangers
-        minted = worth if self._always_minted else min(cost, worth) if is_minted else 0
+        demand, fee = match.demand.message, match.offer.message.lighthouse_fee
+        are_strangers = len({match.demand.signer, match.offer.signer, self._account}) == 3
+        not_minted = self._not_minted(demand, fee=fee, are_strangers=are_strangers)
         if permit_fee:
             data_gas += GAS_OF_PERMIT_FEE
             fee += permit_fee if demand.token == self._xrt else 0
-        return max(worth + self._worth(data_gas) - fee - minted, 0)
+        return max(not_minted + self._worth(data_gas) - fee, 0)
+
+    def permit_fee(self, wanted: PermitFeeRequest, *, data_gas: int = 0) -> int:
+        """The fee for its permit with which a demand's contract is created now; `data_gas` as for `lacking`.
+
+        0 if it is created without, and in a token that does not count.
+        """
+        not_minted = self._not_minted(wanted, are_strangers=wanted.maker != self._account)
+        has_free = wanted.maker in self._customers or self._credit.get(wanted.maker, 0) or self.left()
+        if has_free or wanted.token != self._xrt or not not_minted + self._worth(data_gas):
+            return 0
+        return not_minted + self._worth(DATA_MARGIN * data_gas + GAS_OF_PERMIT_FEE)
 
     def why(self, match: Match, *, data_gas: int = 0) -> str:
         """Why a contract that does not cover the gas is not created, for the makers of its orders."""
@@ -238,6 +250,9 @@ class FreeContracts:
         if demand.token != self._xrt or data_gas:
             gas = _gas(demand.generation, demand.cost, 1) + data_gas
             enough = f"a fee of {XRT.show(self._worth(gas))} in the offer does"
+        if demand.token == self._xrt and demand.validator == ZERO_ADDRESS and not self._always_minted:
+            for_permit = self.lacking(match, data_gas=DATA_MARGIN * data_gas + GAS_OF_PERMIT_FEE)
+            enough += f", or a permit fee of {XRT.show(for_permit)} (--permit-fee)"
         return f"its contract would not cover the provider's gas, and there is no free one left now: {enough}, or wait"
 
     async def take(self, match: Match) -> bool:
@@ -261,6 +276,12 @@ class FreeContracts:
         maker = liability.promisee
         if minted + liability.lighthouse_fee >= self._worth(GAS[5]):
             self._credit[maker] = min(self._credit.get(maker, 0) + 1, CREDIT)
+
+    def _not_minted(self, order: Demand | PermitFeeRequest, *, fee: int = 0, are_strangers: bool) -> int:
+        """What nothing is minted for of a contract's gas, in wn; with a `fee` in its offer."""
+        worth = self._worth(_gas(order.generation, order.cost, fee))
+        is_minted = order.token == self._xrt and are_strangers
+        return worth - (worth if self._always_minted else min(order.cost, worth) if is_minted else 0)
 
     def _worth(self, gas: int) -> int:
         return gas * self._emission // 100

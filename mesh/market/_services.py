@@ -21,7 +21,7 @@ from mesh.network.metrics import drop_family, message_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled, public_parts
 from schemas import InvalidMessage, encode, lighthouse_selector
 from schemas.keys import ORDER
-from schemas.rpc import PairTaken
+from schemas.rpc import PairTaken, PermitFee
 from schemas.signing import Refusal
 from schemas.status import ALIVE, MarketStatus, Status
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mesh.market.withdrawals import Withdrawals
     from mesh.network import Subscription
     from schemas import Permit, Withdrawal
-    from schemas.rpc import Nothing, OrderPair
+    from schemas.rpc import Nothing, OrderPair, PermitFeeRequest
 
 THREADS: Final = 2
 """Threads that answer queries: a book can be large, and a client may take the answers slowly."""
@@ -165,6 +165,12 @@ class PairService:
                 return PairTaken(shortage, f"{signer} lacks the money, or the factory may not take it")
         refusal = self._settlement.pair(pair)
         return PairTaken() if refusal is None else PairTaken(refusal, f"the provider refuses it: {refusal}")
+
+
+async def permit_fee(parts: SettlementParts, wanted: PermitFeeRequest) -> PermitFee:
+    """The service `permit-fee`: what the provider wants now for an order with a permit. Raises as reading the chain."""
+    data_gas = await parts.chain.liabilities.usual_data_gas()
+    return PermitFee(parts.free.permit_fee(wanted, data_gas=data_gas))
 
 
 class ProviderStatus:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.base.blocklist import Blocklist, blocklist_at
@@ -22,7 +23,7 @@ from mesh.chain import InsufficientFunds
 from mesh.chain.transactions import TransactionSender
 from mesh.market._earnings import A_DAY, Earnings, EarningsLedger, FreeContracts
 from mesh.market._orders import Orders
-from mesh.market._services import OrderBookService, PairService, ProviderStatus
+from mesh.market._services import OrderBookService, PairService, ProviderStatus, permit_fee
 from mesh.market._settlement import OPEN_LIABILITIES, Settlement, SettlementParts
 from mesh.market.book import LIMIT, Match
 from mesh.market.store import MarketStore
@@ -311,6 +312,8 @@ class Provider(Role):
         with source_context(self._source):
             services.offer("status", self.status.status)
             services.offer("logs", LogService("provider", self.address).logs)
+            if is_ours:  # others take no permits
+                services.offer("permit-fee", partial(permit_fee, parts))
         self.channel.announce("provider", self.address)
 
     @property

@@ -105,8 +105,10 @@ _READ_CONTENT: Final = _grant("get", "aira/agent/*/cid/*")
 """Who holds content serves it in its own space."""
 _READINGS: Final = _grant("subscribe", "aira/agent/*/reading/**")
 _PROFILES: Final = _grant("get subscribe", "aira/agent/*/profile")
-_ORDERS: Final = _grant("get", *(f"aira/agent/*/rpc/{service}" for service in ("quote", "accept", "pair", "stop")))
-"""What those who order ask of robots and providers; their signatures say who asks."""
+_ORDERS: Final = _grant(
+    "get", *(f"aira/agent/*/rpc/{service}" for service in ("quote", "accept", "permit-fee", "pair", "stop"))
+)
+"""What those who order ask of robots and providers; where it matters who asks, a signature says so."""
 
 ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
     {

@@ -12,11 +12,13 @@ from msgspec.structs import replace
 from mesh.chain import Account, TransactionSender
 from mesh.chain._permits import permit_arguments
 from mesh.chain.deploy import XRT
+from mesh.market._earnings import GAS_OF_PERMIT_FEE
 from schemas import encode
 from schemas.rpc import AcceptDemand, OrderPair, SendDemand, SendOffer, SendPermit
 from tests.bridges.web.test_page_server import COST, signed_demand
 from tests.bridges.web.test_web_robots import contract_of, demand_of, made
 from tests.mesh.agent.trades import working
+from tests.mesh.market.test_free_contracts import COVERED
 from tests.support.market import MODEL
 from tests.support.waiting import until_found
 
@@ -147,6 +149,23 @@ async def test_an_account_may_order_by_permits_where_a_provider_takes_them(place
             assert await may(with_ether)
     async with serve(settings={"contracts": "original"}) as browser, place.provider():
         assert not (await browser.get(f"accounts/{without}"))["permits"]
+
+
+async def test_an_account_is_told_what_a_provider_wants_for_its_permit(place: Place, serve: Any) -> None:
+    path = f"accounts/{place.address('person')}/permit-fee"
+    async with serve() as browser:
+
+        async def fee(cost: int) -> int:
+            return int((await browser.get(path, cost=str(cost)))["fee"])
+
+        assert await fee(5) == 0  # nobody is here
+        async with place.provider(free_contracts=0):
+            assert await fee(5) == COVERED - 5 + GAS_OF_PERMIT_FEE
+            assert await fee(COVERED) == 0
+            for cost in ("many", str(2**256)):
+                await browser.get(path, status=400, cost=cost)
+        async with place.provider():
+            assert await fee(5) == 0
 
 
 async def test_a_permit_for_anything_but_the_demand_is_refused(place: Place, serve: Any) -> None:

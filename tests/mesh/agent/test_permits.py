@@ -10,11 +10,15 @@ from typing import TYPE_CHECKING, Literal
 
 import pytest
 
+from mesh import Progress
+from mesh.amounts import XRT as XRT_UNIT
 from mesh.chain import Account, DeploymentPlan
 from mesh.chain.deploy import XRT
 from mesh.errors import InputError
+from mesh.network import call
 from mesh.testing import MarketChain
 from schemas import Demand
+from schemas.rpc import PermitFeeRequest
 from tests.mesh.agent.restarts import COST, speaking, words
 from tests.mesh.agent.trades import job, working
 from tests.support.market import MODEL, Place, offering
@@ -24,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from mesh import Agent, Progress
+    from mesh import Agent
     from mesh.agent.agent import DemandTerms
     from tests.support.routers import EmbeddedRouter
 
@@ -120,6 +124,31 @@ async def test_the_provider_is_paid_for_the_permit(place: Place, generation: Lit
         assert await person.chain.tokens.balance() == FUNDS - cost - FEE
         (entry,) = (await person.statement()).entries
         assert (entry.spent, entry.fee) == (cost + FEE, 0)
+
+
+@pytest.mark.sample("generation")
+@GENERATIONS
+async def test_the_fee_that_a_provider_wants_is_the_least_that_it_takes(
+    place: Place, generation: Literal[3, 5]
+) -> None:
+    cost, heard = 5, list[Progress]()
+    async with (
+        place.provider(free_contracts=0) as provider,
+        working(place.agent("robot")),
+        penniless(place, generation) as person,
+        asyncio.timeout(60),
+    ):
+        wanted = PermitFeeRequest(maker=person.address, generation=generation, token=person.chain.xrt, cost=cost)
+        fee = int((await call(person.network.session, provider.address, "permit-fee", wanted)).fee)
+        order = await person.order(job(place), cost=cost, permit_fee=fee - 1)
+        waiting = asyncio.create_task(order.contract(on_progress=heard.append))
+        await until(lambda: any(one.code == "unpaid" for one in heard))
+        assert f"a permit fee of {XRT_UNIT.show(fee)} (--permit-fee)" in heard[-1].detail
+        waiting.cancel()
+        contract = await person.demand(job(place), cost=cost, permit_fee=fee)
+        assert (await contract.outcome()).success
+        assert provider.earnings().fees == fee
+        await order.withdraw()
 
 
 async def test_a_permit_is_signed_for_the_fee_also_if_the_cost_is_approved(place: Place) -> None:

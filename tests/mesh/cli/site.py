@@ -105,9 +105,9 @@ class Site:
         }
         return {f"AIRA_{name.upper()}": value for name, value in (fields | options).items()}
 
-    def provider(self, role: str = "provider") -> Serving:
-        """`aira provider` as a process that logs in JSON, not yet started."""
-        variables = self.variables(role, log_format="json")
+    def provider(self, role: str = "provider", **options: str) -> Serving:
+        """`aira provider` as a process that logs in JSON, not yet started; with these settings."""
+        variables = self.variables(role, log_format="json", **options)
         return Serving(*AIRA, "provider", says='"provider-started"', variables=variables)
 
     async def found_lighthouse(self, name: str, *, timeout_blocks: int, **quotas: int) -> NewLighthouse:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import sys
 from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.mesh.cli.site import MODEL, Site
-from tests.support.commands import Serving, aira
+from tests.support.commands import AIRA, Serving, aira
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,3 +59,24 @@ async def test_a_person_needs_no_ether(anvil: Anvil, router: EmbeddedRouter, tmp
             assert await chain.node.request("eth_getBalance", person, hex(block)) == "0x0"
         assert await chain.node.transaction_count(person, block="pending") == sent
         assert await chain.tokens.balance() == had - 2 * (COST + FEE)
+
+
+async def test_who_is_refused_as_unpaid_reads_the_fee_and_the_flag_that_pays_it(
+    anvil: Anvil, router: EmbeddedRouter, tmp_path: Path
+) -> None:
+    site = await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+    (tmp_path / "robot.py").write_text(ROBOT)
+    async with site.chain("person") as chain:
+        await chain.tokens.approve(chain.factory, 0)
+        await chain.node.request("anvil_setBalance", site.address("person"), "0x0")
+    robot = Serving(sys.executable, tmp_path / "robot.py", says="account 0x", variables=site.variables("robot"))
+    words = ("demand", "--model", MODEL, "--objective", str(site.job("work")), "--cost", "5wn", "--existing", "new")
+    variables = site.variables("person")
+    async with site.provider(free_contracts="0") as provider, robot:
+        async with Serving(*AIRA, *words, says="(--permit-fee)", variables=variables) as refused:
+            (said,) = re.findall(
+                r"can't use the demand now: .* a permit fee of (\S+ XRT) \(--permit-fee\)", refused.log()
+            )
+        paid = await asyncio.to_thread(aira, *words, "--permit-fee", said, **variables)
+        assert paid.returncode == 0, (paid.stdout, paid.stderr, provider.log(), robot.log())
+        assert f"; {said} more to the provider with the permit" in paid.stdout

@@ -14,7 +14,9 @@ from mesh.chain._node import FEE_SECONDS, NO_ORACLE_SECONDS, DataFees
 from mesh.dev import EmbeddedChain
 from mesh.market.provider import check_account
 from mesh.market.transactions import LEAST_GAS, least_cost
+from mesh.network import call
 from schemas import order_abi
+from schemas.rpc import PermitFeeRequest
 from tests.mesh.market.local_market import LocalMarket
 from tests.mesh.market.test_free_contracts import COVERED
 from tests.support.rollups import OpStack, data_fee
@@ -102,6 +104,21 @@ async def test_a_contract_must_cover_its_data_too(local: LocalMarket) -> None:
         assert "in the offer does" in rejection.detail
         local.publish(local.offer(cost=COVERED, lighthouse_fee=2 * lacking + 20_000))
         assert (await local.liability_of(demand)).cost == COVERED
+
+
+async def test_the_fee_that_is_wanted_for_a_permit_covers_its_data_too(local: LocalMarket) -> None:
+    person, xrt = local.address("person"), local.chain.xrt
+    await local.chain.tokens.approve(local.chain.factory, 0)
+    wanted = PermitFeeRequest(maker=person, generation=3, token=xrt, cost=COVERED)
+    async with local.provider(free_contracts=0) as provider:
+        fee = int((await call(local.session, provider.address, "permit-fee", wanted)).fee)
+        demand, offer = local.demand(cost=COVERED, validator_fee=fee), local.offer(cost=COVERED)
+        assert fee - 16_300 > await local.chain.liabilities.data_gas(demand, offer)
+        permit = await local.chain.permits.sign(xrt, COVERED + fee)
+        assert permit is not None
+        local.publish(permit, demand, offer)
+        assert (await local.liability_of(demand)).validator_fee == fee
+        assert provider.earnings().fees == fee
 
 
 async def test_a_provider_needs_the_fee_for_data_too(local: LocalMarket) -> None:

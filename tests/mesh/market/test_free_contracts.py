@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
@@ -11,6 +11,7 @@ from mesh.market import Match, order_id
 from mesh.market._earnings import DAY, FreeContracts
 from mesh.market.store import MarketStore
 from schemas import Demand, Offer, Signer, verify_message
+from schemas.rpc import PermitFeeRequest
 from tests.support.clocks import SECOND, SetClock
 from tests.support.orders import PERSON, ROBOT, TOKEN, verified_demand, verified_offer
 from tests.support.waiting import until
@@ -73,6 +74,40 @@ def test_where_gas_is_worth_more_it_takes_more_to_cover_it() -> None:
 )
 def test_the_fee_for_a_permit_covers_gas_if_it_is_in_xrt(lacking: int, fee: int, terms: dict[str, Any]) -> None:
     assert made().lacking(pair(**terms), permit_fee=fee) == lacking
+
+
+def asked(generation: Literal[3, 5] = 3, *, token: str = TOKEN, cost: int = 0, maker: Signer = PERSON) -> Any:
+    return PermitFeeRequest(maker=maker.address, generation=generation, token=token, cost=cost)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "data_gas", "fee"),
+    [
+        (asked(), 0, 268_000 + 16_300),
+        (asked(5), 0, 224_000 + 16_300),
+        (asked(cost=COVERED - 1), 0, 1 + 16_300),
+        (asked(cost=COVERED), 0, 0),
+        (asked(cost=COVERED), 1000, 2 * 1000 + 16_300),
+        (asked(cost=COVERED, maker=PROVIDER), 0, COVERED + 16_300),
+        (asked(cost=COVERED, token="0x" + "11" * 20), 0, 0),
+    ],
+)
+def test_the_fee_that_is_wanted_for_a_permit_is_what_covers_the_gas(
+    wanted: PermitFeeRequest, data_gas: int, fee: int
+) -> None:
+    assert made(a_day=0).permit_fee(wanted, data_gas=data_gas) == fee
+    if fee and wanted.maker == PERSON.address:
+        match = pair(cost=int(wanted.cost), generation=wanted.generation)
+        assert not made().lacking(match, data_gas=data_gas, permit_fee=fee)
+        assert made().lacking(match, data_gas=2 * data_gas, permit_fee=fee - 1) == 1
+
+
+async def test_no_fee_is_wanted_while_there_are_free_contracts() -> None:
+    free = made(a_day=4)
+    assert free.permit_fee(asked()) == 0
+    assert await free.take(pair())
+    assert free.permit_fee(asked())
+    assert made(a_day=0, customers=[PERSON.address]).permit_fee(asked()) == 0
 
 
 def test_nothing_is_minted_for_work_among_oneself() -> None:
@@ -161,7 +196,10 @@ async def test_a_customer_has_a_free_contract_for_each_that_covered_its_gas(loca
         liability = await local.liability_of(paid)
         local.publish(local.result(liability.address))
         await until(lambda: provider.earnings().finalized == 1)
+        wanted = asked(token=local.chain.xrt, maker=local.accounts["person"].signer)
+        assert provider.free.permit_fee(wanted) == 0
         local.publish(free := local.demand(cost=0), local.offer(cost=0))
         await local.liability_of(free)
+        assert provider.free.permit_fee(wanted)
         local.publish(local.demand(cost=0), local.offer(cost=0))
         await until(lambda: len(local.rejections) == 2)

@@ -11,7 +11,7 @@ import { PermitRefused, PermitUsed, domainOf, nextPermit, permitFields, permitMe
 import type { Domain, Permit, SignedPermit } from "./permits";
 import { texts } from "./texts";
 import { ServerLies, checkAsked, checkOrder, ownOrders, readerFor, rememberContract, rememberOrder } from "./trust";
-import { plain } from "./format";
+import { amount, plain } from "./format";
 import type { AccountState, Market, Message, Model, Objective, Order, PostedOrder } from "./types";
 import { personalSign, signTypedData } from "./wallet";
 
@@ -64,14 +64,16 @@ export function contractsOf(market: Market): string {
   return [market.chainId, market.factory, market.lighthouse.address, market.token.address, market.token.decimals, market.xrt.address].join();
 }
 
+type Priced = Pick<Wish, "cost" | "validator" | "validatorFee">;
+
 /** What the contracts take of the market's token for an order: its cost, and its fee if that is in the same token. */
-export function priceOf({ cost, validator, validatorFee }: Pick<Wish, "cost" | "validator" | "validatorFee">, market: Market): bigint {
+export function priceOf({ cost, validator, validatorFee }: Priced, market: Market): bigint {
   const isFeeInToken = validator === zeroAddress || market.token.address === market.xrt.address; // without a validator it is for a permit
   return isFeeInToken ? cost + validatorFee : cost;
 }
 
 /** The same for an order and all others of the account that may still become contracts: an allowance is for all of them. */
-export function neededFor(wish: Wish, state: AccountState, market: Market): bigint {
+export function neededFor(wish: Priced, state: AccountState, market: Market): bigint {
   return priceOf(wish, market) + neededForOthers(state, market);
 }
 
@@ -92,6 +94,11 @@ export async function prepare(wish: Wish, account: Account, shown: Market, domai
   const draft = { model: wish.model.cid, objective: objective.cid, robot, cost, validator, validatorFee, lifetime };
   const prepared = { wish, account, market: shown, objective, messages, draft };
   if (account.kind === "local") return prepared;
+  const isShort = domain !== null && BigInt(state.token.allowance) < neededFor(wish, state, market);
+  // A demand has one fee: the validator's if it has one, else that of the provider which brings its permit to the chain.
+  if (isShort && validator === zeroAddress) draft.validatorFee = await permitFee(account.address, cost);
+  const [price, needed] = [priceOf(draft, market), neededFor(draft, state, market)];
+  if (BigInt(state.token.balance) < price) throw new Error(texts.tooLittle(amount(state.token.balance, market.token), amount(price, market.token)));
   const demand: Demand = {
     model: draft.model,
     objective: draft.objective,
@@ -99,15 +106,19 @@ export async function prepare(wish: Wish, account: Account, shown: Market, domai
     cost,
     lighthouse: market.lighthouse.address,
     validator,
-    validatorFee,
+    validatorFee: draft.validatorFee,
     deadline: BigInt(market.block + lifetime),
     nonce: state.nonce === null ? randomNonce() : BigInt(state.nonce),
     sender: state.nonce === null ? undefined : account.address,
   };
-  const needed = neededFor(wish, state, market);
-  const isShort = domain !== null && BigInt(state.token.allowance) < needed;
   const permit = isShort ? await nextPermit(domain, account.address, market.factory, needed, readerFor(account, market).reader) : undefined;
   return { ...prepared, demand, hash: orderHash(demand), permit };
+}
+
+/** What the providers that are here want at least for bringing an order with a permit to the chain. */
+async function permitFee(address: Address, cost: bigint): Promise<bigint> {
+  const { fee } = await get<{ fee: string }>(`accounts/${address}/permit-fee${query({ cost: String(cost) })}`);
+  return BigInt(fee);
 }
 
 /** A robot does not want the order. */

@@ -179,6 +179,8 @@ export const texts = {
   permit: (sum: string, until: string) =>
     `You also sign a permit, so you send no transaction and need no ether. It lets the market's contract take up to ${sum} from your account until ${until}, for this order and your other open ones. The permit itself costs nothing.`,
   permitFor: "The contract:",
+  permitFee: "Provider's fee for sending your order",
+  inAll: "In all",
   permitUsed: "Another order of yours has used this permit. Sign a new one.",
   permitUsedByOther: "Another order of yours has used the permit of this one. Sign a new one, or this order can't be paid.",
   signPermit: "Sign a new permit",

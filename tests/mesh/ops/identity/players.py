@@ -56,7 +56,7 @@ WHO = ("arm", "ann", "miner", "judge", "boss", "board", "bridge", "screen", "str
 
 MODEL = "QmWATWQ7fVPP2EFGu71UkfnqhYXDYH566qy47CnJDgvs8u"
 LIABILITY = "0x" + "ee" * 20
-ORDERING = ("quote", "accept", "pair", "stop")
+ORDERING = ("quote", "accept", "permit-fee", "pair", "stop")
 """The services by which a robot is chosen and stopped."""
 
 

@@ -336,16 +336,19 @@ function Review(props: { of: Prepared; isWanted: () => boolean; close: () => voi
     if (problem instanceof PermitRefused) props.refused();
   };
   const left = demand ? Number(demand.deadline) - block : draft.lifetime;
+  const permitFee = draft.validator === zeroAddress ? draft.validatorFee : 0n;
   return (
     <>
       <InWords of={props.of} />
       <Facts
         of={[
           [texts.youPayShort, <strong>{amount(draft.cost, market.token)}</strong>],
+          [texts.permitFee, permitFee ? amount(permitFee, market.token) : ""],
+          [texts.inAll, permitFee ? <strong id="in-all">{amount(priceOf(draft, market), market.token)}</strong> : ""],
           [texts.to, draft.robot ? <>{robot ? <strong>{nameOf(robot)}</strong> : null} <Name text={draft.robot} label={draft.robot} /></> : texts.anybody],
           [texts.ifStopped, wish.model.description ? texts.stopCosts[wish.model.description.onStop ?? "refund"] : ""],
           [texts.validator, draft.validator === zeroAddress ? "" : <Name text={draft.validator} label={draft.validator} />],
-          [texts.validatorFee, draft.validatorFee ? amount(draft.validatorFee, market.xrt) : ""],
+          [texts.validatorFee, draft.validatorFee && !permitFee ? amount(draft.validatorFee, market.xrt) : ""],
         ]}
       />
       {permit ? <p class="callout" id="permit">{permitWords(permit, market.token)} {texts.permitFor} <Name text={permit.spender} label={permit.spender} /></p> : null}
