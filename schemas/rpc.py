@@ -11,7 +11,7 @@ signed; addresses may be ENS names, and a model may be given by its name.
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self
 
 import msgspec
 
@@ -204,7 +204,7 @@ class PermitFeeRequest(Record, frozen=True, kw_only=True):
     """
 
     maker: str
-    generation: Literal[3, 5]
+    generation: int
     token: str
     cost: UInt256
 
@@ -212,6 +212,8 @@ class PermitFeeRequest(Record, frozen=True, kw_only=True):
         Record.__post_init__(self)
         for field in ("maker", "token"):
             _check_address(self, field)
+        if self.generation not in (3, 5):
+            raise InvalidRecord("PermitFeeRequest", "generation: expected 3 or 5")
 
 
 class PermitFee(Record, frozen=True):

@@ -14,6 +14,7 @@ from schemas.rpc import (
     GUARDED,
     SERVICES,
     SPENDING,
+    PermitFeeRequest,
     SendDemand,
     SendOffer,
     SendResult,
@@ -85,6 +86,16 @@ def test_an_invalid_message_is_refused_when_it_is_built() -> None:
     with pytest.raises(InvalidMessage) as caught:
         replace(SendDemand.of(DEMAND), objective="the kitchen").message()
     assert "objective" in caught.value.detail
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"maker": "0x12"}, {"token": DEMAND.token.lower()}, {"generation": 4}, {"cost": -1}, {"cost": 2**256}]
+)
+def test_a_question_for_the_fee_of_a_permit_names_an_order_that_can_be(wrong: dict[str, Any]) -> None:
+    asked: dict[str, Any] = {"maker": DEMAND.token, "generation": 3, "token": DEMAND.token, "cost": 5}
+    assert PermitFeeRequest.decode(PermitFeeRequest(**asked).encode()) == PermitFeeRequest(**asked)
+    with pytest.raises(InvalidRecord):
+        PermitFeeRequest(**asked | wrong)
 
 
 def test_guarded_services_exist() -> None:

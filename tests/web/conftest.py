@@ -83,9 +83,10 @@ def hostile_model(folder: Path) -> Path:
     return path
 
 
-@pytest.fixture(scope="package")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    folder, port = tmp_path_factory.mktemp("site"), free_port()
+@contextmanager
+def opened(folder: Path, *options: str) -> Iterator[Site]:
+    """A market that `aira up` makes with these options, with the robot and a page."""
+    port = free_port()
     endpoint, node = f"tcp/127.0.0.1:{free_port()}", f"http://127.0.0.1:{port}"
     variables = {
         "AIRA_CONNECT": endpoint,
@@ -94,7 +95,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         "AIRA_KEYFILE_PASSWORD_FILE": str(folder / "development" / "password"),
     }
     with ExitStack() as stack:
-        up = ("up", "--no-web", "--data-dir", folder, "--listen", endpoint, "--port", str(port))
+        up = ("up", "--no-web", "--data-dir", str(folder), "--listen", endpoint, "--port", str(port), *options)
         stack.enter_context(Serving(*AIRA, *up, says="provider    0x"))
         model = json.loads(aira("model", "new", HERE / "model.json", "--out", folder / "model.json", "--json").stdout)
         hostile = hostile_model(folder)
@@ -107,6 +108,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         site = Site("", *models, node, bytes(key), variables, folder)
         url = stack.enter_context(site.page())
         yield Site(url, *models, node, bytes(key), variables, folder)
+
+
+@pytest.fixture(scope="package")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    with opened(tmp_path_factory.mktemp("site")) as site:
+        yield site
 
 
 @pytest.fixture(scope="package")

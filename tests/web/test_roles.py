@@ -11,6 +11,7 @@ import pytest
 
 from schemas.model import parse_description
 from tests.web.browser import Browser
+from tests.web.conftest import opened
 from tests.web.steps import anybody, check, facts, fill_in, order, sign
 from tests.web.test_order_form import put
 
@@ -129,6 +130,36 @@ def test_a_person_without_ether_orders_and_the_job_is_paid(site: Site, pictures:
     assert (account["transactions"], int(account["token"]["balance"])) == (0, 10**10 - int(job["cost"]))
     blocks = range(first, int(rich.rpc("eth_blockNumber"), 16) + 1)
     assert {rich.rpc("eth_getBalance", wallet.address, hex(block)) for block in blocks} == {"0x0"}
+
+
+def test_a_person_without_ether_agrees_to_the_fee_that_the_provider_wants_by_signing(
+    tmp_path: Path, pictures: Path
+) -> None:
+    cost, fee = 100_000, 319_000 - 100_000 + 16_300  # wn: what its gas is worth, and that of the fee itself
+    with opened(tmp_path, "--free-contracts", "0") as site:
+        wallet, rich, token = site.poor_wallet(), site.wallet(), facts(site, "market")["token"]["address"]
+        rich.give(wallet.address, token=token, units=cost + fee - 1)
+        with Browser(site.url, wallet) as browser:
+            browser.go()
+            browser.connect()
+            fill_in(browser, site)
+            anybody(browser)
+            browser.type("You pay", "0.0001")
+            browser.click("#order:not([disabled])")
+            browser.sees("This account has 0.000335299 XRT, and the order needs 0.0003353 XRT.")
+            rich.give(wallet.address, token=token, units=1)
+            browser.click("#order:not([disabled])")
+            assert browser.find("#in-all").text == "0.0003353 XRT"
+            browser.sees("Provider's fee for sending your order")
+            assert "0.0002353 XRT" in browser.find("dialog[open] dl").text
+            assert "take up to 0.0003353 XRT from your account" in browser.find("#permit").text
+            check(browser, pictures / "permit-fee.png")
+            browser.click("#sign")
+            browser.sees("the robot was paid")
+        account = facts(site, f"accounts/{wallet.address}")
+        (job,) = account["liabilities"]
+        assert (job["state"], job["cost"], job["validatorFee"]) == ("paid", str(cost), str(fee))
+        assert (account["token"]["balance"], account["eth"], account["transactions"]) == ("0", "0", 0)
 
 
 def use_permit(wallet: Wallet, rich: Wallet, market: dict[str, Any]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -76,7 +76,7 @@ def test_the_fee_for_a_permit_covers_gas_if_it_is_in_xrt(lacking: int, fee: int,
     assert made().lacking(pair(**terms), permit_fee=fee) == lacking
 
 
-def asked(generation: Literal[3, 5] = 3, *, token: str = TOKEN, cost: int = 0, maker: Signer = PERSON) -> Any:
+def asked(generation: int = 3, *, token: str = TOKEN, cost: int = 0, maker: Signer = PERSON) -> PermitFeeRequest:
     return PermitFeeRequest(maker=maker.address, generation=generation, token=token, cost=cost)
 
 
