@@ -7,11 +7,10 @@ from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
 from msgspec import Meta, field
 
-from schemas.address import parse_address
 from schemas.cid import is_cid
-from schemas.errors import InvalidAddress, InvalidRecord
+from schemas.errors import InvalidRecord
 from schemas.model import PRICE, require_plain_text
-from schemas.records import LONGEST_PRICE, Record
+from schemas.records import LONGEST_PRICE, Record, check_addresses
 from schemas.signing import SignedRecord
 
 ProfileState: TypeAlias = Literal["idle", "working", "stopped", "closed"]
@@ -107,11 +106,7 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
                 raise InvalidRecord("Profile", f"{name}: expected a CIDv0")
         if self.price and not re.fullmatch(PRICE, self.price):
             raise InvalidRecord("Profile", "price: expected one like `5 XRT`")
-        try:
-            if parse_address(self.agent) != self.agent:
-                raise InvalidRecord("Profile", "agent: expected the address in EIP-55 form")
-        except InvalidAddress as error:
-            raise InvalidRecord("Profile", f"agent: {error}") from None
+        check_addresses(self, "agent")
 
 
 def text_fault(field: str, text: str) -> str:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlia
 import msgspec
 from msgspec.structs import force_setattr
 
-from schemas.address import ZERO_ADDRESS
+from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.decoding import InvalidData, decode_json
-from schemas.errors import InvalidRecord
+from schemas.errors import InvalidAddress, InvalidRecord
 
 MAX_UINT256: Final = 2**256 - 1
 MAX_RECORD_SIZE: Final = 65_536
@@ -172,6 +172,17 @@ class PlaybackPosition(Record, frozen=True, kw_only=True):
         Record.__post_init__(self)
         if not 0 <= self.position <= self.total < _MAX_TOTAL:
             raise InvalidRecord("PlaybackPosition", f"position: expected one from 0 to the total, below {_MAX_TOTAL}")
+
+
+def check_addresses(record: Record, *fields: str) -> None:
+    """Raise `InvalidRecord` unless these fields of a record have addresses in EIP-55 form."""
+    for field in fields:
+        try:
+            canonical = parse_address(getattr(record, field))
+        except InvalidAddress as error:
+            raise InvalidRecord(type(record).__name__, f"{field}: {error}") from None
+        if canonical != getattr(record, field):
+            raise InvalidRecord(type(record).__name__, f"{field}: expected the address in EIP-55 form")
 
 
 @lru_cache(maxsize=128)

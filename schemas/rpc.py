@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self
 
 import msgspec
 
-from schemas.address import keccak256, parse_address
-from schemas.errors import InvalidAddress, InvalidMessage, InvalidRecord
+from schemas.address import keccak256
+from schemas.errors import InvalidMessage, InvalidRecord
 from schemas.messages import Demand, Offer, Permit, Result, equal_terms
 from schemas.records import (
     MAX_UINT256,
@@ -26,6 +26,7 @@ from schemas.records import (
     Record,
     RobotControl,
     UInt256,
+    check_addresses,
 )
 from schemas.signing import Decline, SignedRecord, StopRequest  # msgspec reads the annotations
 from schemas.status import LogsRead, ReadLogs, Status
@@ -210,8 +211,7 @@ class PermitFeeRequest(Record, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         Record.__post_init__(self)
-        for field in ("maker", "token"):
-            _check_address(self, field)
+        check_addresses(self, "maker", "token")
         if self.generation not in (3, 5):
             raise InvalidRecord("PermitFeeRequest", "generation: expected 3 or 5")
 
@@ -270,23 +270,13 @@ class Quote(SignedRecord, frozen=True, kw_only=True, omit_defaults=True):
     def __post_init__(self) -> None:
         Record.__post_init__(self)
         if not self.code:
-            _check_address(self, "token")
+            check_addresses(self, "token")
 
 
 class Published(Record, frozen=True):
     """The message was published; `hash` is its hash, 64 hexadecimal digits."""
 
     hash: str
-
-
-def _check_address(record: Record, field: str) -> None:
-    """Raise `InvalidRecord` unless a field has an address in EIP-55 form."""
-    name = type(record).__name__
-    try:
-        if parse_address(getattr(record, field)) != getattr(record, field):
-            raise InvalidRecord(name, f"{field}: expected the address in EIP-55 form")
-    except InvalidAddress as error:
-        raise InvalidRecord(name, f"{field}: {error}") from None
 
 
 def _count(nonce: str) -> int:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from typing import ClassVar, Final
 
-from schemas.address import parse_address
 from schemas.cid import parse_cid
-from schemas.errors import InvalidAddress, InvalidCid, InvalidRecord
-from schemas.records import Record, UInt256
+from schemas.errors import InvalidCid, InvalidRecord
+from schemas.records import Record, UInt256, check_addresses
 from schemas.signing import SignedRecord, is_word
 
 MOST_POLICIES: Final = 16
@@ -58,7 +57,7 @@ class ValidatorAnnouncement(SignedRecord, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         Record.__post_init__(self)
-        _check_addresses(self, "validator", "juror")
+        check_addresses(self, "validator", "juror")
         _check_text(self, "title", self.title)
         _check_count(self, "policies", len(self.policies), MOST_POLICIES)
         if not 1 <= self.quorum <= self.jurors <= 255:
@@ -107,7 +106,7 @@ class ValidatorReport(SignedRecord, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         Record.__post_init__(self)
-        _check_addresses(self, "liability", "validator", "juror")
+        check_addresses(self, "liability", "validator", "juror")
         for field in ("objective", "result"):
             try:
                 parse_cid(getattr(self, field))
@@ -136,13 +135,3 @@ def _check_text(record: Record, field: str, text: str) -> None:
 def _check_count(record: Record, field: str, count: int, most: int) -> None:
     if count > most:
         raise InvalidRecord(type(record).__name__, f"{field}: expected at most {most}, not {count}")
-
-
-def _check_addresses(record: Record, *fields: str) -> None:
-    for field in fields:
-        try:
-            canonical = parse_address(getattr(record, field))
-        except InvalidAddress as error:
-            raise InvalidRecord(type(record).__name__, f"{field}: {error}") from None
-        if canonical != getattr(record, field):
-            raise InvalidRecord(type(record).__name__, f"{field}: expected the address in EIP-55 form")
