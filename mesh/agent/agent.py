@@ -555,7 +555,8 @@ class Agent(Program):
 
         `permit_fee` is what the provider gets for creating the contract with a permit of this agent, which needs no
         ether for that: an amount in the token of the `cost`. It is charged once, when the contract is created, and only
-        with the permit. A demand has one fee, so it can't have a validator, too.
+        with the permit. A provider that wants more rejects the demand as `unpaid`, and says how much. A demand has one
+        fee, so it can't have a validator, too.
 
         With a `robot` (its name or address) only that one gets the job: it is asked for its offer, and the demand is
         not published. Raises `DemandDeclined` with its reason if it makes none, `ServiceFailed` if it does not answer,
