@@ -86,7 +86,8 @@ def _address(settings: Settings) -> str | None:
 async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
     from bridges.ipfs.daemon import base_url
     from bridges.ipfs.service import IpfsBridge
-    from mesh.role.composition import endpoints_of, open_network
+    from mesh.network import Endpoints
+    from mesh.role.composition import open_network
     from mesh.role.running import wait_for_files
     from mesh.telemetry.serving import Telemetry
 
@@ -96,7 +97,7 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
         await wait_for_files(settings)
         chain = _chain(settings)
         network = await open_network(
-            stack, endpoints_of(settings), OutageLog(log, "router"), on_wait=telemetry.starting
+            stack, Endpoints.from_settings(settings), OutageLog(log, "router"), on_wait=telemetry.starting
         )
         bridge = await stack.enter_async_context(
             IpfsBridge(network, settings, lighthouses=lighthouses, chain=chain, address=_address(settings))
@@ -111,13 +112,16 @@ async def _serve_api(settings: Settings, address: str) -> None:
 
     from bridges.ipfs._serving import IpfsApi
     from mesh.content import Exchange
-    from mesh.role.composition import endpoints_of, open_network, open_store
+    from mesh.network import Endpoints
+    from mesh.role.composition import open_network, open_store
 
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
         raise InputError(f"{address!r} is not as in 127.0.0.1:5001")
     async with AsyncExitStack() as stack:
-        network = await open_network(stack, endpoints_of(settings), OutageLog(log, "router"), on_wait=lambda _: None)
+        network = await open_network(
+            stack, Endpoints.from_settings(settings), OutageLog(log, "router"), on_wait=lambda _: None
+        )
         directory = settings.state_directory / "bridge" / "ipfs-api"
         store = await open_store(stack, settings, directory, limit=settings.objective_size_limit)
         exchange = await stack.enter_async_context(Exchange(network.session, store))

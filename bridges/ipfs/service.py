@@ -24,8 +24,8 @@ from mesh.errors import ChainError, ConfigurationError
 from mesh.market.store import MarketStore
 from mesh.market.withdrawals import Withdrawals
 from mesh.network import MarketRules
-from mesh.network.metrics import drop_family, network_families
 from mesh.role.composition import open_store
+from mesh.telemetry.metrics import drop_family
 from schemas import Demand, Result, Signer, decode
 from schemas.decoding import InvalidData, text_of
 
@@ -183,7 +183,7 @@ class IpfsBridge(Role):
             *bridge_families(channel.health() for channel in self.channels),
             *content_families(self.content.metrics()),
             drop_family(self.drops),
-            *network_families(self._network),
+            *self._network.families(),
         )
 
     def parts(self) -> Mapping[str, str]:

@@ -22,8 +22,7 @@ from bridges.ros1.node import Ros1Node
 from mesh.base.background import Background, call_in_loop
 from mesh.base.lifecycle import Role
 from mesh.base.log_context import log_event
-from mesh.network.metrics import drop_family
-from mesh.telemetry.metrics import MetricFamily, by_label
+from mesh.telemetry.metrics import MetricFamily, by_label, drop_family
 from schemas.keys import IDLE, PRESENT, DeviceTopicKey
 from schemas.status import ALIVE
 

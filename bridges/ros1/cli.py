@@ -143,7 +143,6 @@ def _write_messages(folder: Path, generation: str) -> None:
 async def _serve(settings: Settings, options: Ros1Options) -> None:
     from bridges.ros1._bridge import Ros1Bridge
     from bridges.ros1._parts import RosBridgeOptions
-    from mesh.network.metrics import network_families
     from mesh.telemetry.serving import Telemetry
     from schemas import parse_address
 
@@ -172,7 +171,7 @@ async def _serve(settings: Settings, options: Ros1Options) -> None:
         set_process_source(LogSource("edge", parse_address(parts.agent)))
 
         async def measure() -> Iterable[MetricFamily]:
-            return (*bridge.families(), *network_families(parts.network))
+            return (*bridge.families(), *parts.network.families())
 
         stack.enter_context(telemetry.showing(measure=measure, health=bridge.parts))
         words = f"bridge of {parts.agent}: the ROS master is {graph.master}"

@@ -29,10 +29,9 @@ from mesh.base.log_context import liability_context, log_event
 from mesh.errors import AiraError, ConfigurationError, InputError, InvalidKey
 from mesh.network import sending
 from mesh.network.endpoints import Endpoints
-from mesh.network.metrics import drop_family
 from mesh.network.pump import Pump
 from mesh.recording.ros import RosTypes
-from mesh.telemetry.metrics import MetricFamily, by_label
+from mesh.telemetry.metrics import MetricFamily, by_label, drop_family
 from schemas.address import ZERO_ADDRESS
 from schemas.errors import InvalidPayload
 from schemas.keys import (

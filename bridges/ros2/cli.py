@@ -71,8 +71,8 @@ async def _serve(
     from bridges.devices import LOG, answer_log_queries
     from bridges.ros2._bridge import RosBridge, check_apart, ros_endpoints, types_of
     from bridges.ros2._robot import RosAllowed
-    from mesh.network.metrics import network_families
-    from mesh.role.composition import endpoints_of, open_network
+    from mesh.network import Endpoints
+    from mesh.role.composition import open_network
     from mesh.role.running import wait_for_files
     from mesh.telemetry.serving import Telemetry
     from schemas.keys import DeviceTopicKey
@@ -83,7 +83,9 @@ async def _serve(
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         await wait_for_files(settings)
-        mesh = await open_network(stack, endpoints_of(settings), OutageLog(log, "router"), on_wait=telemetry.starting)
+        mesh = await open_network(
+            stack, Endpoints.from_settings(settings), OutageLog(log, "router"), on_wait=telemetry.starting
+        )
         ros = await open_network(stack, ros_at, OutageLog(log, "ros2-router"), on_wait=telemetry.starting)
         check_apart(mesh.session, ros.session)
         bridge = await stack.enter_async_context(
@@ -93,7 +95,7 @@ async def _serve(
         set_process_source(LogSource("edge", parse_address(agent)))
 
         async def measure() -> Iterable[MetricFamily]:
-            return (*bridge.families(), *network_families(mesh))
+            return (*bridge.families(), *mesh.families())
 
         stack.enter_context(telemetry.showing(measure=measure, health=bridge.parts))
         words = f"bridge of {agent}: {name} is the ROS 2 system at {', '.join(settings.ros2_connect)}"

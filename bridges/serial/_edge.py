@@ -56,7 +56,7 @@ from mesh.base.log_context import LogSource, liability_context, log_event
 from mesh.cli.output import announce
 from mesh.errors import InvalidKey, public_text
 from mesh.network import sending
-from mesh.network.connecting import SessionOpening
+from mesh.network.endpoints import SessionOpening
 from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, LocalRequest, listening, stop_folder
 from mesh.role.running import INTERRUPTED, file_delays
 from mesh.telemetry.logs import set_process_source

@@ -18,11 +18,11 @@ from mesh.chain._validators import Validators
 from mesh.chain.errors import NoContracts, UnknownName
 from mesh.chain.following import NODE_ERRORS, EventSources, follow, glance, history_at, read_events, retrying
 from mesh.chain.liabilities import Liabilities
-from mesh.chain.metrics import CachedMetrics
 from mesh.chain.transactions import TransactionSender
 from mesh.errors import ClosedError
 from mesh.settings.chains import ANY
 from mesh.telemetry.metrics import gauge
+from mesh.telemetry.serving import CachedMetrics
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Sequence
@@ -249,7 +249,7 @@ class Chain:
 
     async def measure(self) -> tuple[MetricFamily, ...]:
         """The metrics of the node, and of the account if there is one."""
-        return (*self.node.metrics.families(), *await self._balances.measure())
+        return (*self.node.families(), *await self._balances.measure())
 
     async def _ask_balances(self) -> Iterable[MetricFamily]:
         if self.account is None:

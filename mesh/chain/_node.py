@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.base.log_context import log_event
 from mesh.chain._abi import ContractFunctions, SpoiledAnswer, decode, encode, load_artifact, our_functions
-from mesh.chain._pending import PendingTransactions, TransactionStore
+from mesh.chain._pending import PendingTransactions, TransactionCounts, TransactionStore
 from mesh.chain._policy import GWEI, FeePolicy, Fees, GasMarket, Timing
 from mesh.chain.answers import (
     ANSWERS,
@@ -43,7 +43,6 @@ from mesh.chain.errors import (
     Reverted,
     WrongChain,
 )
-from mesh.chain.metrics import NodeMetrics
 from mesh.chain.rpc import RpcClient, is_answered
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings.chains import ANY, ETHEREUM_SECONDS
@@ -61,6 +60,7 @@ if TYPE_CHECKING:
     from mesh.chain.rpc import Endpoint
     from mesh.errors import AiraError
     from mesh.settings.chains import ChainProfile
+    from mesh.telemetry.metrics import MetricFamily
 
     Call: TypeAlias = tuple[str, bytes]
     "An address and data."
@@ -482,10 +482,11 @@ class Node:
         self.profile = profile
         self.timing = timing or Timing()
         self.fees = fees or FeePolicy()
-        self.metrics = NodeMetrics()
+        self.sent = TransactionCounts()
+        """What was sent through it."""
         self._transactions = transactions
         self._chain_folder: Path | None = None
-        self.rpc = RpcClient(endpoint, timing=self.timing, metrics=self.metrics)
+        self.rpc = RpcClient(endpoint, timing=self.timing)
         """The requests to the node."""
         self.heads = Heads(
             self._ask_latest, self.header, interval=self.timing.poll_interval, request_pushes=self._request_pushes
@@ -507,6 +508,10 @@ class Node:
         """Until when it is not asked again, on the monotonic clock."""
         self._chain_id: int | None = None
         self._pending: dict[str, PendingTransactions] = {}
+
+    def families(self) -> tuple[MetricFamily, ...]:
+        """The metrics of the transactions that were sent through the node, and of its answers."""
+        return (*self.sent.families(), *self.rpc.families())
 
     @property
     def endpoint(self) -> str:

@@ -1,4 +1,4 @@
-"""The sent transactions of one account that are not settled: which nonces they use, and what they do.
+"""The sent transactions of one account that are not settled: which nonces they use, and what they do; their counts.
 
 On disk they are the rows of one table, by nonce, which all processes of the account share: a row reserves its nonce. It
 names the process that waits for it, by the file that this process keeps locked while it lives; a row whose process has
@@ -13,8 +13,10 @@ import os
 import sqlite3
 import tempfile
 import time
+from collections import Counter
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
@@ -23,6 +25,7 @@ from mesh.base.file_locks import is_locked, lock, try_lock
 from mesh.base.flood import BoundedDict
 from mesh.chain._accounts import SignedTransaction
 from mesh.errors import ConfigurationError
+from mesh.telemetry.metrics import MetricFamily, by_label, counter
 from schemas.decoding import decode_json
 
 if TYPE_CHECKING:
@@ -353,3 +356,43 @@ class PendingTransactions:
         """Other processes may wait for what is pending."""
         if self._store is not None:
             self._store.close()
+
+
+class TransactionOutcome(StrEnum):
+    """The outcome of a transaction. A transaction that is mined was also sent, and counts as both."""
+
+    SENT = "sent"
+    """Given to the node for the first time."""
+    REPLACED = "replaced"
+    """Replaced by one with higher fees because it was stuck."""
+    MINED = "mined"
+    """Mined, and successful."""
+    FAILED = "failed"
+    """Mined and paid for, but reverted."""
+    REFUSED = "refused"
+    """Never sent, because the contracts would revert it."""
+    LOST = "lost"
+    """Another transaction was mined with its nonce."""
+
+
+class TransactionCounts:
+    """The transactions that were sent through a node by their outcome, and what they have cost."""
+
+    def __init__(self) -> None:
+        self.by_outcome = Counter(dict.fromkeys(TransactionOutcome, 0))
+        self.gas_used = 0
+        self.wei = 0
+        """What they have cost."""
+        self.data_wei = 0
+        """The part of it that an OP-type rollup has charged for their data."""
+
+    def families(self) -> tuple[MetricFamily, ...]:
+        """The counters in Prometheus terms."""
+        outcomes = {outcome.value: float(count) for outcome, count in self.by_outcome.items()}
+        meaning = "Transactions of this account, by what became of them"
+        return (
+            by_label("aira_transactions_total", "counter", meaning, "outcome", outcomes),
+            counter("aira_gas_used_total", "Gas that transactions on the chain have used", self.gas_used),
+            counter("aira_gas_spent_wei_total", "What these transactions have cost, wei", self.wei),
+            counter("aira_data_spent_wei_total", "The part of it for their data, on OP-type rollups", self.data_wei),
+        )

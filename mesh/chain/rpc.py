@@ -37,13 +37,13 @@ from mesh.chain.answers import (
 )
 from mesh.chain.errors import NodeUnreachable, RequestRefused
 from mesh.errors import AiraError, ClosedError, ConfigurationError
+from mesh.telemetry.metrics import MetricFamily, counter
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.chain._policy import Timing
-    from mesh.chain.metrics import NodeMetrics
 
 
 PIECE: Final = 1 << 16
@@ -361,8 +361,7 @@ class RpcClient:
     """One or several nodes, with bounded retries.
 
     The nodes are at an endpoint: `http(s)://…`, `ws(s)://…`, a `Transport`, or several of them, as a sequence or as one
-    text with commas. Nothing is connected yet. `metrics` counts whether they answer. Raises `ConfigurationError`
-    for any other text.
+    text with commas. Nothing is connected yet. Raises `ConfigurationError` for any other text.
 
     A request goes to the node that answered last; if its connection fails or its answer is spoiled, to the next, and
     so on around all of them, again and again by `Timing.request_retry`. Only a transaction goes to one node once,
@@ -371,7 +370,7 @@ class RpcClient:
     chain than the first that answered is an error when opening, if it answers soon, and skipped later.
     """
 
-    def __init__(self, endpoint: Endpoint, *, timing: Timing, metrics: NodeMetrics) -> None:
+    def __init__(self, endpoint: Endpoint, *, timing: Timing) -> None:
         given = endpoint if isinstance(endpoint, Sequence) and not isinstance(endpoint, str) else [endpoint]
         upstreams: list[Upstream] = []
         for one in given or [""]:
@@ -382,12 +381,23 @@ class RpcClient:
         self.endpoint = ", ".join(upstream.endpoint for upstream in upstreams)
         self._upstreams = tuple(upstreams)
         self._timing = timing
-        self._metrics = metrics
+        self.failures = 0
+        """Requests that no node answered in any attempt."""
+        self.losses = 0
+        """How often outages began."""
+        self._answers = True
         self._expected: int | RpcFailure | None = None
         self._is_open = False
         self._is_over_quota = False
         """Whether it was logged that all nodes are over their quotas."""
         self._on_head: Callable[[BlockHeader | None], None] | None = None
+
+    def families(self) -> tuple[MetricFamily, ...]:
+        """How well the nodes answer."""
+        return (
+            counter("aira_node_failures_total", "Questions that no node of the chain answered", self.failures),
+            counter("aira_node_losses_total", "How often the nodes of the chain fell silent", self.losses),
+        )
 
     def open(self) -> None:
         """Let requests through, until `close`."""
@@ -462,8 +472,7 @@ class RpcClient:
             for upstream in self._upstreams:
                 try:
                     answered = await self._ask(upstream, method, params, kind)
-                    self._metrics.count(answered=True)
-                    self._is_over_quota = False
+                    self._answers, self._is_over_quota = True, False
                     return answered
                 except AiraError:
                     raise
@@ -491,7 +500,9 @@ class RpcClient:
                 await asyncio.sleep(wait)
             elif is_sent or not may_pass or not await backoff.wait():
                 break
-        self._metrics.count(answered=False)
+        self.failures += 1
+        self.losses += self._answers
+        self._answers = False
         raise NodeUnreachable(self.endpoint, reason) from failure
 
     async def _ask(self, upstream: Upstream, method: str, params: Any, kind: Any) -> tuple[dict[str, Any], Any]:

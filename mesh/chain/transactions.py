@@ -20,7 +20,7 @@ from mesh.amounts import ETH
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.chain._accounts import created_address
-from mesh.chain._pending import PendingTransaction
+from mesh.chain._pending import PendingTransaction, TransactionOutcome
 from mesh.chain._policy import Fees
 from mesh.chain.errors import (
     FeeTooHigh,
@@ -30,7 +30,6 @@ from mesh.chain.errors import (
     Reverted,
     TransactionTimeout,
 )
-from mesh.chain.metrics import TransactionOutcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -331,7 +330,7 @@ class TransactionSender:
                 return await self._outcome(entry, *found)
             facts = log_event("transaction-nonce-lost", tx=entry.newest.hash, nonce=entry.nonce)
             log.info("nonce %d was used by another transaction; sending with the next", entry.nonce, extra=facts)
-            self.node.metrics.transactions[TransactionOutcome.LOST] += 1
+            self.node.sent.by_outcome[TransactionOutcome.LOST] += 1
 
     async def last_nonce(self) -> int:
         """The highest nonce that a transaction of the account may have; -1 if it has sent none."""
@@ -356,7 +355,7 @@ class TransactionSender:
             await self._raise_if_poor(fields, refused)
             raise
         except Reverted:
-            self.node.metrics.transactions[TransactionOutcome.REFUSED] += 1
+            self.node.sent.by_outcome[TransactionOutcome.REFUSED] += 1
             raise
 
     async def _affordable_fees(self) -> Fees:
@@ -400,7 +399,7 @@ class TransactionSender:
                     raise
                 else:
                     self._pending.count(head, nonce + 1)
-                    self.node.metrics.transactions[TransactionOutcome.SENT] += 1
+                    self.node.sent.by_outcome[TransactionOutcome.SENT] += 1
                     return entry
             log.debug("%s: nonce %d was taken; trying the next", self.account.address, nonce)
             if not await backoff.wait():
@@ -469,7 +468,7 @@ class TransactionSender:
             fields = entry.fields | fees.fields()
             signed = self.account.sign_transaction({**fields, "nonce": entry.nonce})
             await self._pending.add_version(entry, fields, signed)
-            self.node.metrics.transactions[TransactionOutcome.REPLACED] += 1
+            self.node.sent.by_outcome[TransactionOutcome.REPLACED] += 1
             replaced = "the transaction %s is stuck; replaced by %s with higher fees"
             facts = log_event("transaction-replaced", tx=stuck, replacement=signed.hash)
             log.warning(replaced, stuck, signed.hash, extra=facts)
@@ -551,10 +550,10 @@ class TransactionSender:
         wei = receipt.wei(price=Fees.of(entry.fields).maximum)
         assert wei is not None
         succeeded = receipt.status == 1
-        self.node.metrics.transactions[TransactionOutcome.MINED if succeeded else TransactionOutcome.FAILED] += 1
-        self.node.metrics.gas_used += gas_used
-        self.node.metrics.wei += wei
-        self.node.metrics.data_wei += receipt.l1_fee or 0
+        self.node.sent.by_outcome[TransactionOutcome.MINED if succeeded else TransactionOutcome.FAILED] += 1
+        self.node.sent.gas_used += gas_used
+        self.node.sent.wei += wei
+        self.node.sent.data_wei += receipt.l1_fee or 0
         if not succeeded:
             why = await self._why_failed(entry.fields, receipt)
             raise Reverted(

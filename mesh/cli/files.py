@@ -208,8 +208,7 @@ async def fetch(settings: Settings, store: Store, cid: str, *, size_limit: int |
     If that takes more than a moment, says on stderr what it waits for, which peers it asks, and when it gives up.
     `size_limit` is in bytes. Raises `InvalidCid`, `NetworkUnavailable`, `ContentUnavailable` and other `ContentError`s.
     """
-    from mesh.network import Network
-    from mesh.role.composition import endpoints_of
+    from mesh.network import Endpoints, Network
 
     parse_cid(cid)
     held = await asyncio.to_thread(store.checked, cid)
@@ -219,7 +218,7 @@ async def fetch(settings: Settings, store: Store, cid: str, *, size_limit: int |
     waits += f" for at most {settings.connect_timeout:g} s"
     connecting = asyncio.get_running_loop().call_later(NOTICE, partial(click.echo, waits, err=True))
     try:
-        async with Network(endpoints_of(settings)) as network, Exchange(network.session, store) as exchange:
+        async with Network(Endpoints.from_settings(settings)) as network, Exchange(network.session, store) as exchange:
             connecting.cancel()
             async with Background() as tasks:
                 tasks.start(_say_who_is_asked(settings, network, cid), "notice")

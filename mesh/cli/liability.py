@@ -331,11 +331,11 @@ async def hand_back(settings: Settings, address: str, code: str, why: str, as_js
 
 async def _stopped(settings: Settings, address: str, why: str, *, code: str | None = None) -> Stopped:
     from mesh.agent.contracts import request_stop
-    from mesh.network import Network
-    from mesh.role.composition import endpoints_of, load_account
+    from mesh.network import Endpoints, Network
+    from mesh.role.composition import load_account
 
     account = await asyncio.to_thread(load_account, settings)
-    async with open_chain(settings) as chain, Network(endpoints_of(settings)) as network:
+    async with open_chain(settings) as chain, Network(Endpoints.from_settings(settings)) as network:
         liability = await chain.liabilities.get(address)
         return await request_stop(network.session, account.signer, liability, why, code=code)
 

@@ -61,8 +61,7 @@ async def command(
     log_format = "json" selects.
     """
     from mesh.base.background import Background
-    from mesh.network import Network, no_answer
-    from mesh.role.composition import endpoints_of
+    from mesh.network import Endpoints, Network, no_answer
     from mesh.telemetry.logs import human_line, json_line
     from mesh.watching.presence import LogReader
 
@@ -70,7 +69,7 @@ async def command(
     wanted: dict[str, Any] = {"lines": lines, "level": level, "liability": liability and parse_address(liability)}
     # An edge agent serves its device's log on the topic `/log`.
     key = str(RpcKey(agent, "logs") if device is None else DeviceTopicKey(agent, device, "/log"))
-    async with Network(endpoints_of(settings)) as network, Background() as tasks:
+    async with Network(Endpoints.from_settings(settings)) as network, Background() as tasks:
         tasks.start(wait_for_broken_pipe(), "readers of stdout")
         reader = LogReader(network.session, key, **wanted)
         update = await reader.poll(timeout=timeout)

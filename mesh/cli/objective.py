@@ -632,12 +632,11 @@ def _lines_with_progress(
 
 
 async def _record(settings: Settings, keys: Sequence[str], out: Path, *, seconds: float | None, as_json: bool) -> None:
-    from mesh.network import Network
-    from mesh.role.composition import endpoints_of
+    from mesh.network import Endpoints, Network
 
     expressions = [key_expression(key) for key in keys]
     require_new_file(out)
-    async with Network(endpoints_of(settings)) as network:
+    async with Network(Endpoints.from_settings(settings)) as network:
         click.echo(f"recording {', '.join(expressions)}; Ctrl-C stops it", err=True)
         try:
             with progress("recording") as tell:

@@ -84,8 +84,8 @@ async def _open_provider(
     While a rotation gives it a new key, it may start without a stake: that is moved to it once it is at work.
     """
     from mesh.market.provider import ProviderProcess, check_account, provider_of
-    from mesh.network import Network
-    from mesh.role.composition import chain_of, endpoints_of
+    from mesh.network import Endpoints, Network
+    from mesh.role.composition import chain_of
     from mesh.role.handover import check_not_retired, handovers_to, rotation_file
 
     check_not_retired(settings.state_directory, account.address)
@@ -94,7 +94,7 @@ async def _open_provider(
         if not (is_moving and handovers_to(settings.state_directory, account.address)):
             await check_account(chain, settings.lighthouse_contract)
         async with (
-            Network(endpoints_of(settings)) as network,
+            Network(Endpoints.from_settings(settings)) as network,
             await provider_of(settings, network.session, chain) as provider,
         ):
             process = ProviderProcess(network, chain, [provider])

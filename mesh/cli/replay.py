@@ -70,8 +70,7 @@ async def command(
 
     No contract is created and nothing is paid. Ctrl-C stops it.
     """
-    from mesh.network import Network
-    from mesh.role.composition import endpoints_of
+    from mesh.network import Endpoints, Network
 
     given = None if to is None else await asyncio.to_thread(destination_of, settings, to)
     chosen = names_in(topics or "")
@@ -89,7 +88,7 @@ async def command(
             key_of(topic, "")  # raises before anything is sent if a topic gives no valid key
         steps = play(recording, speed=AT_ONCE if at_once else rate, start_ns=int(start * 1e9))
         began, played = time.monotonic(), 0
-        async with Network(endpoints_of(settings)) as network:
+        async with Network(Endpoints.from_settings(settings)) as network:
             publishers: dict[str, Any] = {}
             with progress("playing") as tell:
                 async for step in steps:

@@ -143,10 +143,9 @@ def _nobody() -> InputError:
 
 
 async def _ask_elsewhere(settings: Settings, address: str, asked: ControlRobot) -> RobotControl:
-    from mesh.network import Network, call
-    from mesh.role.composition import endpoints_of
+    from mesh.network import Endpoints, Network, call
 
-    async with Network(endpoints_of(settings)) as network:
+    async with Network(Endpoints.from_settings(settings)) as network:
         control = await call(network.session, address, "control", asked)
     assert isinstance(control, RobotControl)
     return control

@@ -148,12 +148,12 @@ async def serve(settings: Settings) -> None:
 
 def _serve_metrics(telemetry: Telemetry, network: Network, drops: Drops) -> AbstractContextManager[None]:
     """Serve a router's metrics and health: that it listens, its links, and what it dropped."""
-    from mesh.network.metrics import drop_family, link_state, network_families
+    from mesh.telemetry.metrics import drop_family
 
     async def measure() -> Iterable[MetricFamily]:
-        return (*network_families(network), drop_family(drops))
+        return (*network.families(), drop_family(drops))
 
-    return telemetry.showing(measure=measure, health=lambda: {"router": link_state(network)})
+    return telemetry.showing(measure=measure, health=lambda: {"router": network.state})
 
 
 async def _wait_for_change(settings: Settings, endpoints: Endpoints, certificate: bytes) -> Endpoints:

@@ -67,12 +67,11 @@ async def command(
         return
     if address is None or service is None:
         raise click.UsageError("ADDRESS and SERVICE are required; --list shows the services")
-    from mesh.network import Network, ServiceFailed, call
-    from mesh.role.composition import endpoints_of
+    from mesh.network import Endpoints, Network, ServiceFailed, call
     from mesh.telemetry.logs import human_line
 
     address, request = parse_address(address), request_of(service, arguments)
-    async with Network(endpoints_of(settings)) as network:
+    async with Network(Endpoints.from_settings(settings)) as network:
         reply = await call(network.session, address, service, request, timeout=timeout)
     if as_json:
         print_json(decode_json(reply.encode()))

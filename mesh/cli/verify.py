@@ -88,11 +88,10 @@ async def print_verdicts(settings: Settings, chain: Chain, liability: Liability)
 
 @asynccontextmanager
 async def _network(settings: Settings) -> AsyncIterator[Network]:
-    from mesh.network import Network
-    from mesh.role.composition import endpoints_of
+    from mesh.network import Endpoints, Network
 
     quick = replace(settings, connect_timeout=min(settings.connect_timeout, CONNECT_TIMEOUT))
-    async with Network(endpoints_of(quick)) as network:
+    async with Network(Endpoints.from_settings(quick)) as network:
         yield network
 
 

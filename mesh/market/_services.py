@@ -13,12 +13,12 @@ from msgspec.structs import asdict
 import mesh
 from mesh.base.background import call_in_loop
 from mesh.base.flood import Rate, RateLimiter
-from mesh.chain.metrics import CachedMetrics, reading_families
 from mesh.errors import public_text
 from mesh.market.book import Match
 from mesh.network import message_key
-from mesh.network.metrics import drop_family, message_families
-from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled, public_parts
+from mesh.network.channel import message_families
+from mesh.telemetry.metrics import MetricFamily, by_label, counter, drop_family, gauge, labelled, public_parts
+from mesh.telemetry.serving import CachedMetrics
 from schemas import InvalidMessage, encode, lighthouse_selector
 from schemas.keys import ORDER
 from schemas.rpc import PairTaken, PermitFee
@@ -247,7 +247,7 @@ class ProviderStatus:
                 "of",
                 amounts,
             ),
-            *reading_families(head=parts.head.head, read_at=parts.head.advanced_at),
+            *parts.head.families(),
             *await self._stake.measure(),
         )
         return labelled(families, lighthouse=parts.channel.lighthouse)

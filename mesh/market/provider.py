@@ -30,7 +30,6 @@ from mesh.market.store import MarketStore
 from mesh.market.transactions import RETRY, UNDER_WAY, NoStake, TransactionQueue, least_cost
 from mesh.market.withdrawals import Withdrawals
 from mesh.network.channel import Channel
-from mesh.network.metrics import link_state, network_families
 from mesh.network.services import Services
 from mesh.role.composition import state_folder
 from mesh.role.following import ChainHead
@@ -388,14 +387,14 @@ class ProviderProcess:
 
     async def measure(self) -> tuple[MetricFamily, ...]:
         """The metrics of session, chain and account, and those of each provider with its lighthouse."""
-        families = [*network_families(self._network), *await self._chain.measure()]
+        families = [*self._network.families(), *await self._chain.measure()]
         for provider in self._providers:
             families += await provider.status.measure()
         return tuple(families)
 
     def health(self) -> Mapping[str, str]:
         """The state of each part; with several providers, their parts name the lighthouse."""
-        parts = {"channel": link_state(self._network)}
+        parts = {"channel": self._network.state}
         for provider in self._providers:
             of = f" of {provider.channel.lighthouse}" if len(self._providers) > 1 else ""
             parts |= {f"{part}{of}": state for part, state in provider.status.health().items()}

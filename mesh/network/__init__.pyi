@@ -9,7 +9,7 @@ from mesh.network.services import (
     no_answer as no_answer,
 )
 from mesh.network.session import Network as Network, NetworkChange as NetworkChange
-from mesh.network._tls import Tls as Tls
+from mesh.network.tls import Tls as Tls
 from mesh.network._validation import (
     MarketRules as MarketRules,
     MessageValidator as MessageValidator,

@@ -21,11 +21,12 @@ from mesh.network import sending
 from mesh.network._validation import M, MarketRules, MessageValidator, Unresolved, message_key
 from mesh.network.presence import PresenceWatch, present_keys
 from mesh.network.pump import BATCH, Pump
+from mesh.telemetry.metrics import MetricFamily, MetricSample
 from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, lighthouse_selector, market_selector, parse_key, presence_selector
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterator
+    from collections.abc import Callable, Container, Iterable, Iterator
 
     from mesh.network._validation import Resolver, ValidationStatistics, ValidatorCheck
 
@@ -176,6 +177,30 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
                     self.insert(verified)
         except Exception as error:
             self.fail(error)
+
+
+def message_families(subscriptions: Iterable[Subscription[Any]]) -> tuple[MetricFamily, ...]:
+    """Messages received over these subscriptions, by kind and verdict, and those dropped before validation."""
+    counts = [(subscription.kind, subscription.statistics()) for subscription in subscriptions]
+    verdicts = [
+        MetricSample(number, {"kind": kind, "verdict": verdict})
+        for kind, one in counts
+        for verdict, number in [("accepted", one.accepted), ("duplicate", one.duplicate), *sorted(one.invalid.items())]
+    ]
+    return (
+        MetricFamily(
+            "aira_messages_total",
+            "counter",
+            "Messages received, by kind and verdict: accepted, duplicate, or the reason for rejection",
+            tuple(verdicts),
+        ),
+        MetricFamily(
+            "aira_messages_dropped_total",
+            "counter",
+            "Messages dropped unseen, the oldest first, because they arrived faster than they were processed",
+            tuple(MetricSample(one.dropped, {"kind": kind}) for kind, one in counts),
+        ),
+    )
 
 
 ANSWER_TIMEOUT: Final = 5.0

@@ -1,25 +1,33 @@
-"""The endpoints and the identity of a Zenoh session, and the Zenoh configuration made from them."""
+"""Where a Zenoh session connects and listens, the Zenoh configuration made from that, and opening the session.
+
+Opening is a blocking call that can't be interrupted, so it is made in short attempts.
+"""
 
 from __future__ import annotations
 
 import json
+import logging
 import re
 import socket
 import sys
+import threading
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import zenoh
 
-from mesh.base.retry import RetryPolicy
-from mesh.errors import ConfigurationError
-from mesh.network._tls import Tls, unusable
+from mesh.base.outage_log import OutageLog
+from mesh.base.retry import Backoff, RetryPolicy
+from mesh.errors import ClosedError, ConfigurationError, NetworkUnavailable, RemoteError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from mesh.network.tls import Tls
     from mesh.settings import NetworkSettings
 
+log = logging.getLogger(__name__)
 
 RECONNECT: Final = RetryPolicy(initial=0.1, factor=1.5, ceiling=0.5)
 """Delays between attempts to reach a router: short, so that an agent is back within a second."""
@@ -38,8 +46,8 @@ LOCATOR: Final = re.compile(
 """The endpoints that Zenoh connects to. It reports no error for others; it never connects to them."""
 TLS_PREFIXES: Final = ("tls/", "quic/")
 """Prefixes of locators on which both sides show certificates."""
-
-
+CAUSE: Final = re.compile(r"\[\S+?: (?P<cause>.+?) at /")
+"""The cause in Zenoh's error about a listener."""
 SEND_WAIT: Final = 0.02
 """Seconds that a put waits for room in a client's queue before it drops the message, once until there is room again.
 
@@ -95,10 +103,15 @@ class Endpoints:
     @classmethod
     def from_settings(cls, settings: NetworkSettings) -> Endpoints:
         """The endpoints and identity of a client. Raises `ConfigurationError` for an incomplete identity."""
+        tls = None
+        if settings.tls_ca or settings.tls_certificate or settings.tls_key:
+            from mesh.network.tls import Tls  # loads Python's TLS, some megabytes
+
+            tls = Tls.from_settings(settings)
         return cls(
             connect=settings.connect,
             timeout=settings.connect_timeout,
-            tls=Tls.from_settings(settings),
+            tls=tls,
             shared_memory=settings.shared_memory,
         )
 
@@ -150,13 +163,12 @@ class Endpoints:
             raise ConfigurationError("no Zenoh router to connect to", hint="name one with --connect tcp/HOST:PORT")
         if not any(locator.startswith(TLS_PREFIXES) for locator in (*self.connect, *self.listen)):
             return
-        if self.tls is not None:
-            from mesh.network.handshake import check_files  # loads Python's TLS, some megabytes
+        from mesh.network.tls import check_files, unusable
 
-            check_files(self.tls, mode=self.mode)
-        else:
+        if self.tls is None:
             hint = "give --tls-ca, or tls_ca in the settings"
             raise unusable("a tls/ endpoint needs the site's certificate", hint=hint)
+        check_files(self.tls, mode=self.mode)
 
 
 def room_for_sessions() -> int:
@@ -186,3 +198,84 @@ def check_locators(*locators: str) -> None:
                 f"{locator!r} is not a Zenoh endpoint",
                 hint="write it as tcp/HOST:PORT, for instance tcp/127.0.0.1:7447",
             )
+
+
+class SessionOpening:
+    """Opens one session: call `run` in a thread, and `abandon` from another to cancel it."""
+
+    def __init__(self, endpoints: Endpoints) -> None:
+        self._endpoints = endpoints
+        self._lock = threading.Lock()
+        self._session: zenoh.Session | None = None
+        self._abandoned = threading.Event()
+        self._outage = OutageLog(log, "router")
+
+    def run(self) -> zenoh.Session:
+        """Return the open session. With an infinite timeout, the wait for a router is logged once.
+
+        Raises `NetworkUnavailable` when no router answers within the timeout, `RemoteError` (`not-admitted`) when every
+        router that answers rejects this identity, `ConfigurationError`, `ClosedError` when it was abandoned.
+        """
+        ends = time.monotonic() + self._endpoints.timeout
+        backoff = Backoff(RECONNECT)
+        while True:
+            try:
+                session = zenoh.open(self._endpoints.config())
+            except zenoh.ZError as error:
+                if self._endpoints.mode == "router":
+                    raise self._not_listening(error) from None
+                pause = backoff.next_delay() or 0.0
+                self._check_attempt(ends, pause)
+                self._abandoned.wait(pause)
+                session = None
+            if (opened := self._unless_abandoned(session)) is not None:
+                self._outage.recovered("a router answers")
+                return opened
+
+    def abandon(self) -> None:
+        """Cancel: close the session, now if it is open, otherwise as soon as it opens."""
+        with self._lock:
+            self._abandoned.set()
+            session, self._session = self._session, None
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+    def _unless_abandoned(self, session: zenoh.Session | None) -> zenoh.Session | None:
+        with self._lock:
+            if not self._abandoned.is_set():
+                self._session = session
+                return session
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+        raise ClosedError("opening the network session was cancelled")
+
+    def _check_attempt(self, ends: float, pause: float) -> None:
+        """After a failed attempt: raise unless there may be another one after `pause` seconds."""
+        self._check_admitted()
+        timeout, routers = self._endpoints.timeout, self._endpoints.connect
+        if timeout < 0:
+            self._outage.failed(NetworkUnavailable(routers, "no answer yet"), "waiting for a router")
+        elif time.monotonic() + pause >= ends:
+            raise NetworkUnavailable(routers, f"no answer within {timeout:g} s") from None
+
+    def _check_admitted(self) -> None:
+        """Raise `RemoteError` if all routers reject this identity: waiting longer would not help."""
+        if (tls := self._endpoints.tls) is None:
+            return
+        from mesh.network.tls import TlsRefusal, shake_hands
+
+        refusals = []
+        for locator in self._endpoints.connect:
+            if not isinstance(refusal := shake_hands(tls, locator, ATTEMPT_TIMEOUT), TlsRefusal):
+                return
+            refusals.append(f"{locator}: {refusal.text}")
+        hint = "set --tls-ca, --tls-certificate and --tls-key to your site's; `aira identity show` prints them"
+        raise RemoteError(f"rejected by the Zenoh router at {'; '.join(refusals)}", hint=hint, code="not-admitted")
+
+    def _not_listening(self, error: zenoh.ZError) -> ConfigurationError:
+        found = CAUSE.search(str(error))
+        why = found["cause"] if found else str(error).split(" at /", 1)[0]
+        hint = "is the port taken? choose another with --listen tcp/HOST:PORT"
+        return ConfigurationError(
+            f"can't listen at {', '.join(self._endpoints.listen)}: {why}", hint=hint, code="listen-failed"
+        )

@@ -33,15 +33,16 @@ from mesh.base.fresh_file import CHECK_INTERVAL
 from mesh.base.log_context import log_event
 from mesh.errors import ClosedError
 from mesh.network import sending
-from mesh.network.connecting import SessionOpening
+from mesh.network.endpoints import Endpoints, SessionOpening
+from mesh.telemetry.metrics import MetricFamily, counter, gauge
 from schemas import parse_address
+from schemas.status import ALIVE
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Collection, Iterator
 
     from mesh.base.clock import Clock
     from mesh.base.flood import Drops
-    from mesh.network.endpoints import Endpoints
 
 
 log = logging.getLogger(__name__)
@@ -255,6 +256,18 @@ class Network:
     def links(self) -> int:
         """The number of connected routers; for a router, of its clients as well."""
         return len(self._linked)
+
+    @property
+    def state(self) -> str:
+        """Its health as a part of a role."""
+        return ALIVE if self.connected else "waits for a router"
+
+    def families(self) -> tuple[MetricFamily, ...]:
+        """The metrics of the connection."""
+        return (
+            gauge("aira_network_links", "Connected routers; for a router, all sessions connected to it", self.links),
+            counter("aira_network_losses_total", "How often the last connected router was lost", self.losses),
+        )
 
     async def __aenter__(self) -> Self:
         if self._session is not None:

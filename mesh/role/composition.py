@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mesh.base.flood import Drops
     from mesh.chain import Account, Chain
     from mesh.role.following import ChainHead
-    from mesh.settings import AccountSettings, ChainSettings, NetworkSettings, Settings
+    from mesh.settings import AccountSettings, ChainSettings, Settings
     from mesh.settings.groups import StorageSettings
     from schemas import Signer
 
@@ -114,7 +114,7 @@ async def open_parts(
 async def watching(settings: Settings, *, drops: Drops | None = None) -> AsyncIterator[tuple[Network, Channel]]:
     """What a role has open that only watches the market: it needs a router, but no account and no chain."""
     async with (
-        Network(endpoints_of(settings)) as network,
+        Network(Endpoints.from_settings(settings)) as network,
         Channel(
             network.session, settings.lighthouse_contract, drops=drops, answer_timeout=settings.answer_timeout
         ) as channel,
@@ -128,7 +128,7 @@ async def connected(
 ) -> AsyncIterator[tuple[Network, Channel]]:
     """A session, and the channel of the lighthouse, which resolves names and knows the head by the chain."""
     async with (
-        Network(endpoints_of(settings)) as network,
+        Network(Endpoints.from_settings(settings)) as network,
         Channel(
             network.session,
             settings.lighthouse_contract,
@@ -190,11 +190,6 @@ async def state_folder(settings: StorageSettings, chain: Chain, address: str) ->
     """
     first = await chain.node.block_hash(min(1, await chain.block_number()))
     return settings.state_directory / address / f"{chain.chain_id}-{first.hex()[:8]}"
-
-
-def endpoints_of(settings: NetworkSettings) -> Endpoints:
-    """Where the settings' client session connects to."""
-    return Endpoints.from_settings(settings)
 
 
 async def open_store(stack: AsyncExitStack, settings: Settings, folder: Path, *, limit: int) -> Store:

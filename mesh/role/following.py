@@ -39,6 +39,7 @@ from mesh.chain import (
     RequestRefused,
 )
 from mesh.chain.following import QUICK
+from mesh.telemetry.metrics import gauge
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Sequence
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from mesh.base.outage_log import OutageLog
     from mesh.chain import BlockEvents, Chain, ChainEvent
     from mesh.chain.following import Choose
+    from mesh.telemetry.metrics import MetricFamily
     from schemas import Liability
 
     Created = tuple[Liability, tuple[bytes, bytes]]
@@ -86,13 +88,22 @@ class ChainHead:
         """All of `block` has been handled. After a reorganisation it may be lower than before."""
         self.head = self._handled = block
         self._other = None if contract_block == block else contract_block
-        self.advanced_at = time.monotonic()
+        self._advanced_at = time.monotonic()
         self._advance()
 
     async def reached(self, block: int) -> None:
         """Return when `block` has been handled."""
         while self._handled < block:
             await self._advanced.wait()
+
+    def families(self) -> tuple[MetricFamily, ...]:
+        """How far the chain was read, and when."""
+        return (
+            gauge("aira_chain_head_block", "The last block that was read", self.head),
+            gauge(
+                "aira_chain_read_age_seconds", "Seconds since a block was read", time.monotonic() - self._advanced_at
+            ),
+        )
 
     def _advance(self) -> None:
         self._advanced.set()

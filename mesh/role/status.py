@@ -8,8 +8,8 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import mesh
-from mesh.network.metrics import drop_family, link_state, message_families, network_families
-from mesh.telemetry.metrics import gauge, labelled, public_parts
+from mesh.network.channel import message_families
+from mesh.telemetry.metrics import drop_family, gauge, labelled, public_parts
 from schemas.status import ALIVE, Status, StoreUse
 
 if TYPE_CHECKING:
@@ -37,11 +37,11 @@ class WatcherStatus:
         received = labelled(
             (*message_families(subscriptions), drop_family(self._drops)), lighthouse=self._channel.lighthouse
         )
-        return (*received, *network_families(self._network))
+        return (*received, *self._network.families())
 
     def health(self) -> Mapping[str, str]:
         """The state of its one part, the channel."""
-        return {"channel": link_state(self._network)}
+        return {"channel": self._network.state}
 
 
 class RoleStatus(ABC, Generic[P]):
@@ -75,14 +75,12 @@ class RoleStatus(ABC, Generic[P]):
     def health(self) -> dict[str, str]:
         """The state of each part."""
         return {
-            "channel": link_state(self.parts.network),
+            "channel": self.parts.network.state,
             "listener": "waits for the node" if self.parts.outages.is_down else ALIVE,
         }
 
     async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[MetricFamily, ...]:
         """The metrics now; `subscriptions` are those of its market."""
-        from mesh.chain.metrics import reading_families
-
         parts, usage = self.parts, await asyncio.to_thread(self.parts.store.usage)
         families = (
             *message_families(subscriptions),
@@ -91,10 +89,10 @@ class RoleStatus(ABC, Generic[P]):
             gauge("aira_content_files", "Files in the content store", usage.files),
             gauge("aira_content_bytes", "Bytes of the content store", usage.bytes),
             *(() if usage.quota is None else (gauge("aira_content_quota_bytes", "The store's quota", usage.quota),)),
-            *reading_families(head=parts.chain_head.head, read_at=parts.chain_head.advanced_at),
+            *parts.chain_head.families(),
         )
         own = labelled(families, lighthouse=parts.channel.lighthouse)
-        return (*own, *network_families(parts.network), *await parts.chain.measure())
+        return (*own, *parts.network.families(), *await parts.chain.measure())
 
     @abstractmethod
     async def _own_status(self, store: StoreUse) -> dict[str, Any]:

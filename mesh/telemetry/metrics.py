@@ -19,6 +19,7 @@ from schemas.status import ALIVE, OFF
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from mesh.base.flood import Drops
 
 MetricType = Literal["counter", "gauge"]
 """A counter only grows while a process runs; a gauge goes up and down."""
@@ -54,6 +55,12 @@ def gauge(name: str, meaning: str, value: float) -> MetricFamily:
 def by_label(name: str, kind: MetricType, meaning: str, label: str, values: Mapping[str, float]) -> MetricFamily:
     """A family with one label and a sample for each of its values."""
     return MetricFamily(name, kind, meaning, tuple(MetricSample(value, {label: key}) for key, value in values.items()))
+
+
+def drop_family(drops: Drops) -> MetricFamily:
+    """What a role dropped because of floods."""
+    meaning = "Messages, requests and the like that were dropped because there were too many, by reason"
+    return by_label("aira_dropped_total", "counter", meaning, "reason", drops.totals())
 
 
 def labelled(families: Iterable[MetricFamily], **labels: str) -> tuple[MetricFamily, ...]:

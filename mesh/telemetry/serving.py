@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import logging
+import time
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
 
 from mesh.base.extras import needs_extra
-from mesh.errors import ClosedError
+from mesh.errors import AiraError, ClosedError
 from mesh.telemetry.metrics import STARTING, Health, health_metrics, listen_address
 
 if TYPE_CHECKING:
@@ -23,8 +25,12 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+log = logging.getLogger(__name__)
+
 ANSWER_TIMEOUT: Final = 5.0
 """Seconds that the event loop may take to answer."""
+NODE_TIMEOUT: Final = 1.0
+"""Seconds that a node of the chain may take; metrics that it does not answer by then are left out."""
 
 
 def open_server(
@@ -147,3 +153,25 @@ class Telemetry:
         except concurrent.futures.TimeoutError:
             future.cancel()
             raise TimeoutError(f"the event loop has not answered within {self._answer_timeout:g} s") from None
+
+
+class CachedMetrics:
+    """Metrics that the node is asked for at most every `max_age` seconds, left out if it does not answer in time."""
+
+    def __init__(self, ask: Measure, *, max_age: float) -> None:
+        self._ask = ask
+        self._max_age = max_age
+        self._families: tuple[MetricFamily, ...] = ()
+        self._asked_at = float("-inf")
+
+    async def measure(self) -> tuple[MetricFamily, ...]:
+        """The metrics, not older than `max_age`."""
+        if time.monotonic() - self._asked_at >= self._max_age:
+            self._asked_at = time.monotonic()
+            try:
+                async with asyncio.timeout(NODE_TIMEOUT):
+                    self._families = tuple(await self._ask())
+            except (AiraError, TimeoutError) as error:
+                log.debug("metrics of the chain are left out: %s", error)
+                self._families = ()
+        return self._families

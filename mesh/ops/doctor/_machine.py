@@ -13,16 +13,15 @@ import pwd
 import re
 import shutil
 import socket
-import ssl
 import stat
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from mesh.network import Tls
 from mesh.network.endpoints import SPARE_DESCRIPTORS, check_locators, room_for_sessions
-from mesh.network.handshake import WILDCARD_HOSTS, refusal_by
+from mesh.network.tls import WILDCARD_HOSTS, TlsRefusal, shake_hands
 from mesh.ops.doctor.checks import (
     CheckResult,
     certificate_info,
@@ -30,7 +29,6 @@ from mesh.ops.doctor.checks import (
     failed,
     passed,
     subject_values,
-    tls_context,
     warning,
 )
 from mesh.ops.identity.roster import read_roster
@@ -237,7 +235,7 @@ def check_router_address(locator: str, settings: Settings) -> CheckResult:
     answers = f"{locator} answers in {(time.monotonic() - began) * 1000:.1f} ms"
     if place["kind"] == "tcp":
         return passed(answers)
-    return _shown(locator, Tls.from_settings(settings), (host, port), answers)
+    return _shown(locator, Tls.from_settings(settings), answers)
 
 
 def is_everywhere(locator: str) -> bool:
@@ -304,7 +302,7 @@ def _unanswered(locator: str, error: OSError) -> CheckResult:
     )
 
 
-def _shown(locator: str, tls: Tls | None, place: tuple[str, int], answers: str) -> CheckResult:
+def _shown(locator: str, tls: Tls | None, answers: str) -> CheckResult:
     """The certificate that a TLS router presents, and whether it accepts ours."""
     if tls is None:
         return failed(
@@ -312,13 +310,13 @@ def _shown(locator: str, tls: Tls | None, place: tuple[str, int], answers: str) 
             code="certificate-required",
             hint=OWN_FILES,
         )
-    if (refusal := refusal_by(tls, locator, SECONDS)) is not None:
+    certificate = shake_hands(tls, locator, SECONDS)
+    if isinstance(certificate, TlsRefusal):
         return failed(
-            f"{locator}: {refusal.text}",
-            code=refusal.reason,
+            f"{locator}: {certificate.text}",
+            code=certificate.reason,
             hint=f"check that {tls.ca} is of this router's site; {OWN_FILES}",
         )
-    certificate = _certificate_of(tls, place, named=not is_everywhere(locator))
     if certificate is None:
         return failed(
             f"{locator}: the TLS 1.3 handshake failed",
@@ -331,21 +329,6 @@ def _shown(locator: str, tls: Tls | None, place: tuple[str, int], answers: str) 
     )
     shown = f"{answers}, accepts our certificate and presents that of {whose}"
     return _lasting(shown, expiry_of(certificate), whose="router")
-
-
-def _certificate_of(tls: Tls, place: tuple[str, int], *, named: bool) -> dict[str, Any] | None:
-    """The certificate that a router presents, verified against our site and, if `named`, against the host; None if
-    the handshake fails."""
-    context = tls_context(tls, ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = named
-    try:
-        with (
-            socket.create_connection(place, SECONDS) as connection,
-            context.wrap_socket(connection, server_hostname=place[0]) as shaken,
-        ):
-            return shaken.getpeercert()
-    except OSError:  # `ssl.SSLError` is one
-        return None
 
 
 def _lasting(words: str, until: float, *, whose: str) -> CheckResult:

@@ -16,7 +16,7 @@ from mesh.base.background import in_daemon_thread
 from mesh.errors import AiraError, ConfigurationError, InvalidAddress
 from mesh.network import Tls
 from mesh.network.endpoints import TLS_PREFIXES
-from mesh.network.handshake import check_files
+from mesh.network.tls import check_files
 from mesh.settings import DEFAULTS
 from schemas.address import parse_address
 
@@ -160,10 +160,8 @@ def certificate_info(tls: Tls, *, mode: str) -> CertificateInfo | None:
 
     Raises `ConfigurationError` for unusable files, and for a certificate whose common name is not an address.
     """
-    check_files(tls, mode=mode)
-    if tls.pair is None:
+    if (subject := check_files(tls, mode=mode)) is None:
         return None
-    subject = _peer_certificate(tls)
     (address, *_) = subject_values(subject, "commonName") or ("",)
     try:
         address = parse_address(address).lower()
@@ -197,32 +195,6 @@ def subject_values(certificate: dict[str, Any], name: str) -> tuple[str, ...]:
 def expiry_of(certificate: dict[str, Any]) -> float:
     """Its expiry, in seconds since the epoch."""
     return float(ssl.cert_time_to_seconds(str(certificate["notAfter"])))
-
-
-def tls_context(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
-    """TLS settings like Zenoh's, with files that were checked before."""
-    context = ssl.SSLContext(protocol)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.load_verify_locations(tls.ca)
-    if tls.pair is not None:
-        context.load_cert_chain(*tls.pair)
-    return context
-
-
-def _peer_certificate(tls: Tls) -> dict[str, Any]:
-    """Read the own certificate by a handshake with itself, in memory."""
-    client, server = tls_context(tls, ssl.PROTOCOL_TLS_CLIENT), tls_context(tls, ssl.PROTOCOL_TLS_SERVER)
-    client.check_hostname = False
-    client.verify_mode = ssl.CERT_NONE
-    server.verify_mode = ssl.CERT_REQUIRED
-    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
-    asking, answering = client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True)
-    for end in (asking, answering, asking, answering):
-        try:
-            end.do_handshake()
-        except ssl.SSLWantReadError:
-            continue
-    return answering.getpeercert() or {}
 
 
 Role: TypeAlias = Literal["agent", "provider", "validator", "person", "edge", "bridge", "router", "operator"]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT, Account, Chain, Node, NodeUnreachable, TransactionSender, deploy
-from mesh.chain.metrics import TransactionOutcome
+from mesh.chain._pending import TransactionOutcome
 from mesh.dev import EmbeddedChain
 from mesh.dev._embedded import EmbeddedProvider
 from tests.mesh.chain.conftest import QUICK, reverted
@@ -48,8 +48,8 @@ async def test_a_successful_transaction_counts_as_sent_and_mined_with_its_gas(no
         account = Account(node.funded_keys[0])
         before = await way.eth_balance(account.address)
         receipt = await TransactionSender(way, account).send(to=unused_address(), data=b"", value=5)
-        counted = way.metrics
-        assert counted.transactions == NONE | {"sent": 1, "mined": 1}
+        counted = way.sent
+        assert counted.by_outcome == NONE | {"sent": 1, "mined": 1}
         assert (counted.gas_used, counted.wei) == (receipt.gas_used, receipt.wei)
         assert before - await way.eth_balance(account.address) == counted.wei + 5
 
@@ -60,8 +60,8 @@ async def test_a_transaction_that_would_revert_is_not_sent_and_costs_nothing(nod
     async with Chain(node.provider, account=friend, timing=QUICK) as chain:
         with reverted("ERC20InsufficientBalance"):
             await chain.tokens.transfer(deployer.address, XRT)
-        counted = chain.node.metrics
-        assert counted.transactions == NONE | {"refused": 1}
+        counted = chain.node.sent
+        assert counted.by_outcome == NONE | {"refused": 1}
         assert (counted.gas_used, counted.wei) == (0, 0)
 
 
@@ -73,11 +73,11 @@ async def test_an_outage_counts_once_and_each_failed_request(node: EmbeddedChain
             for _ in range(3):
                 with pytest.raises(NodeUnreachable):
                     await way.block_number()
-            counted = way.metrics
+            counted = way.rpc
             assert (counted.losses, counted.failures) == (silence, 3 * silence)
             line.cut = False
             await way.block_number()
-        assert way.metrics.losses == 2
+        assert way.rpc.losses == 2
 
 
 async def test_a_stuck_transaction_is_replaced_and_mined_once(anvil: Anvil) -> None:
@@ -89,7 +89,7 @@ async def test_a_stuck_transaction_is_replaced_and_mined_once(anvil: Anvil) -> N
                 await way.request("evm_mine")
                 await asyncio.sleep(0.05)
         await sending
-        counted = way.metrics.transactions
+        counted = way.sent.by_outcome
         assert (
             counted[TransactionOutcome.SENT],
             counted[TransactionOutcome.MINED],

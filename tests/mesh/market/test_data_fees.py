@@ -71,7 +71,7 @@ async def test_the_metrics_name_the_part_for_data(local: LocalMarket) -> None:
         receipt = await TransactionSender(chain.node, local.accounts["provider"]).send(
             to=local.address("robot"), data=b"", value=1
         )
-        families = {family.name: family for family in chain.node.metrics.families()}
+        families = {family.name: family for family in chain.node.families()}
         values = {name: families[f"aira_{name}_wei_total"].samples[0].value for name in ("gas_spent", "data_spent")}
         fee = line_of(local).charged(receipt.tx)
         assert values == {"gas_spent": float(receipt.wei), "data_spent": float(fee)}

@@ -261,10 +261,10 @@ def test_no_file_with_a_key_can_be_read_by_others(site: Site, arm: MemberFolder)
     assert [path.stat().st_mode & 0o777 for path in (site.authority.key, arm.key, ann.key)] == [0o600] * 3
 
 
-def test_a_silent_port_is_not_a_refusal_by(site: Site, arm: MemberFolder) -> None:
+def test_a_silent_port_shakes_no_hands(site: Site, arm: MemberFolder) -> None:
     import socket
 
-    from mesh.network.handshake import refusal_by
+    from mesh.network.tls import shake_hands
 
     with closing(socket.create_server(("127.0.0.1", site.port))):
-        assert refusal_by(site.client(arm).tls or pytest.fail("no identity"), site.endpoint, 0.2) is None
+        assert shake_hands(site.client(arm).tls or pytest.fail("no identity"), site.endpoint, 0.2) is None

@@ -1,4 +1,4 @@
-"""Diagnosis of TLS identities: checks certificate files before a session opens, and explains a failed handshake.
+"""The TLS identity of a session: its files, their check before a session opens, and why a handshake failed.
 
 Zenoh reports a failed handshake only as a missing connection. Therefore the files are checked before Zenoh reads them,
 and after a failure Python's own TLS repeats the handshake to find the reason.
@@ -9,12 +9,14 @@ from __future__ import annotations
 import re
 import socket
 import ssl
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from mesh.network._tls import unusable
+from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from mesh.network._tls import Tls
+    from mesh.settings import NetworkSettings
 
 LOCATOR: Final = re.compile(r"tls/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")
 WILDCARD_HOSTS: Final = ("0.0.0.0", "::")
@@ -23,6 +25,56 @@ ALERT_TIMEOUT: Final = 1.0
 """Seconds in which a router that rejects the certificate says so after the handshake."""
 HOSTNAME_MISMATCH: Final = 62
 """OpenSSL's number of the error that a certificate names another host."""
+
+
+def unusable(why: str, *, hint: str = "`aira identity new` creates it") -> ConfigurationError:
+    """The error that the files of the TLS identity can't be used."""
+    return ConfigurationError(why, hint=hint, code="tls-unusable")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tls:
+    """The certificate files of one identity (paths, PEM): the site's, the session's own, and its key.
+
+    A client may omit the last two; then only a router that requires no client certificate accepts it. Zenoh reads the
+    files on every connection, so a renewed certificate takes effect without a restart.
+    """
+
+    ca: Path
+    certificate: Path | None = None
+    key: Path | None = None
+
+    @classmethod
+    def from_settings(cls, settings: NetworkSettings) -> Tls | None:
+        """The identity that the settings name, None if they name none. Raises `ConfigurationError`."""
+        if not settings.tls_ca and (settings.tls_certificate or settings.tls_key):
+            raise unusable("tls_certificate is set, but tls_ca is not", hint="add --tls-ca")
+        if not settings.tls_ca:
+            return None
+        return cls(
+            ca=Path(settings.tls_ca).expanduser(),
+            certificate=Path(settings.tls_certificate).expanduser() if settings.tls_certificate else None,
+            key=Path(settings.tls_key).expanduser() if settings.tls_key else None,
+        )
+
+    @property
+    def pair(self) -> tuple[Path, Path] | None:
+        """The session's own certificate and its key, None without them."""
+        return None if self.certificate is None or self.key is None else (self.certificate, self.key)
+
+    def options(self, mode: str) -> dict[str, object]:
+        """Zenoh's options below `transport/link/tls` for a session in this mode. Paths are absolute."""
+        options: dict[str, object] = {
+            "root_ca_certificate": str(self.ca.absolute()),
+            "enable_mtls": self.pair is not None,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+        if self.pair is not None:
+            certificate, key = (str(path.absolute()) for path in self.pair)
+            for use in ("connect", "listen") if mode == "router" else ("connect",):
+                options |= {f"{use}_certificate": certificate, f"{use}_private_key": key}
+        return options
 
 
 class TlsRefusal(NamedTuple):
@@ -45,10 +97,11 @@ ALERTS: Final = {
 """What each TLS alert means with which a router ends the handshake."""
 
 
-def check_files(tls: Tls, *, mode: str) -> None:
-    """Raise `ConfigurationError` for files that can't work: missing, malformed, expired, or not matching.
+def check_files(tls: Tls, *, mode: str) -> dict[str, Any] | None:
+    """The session's own certificate, as `ssl` represents it; None without one.
 
-    `mode` is the mode of the session that uses them: `router` or `client`.
+    `mode` is the mode of the session that uses the files: `router` or `client`. Raises `ConfigurationError` for files
+    that can't work: missing, malformed, expired, or not matching.
     """
     if (tls.certificate is None) != (tls.key is None):
         raise unusable("only one of tls_certificate and tls_key is set")
@@ -60,16 +113,16 @@ def check_files(tls: Tls, *, mode: str) -> None:
                 path.read_bytes()
         except OSError as error:
             raise unusable(f"can't read the {what} {path}: {error.strerror}") from None
-    if tls.certificate is None:
-        _context(tls, ssl.PROTOCOL_TLS_CLIENT)
-    else:
-        _check_certificate(tls, mode)
+    if tls.certificate is not None:
+        return _checked_certificate(tls, mode)
+    _context(tls, ssl.PROTOCOL_TLS_CLIENT)
+    return None
 
 
-def refusal_by(tls: Tls, locator: str, seconds: float) -> TlsRefusal | None:
-    """Why the router at a `tls/` locator and this identity reject each other.
+def shake_hands(tls: Tls, locator: str, seconds: float) -> dict[str, Any] | TlsRefusal | None:
+    """The certificate of the router at a `tls/` locator, or why it and this identity reject each other.
 
-    None if nothing answers there within `seconds`, or if the handshake succeeds. Blocks.
+    None if nothing answers there within `seconds`, or if the handshake fails for another reason. Blocks.
     """
     address = LOCATOR.match(locator)
     if address is None:
@@ -84,10 +137,12 @@ def refusal_by(tls: Tls, locator: str, seconds: float) -> TlsRefusal | None:
         return None
 
 
-def _handshake(context: ssl.SSLContext, connection: socket.socket, host: str) -> TlsRefusal | None:
+def _handshake(context: ssl.SSLContext, connection: socket.socket, host: str) -> dict[str, Any] | TlsRefusal | None:
     """With TLS 1.3 the client finishes first; the router's rejection arrives in place of data."""
+    certificate = None
     try:
         with context.wrap_socket(connection, server_hostname=host) as secured:
+            certificate = secured.getpeercert()
             secured.settimeout(ALERT_TIMEOUT)
             secured.recv(1)
     except ssl.SSLCertVerificationError as error:
@@ -97,12 +152,12 @@ def _handshake(context: ssl.SSLContext, connection: socket.socket, host: str) ->
         reason = error.reason or ""
         return next((refusal for alert, refusal in ALERTS.items() if reason.endswith(alert)), None)
     except OSError:
-        return None
-    return None
+        pass  # it has nothing to say, or is gone
+    return certificate
 
 
-def _check_certificate(tls: Tls, mode: str) -> None:
-    """Check the certificate as the other side will, by a handshake with itself in memory."""
+def _checked_certificate(tls: Tls, mode: str) -> dict[str, Any] | None:
+    """The certificate as the other side sees it, by a handshake with itself in memory."""
     client, server = _context(tls, ssl.PROTOCOL_TLS_CLIENT), _context(tls, ssl.PROTOCOL_TLS_SERVER)
     client.check_hostname = False
     client.verify_mode = ssl.CERT_REQUIRED if mode == "router" else ssl.CERT_NONE
@@ -118,6 +173,7 @@ def _check_certificate(tls: Tls, mode: str) -> None:
             why = f"the certificate {tls.certificate} can't be used: {_explained(error, tls)}"
             hint = "`aira identity show` prints its contents, `aira identity renew` renews it"
             raise unusable(why, hint=hint) from None
+    return ends[mode != "router"].getpeercert()
 
 
 def _explained(error: ssl.SSLCertVerificationError, tls: Tls) -> str:
@@ -128,6 +184,7 @@ def _explained(error: ssl.SSLCertVerificationError, tls: Tls) -> str:
 
 
 def _context(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
+    """TLS settings like Zenoh's. Raises `ConfigurationError` for files that are not PEM, or don't match."""
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
