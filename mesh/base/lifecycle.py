@@ -37,6 +37,12 @@ class Lifecycle(ABC):
         """Whether it is inside `async with`."""
         return self._stack is not None
 
+    def check_open(self) -> AsyncExitStack:
+        """What is closed when it is left. Raises `ClosedError` outside `async with`."""
+        if self._stack is None:
+            raise ClosedError(f"this {self.title} is not open", hint="use it inside `async with`")
+        return self._stack
+
     @abstractmethod
     async def _open(self, stack: AsyncExitStack) -> None:
         """Open what it needs, on `stack`."""
@@ -47,8 +53,7 @@ class Role(Lifecycle):
 
     async def run(self) -> None:
         """Work until cancelled. Raises `ClosedError` outside `async with`."""
-        if self._stack is None:
-            raise ClosedError(f"this {self.title} is not open", hint="use it inside `async with`")
+        self.check_open()
         await self._work()
 
     @abstractmethod

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import AsyncExitStack
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
+from mesh.base.lifecycle import Lifecycle
 from mesh.chain._abi import is_code_of
 from mesh.chain._contracts import Contracts, contract_version
 from mesh.chain._lighthouses import Lighthouses
@@ -16,18 +16,17 @@ from mesh.chain._permits import Permits
 from mesh.chain._tokens import Funds, Tokens
 from mesh.chain._validators import Validators
 from mesh.chain.errors import NoContracts, UnknownName
-from mesh.chain.following import NODE_ERRORS, EventSources, follow, glance, history_at, read_events, retrying
+from mesh.chain.following import NODE_ERRORS, EventSources, follow, glance, read_events, retrying
 from mesh.chain.liabilities import Liabilities
 from mesh.chain.transactions import TransactionSender
-from mesh.errors import ClosedError
 from mesh.settings.chains import ANY
 from mesh.telemetry.metrics import gauge
 from mesh.telemetry.serving import CachedMetrics
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Sequence
+    from contextlib import AsyncExitStack
     from pathlib import Path
-    from typing import Self
 
     from web3 import AsyncWeb3
     from web3.providers.async_base import AsyncBaseProvider
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-class Chain:
+class Chain(Lifecycle):
     """The contracts of the network on the chain at `endpoint` (see `Node`), for one `account` or for reading only.
 
     `contracts` says whether they are this project's (`"mesh"`, which read both generations of orders) or the
@@ -64,6 +63,8 @@ class Chain:
     `lighthouses`, `validators`, `funds`, `tokens`, `names`; `follow` yields events; `web3` talks to any other
     contract.
     """
+
+    title = "chain"
 
     def __init__(
         self,
@@ -94,25 +95,17 @@ class Chain:
         self._factory_name = factory or f"factory.{generation}.robonomics.eth"
         self._xrt_name = xrt or f"xrt.{generation}.robonomics.eth"
         self._kind = contracts
-        self._stack = AsyncExitStack()
-        self._contracts: Contracts | None = None
         self._web3: AsyncWeb3[AsyncBaseProvider] | None = None
         self._balances = CachedMetrics(self._ask_balances, max_age=self.node.timing.metrics_age)
 
-    async def __aenter__(self) -> Self:
-        async with AsyncExitStack() as stack:
-            if self._owns_node:
-                await stack.enter_async_context(self.node)
-            self._contracts = await self._find_contracts()
-            self._validators = Validators(self._contracts, listed=self._known_validators)
-            self._permits = Permits(self._contracts)
-            self._funds, self._tokens = Funds(self._contracts, self._permits), Tokens(self._contracts)
-            self._stack = stack.pop_all()
-        return self
-
-    async def __aexit__(self, *exc_info: object) -> None:
-        self._contracts = self._web3 = None
-        await self._stack.aclose()
+    async def _open(self, stack: AsyncExitStack) -> None:
+        if self._owns_node:
+            await stack.enter_async_context(self.node)
+        self._contracts = contracts = await self._find_contracts()
+        self._web3 = None
+        self._permits, self._tokens = Permits(contracts), Tokens(contracts)
+        self._funds = Funds(contracts, self._permits)
+        self._validators = Validators(contracts, listed=self._known_validators)
 
     @property
     def chain_id(self) -> int:
@@ -142,19 +135,19 @@ class Chain:
     @property
     def tokens(self) -> Tokens:
         """Ether, XRT and other tokens."""
-        self._opened()
+        self.check_open()
         return self._tokens
 
     @property
     def funds(self) -> Funds:
         """What accounts have and let the factory take; what orders cost, and whether it can be paid."""
-        self._opened()
+        self.check_open()
         return self._funds
 
     @property
     def permits(self) -> Permits:
         """Approvals by signature (EIP-2612): the account's own, and those of others that were noted."""
-        self._opened()
+        self.check_open()
         return self._permits
 
     @property
@@ -170,7 +163,7 @@ class Chain:
     @property
     def validators(self) -> Validators:
         """Which validators orders may name."""
-        self._opened()
+        self.check_open()
         return self._validators
 
     @property
@@ -204,10 +197,6 @@ class Chain:
     async def contract_block(self) -> int:
         """The contracts' number of the latest block, which deadlines and refunds count: on Arbitrum, Ethereum's."""
         return await self.node.contract_block()
-
-    async def history_at(self, block_number: int) -> History:
-        """The history of a consumer that has read nothing yet and begins after a block: see `following`."""
-        return await history_at(self.node, block_number)
 
     def follow(
         self,
@@ -279,6 +268,5 @@ class Chain:
         )
 
     def _opened(self) -> Contracts:
-        if self._contracts is None:
-            raise ClosedError("the chain is not open: use it with `async with`")
+        self.check_open()
         return self._contracts

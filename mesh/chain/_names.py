@@ -88,8 +88,8 @@ class Names:
         address = str(await self._node.read(resolver.addr(namehash(name))))
         if address == ZERO_ADDRESS:
             raise UnknownName(name)
-        self._addresses[name] = found = parse_address(address), time.monotonic() + ADDRESS_SECONDS
-        return found[0]
+        self._addresses[name] = address, time.monotonic() + ADDRESS_SECONDS
+        return address
 
     async def model(self, name_or_cid: str) -> str:
         """The CID of a model behind a name (`NAME.model.N.robonomics.eth`), or the given CID itself.
@@ -119,7 +119,7 @@ class Names:
             resolver = str(await self._node.read(registry.resolver(namehash(root))))
             if resolver == ZERO_ADDRESS:
                 raise UnknownName(name)
-            self._resolvers[root] = parse_address(resolver)
+            self._resolvers[root] = resolver
         return self._resolvers[root]
 
 

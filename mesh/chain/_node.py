@@ -153,6 +153,10 @@ class Pace:
         return min(max(latest.timestamp + seconds + self._offset - now, 0.0), float(seconds))
 
 
+def _now() -> float:
+    return asyncio.get_running_loop().time()
+
+
 class Heads:
     """The latest block: `look` asks for it now, and `next` waits for one that the caller has not seen.
 
@@ -198,7 +202,7 @@ class Heads:
     async def recent(self) -> BlockHeader:
         """The latest block, as it was a poll interval ago or later; the node is asked only if it is not known."""
         if self.latest is not None:
-            now = self._now()
+            now = _now()
             if now - self._seen_at <= self._interval or self.is_pushed or self.pace.is_early(self.latest, now):
                 return self.latest
         return await self.look()
@@ -239,7 +243,7 @@ class Heads:
             self._take(head)
 
     def _take(self, head: BlockHeader) -> None:
-        before, self.latest, self._seen_at = self.latest, head, self._now()
+        before, self.latest, self._seen_at = self.latest, head, _now()
         if before is None or before.hash != head.hash:
             if before is not None and before.hash == head.parent_hash:
                 self.pace.add(before, head)
@@ -253,7 +257,7 @@ class Heads:
         """Wait until the next block is due, or pushed; then look for it."""
         self._request_pushes()
         news, is_due, asked_at = self._news, self.pace.is_learned, self._seen_at
-        pause = self.pace.silence if self.is_pushed else self.pace.pause(latest, self._now())
+        pause = self.pace.silence if self.is_pushed else self.pace.pause(latest, _now())
         if self._expected > latest.number:
             self._expected, pause = 0, 0.0
         with suppress(TimeoutError):
@@ -263,7 +267,7 @@ class Heads:
         if not self.pace.is_sampled:
             await self._sample(latest)
         if (head := await self.look()).hash != latest.hash:
-            self.pace.found(head, self._now(), waited=self._now() - asked_at)
+            self.pace.found(head, _now(), waited=_now() - asked_at)
         elif is_due:
             self.pace.missed()
 
@@ -275,10 +279,6 @@ class Heads:
                 return
             self.pace.add(earlier, later)
             later = earlier
-
-    @staticmethod
-    def _now() -> float:
-        return asyncio.get_running_loop().time()
 
 
 RUN_NUMBER: Final = bytes.fromhex("4360005260206000f3")
@@ -322,9 +322,9 @@ class ContractBlocks:
 
     async def are_own(self) -> bool:
         """Whether contracts count the chain's own blocks."""
-        if self._now() >= self._check_at:
+        if _now() >= self._check_at:
             async with self._asking:
-                if self._now() >= self._check_at:
+                if _now() >= self._check_at:
                     await self._check()
         return self._are_own
 
@@ -333,19 +333,15 @@ class ContractBlocks:
         number = await self._run(head)
         if number is not None:
             self._are_own = number in (head, head + 1)  # some nodes run calls in the block after
-        self._check_at = self._now() + (CHECK_REFUSED if number is None else CHECK_AGAIN)
+        self._check_at = _now() + (CHECK_REFUSED if number is None else CHECK_AGAIN)
 
     async def _ask(self) -> int:
         async with self._asking:
-            if self._now() >= self._ask_at:
+            if _now() >= self._ask_at:
                 number = await self._run("latest")
                 self._seen = max(self._seen, (number or 0) - 1)  # another machine of the node may be behind
-                self._ask_at = self._now() + self._interval
+                self._ask_at = _now() + self._interval
         return self._seen
-
-    @staticmethod
-    def _now() -> float:
-        return asyncio.get_running_loop().time()
 
 
 FEE_ORACLE: Final = "0x420000000000000000000000000000000000000F"
@@ -376,7 +372,7 @@ class DataFees:
 
     async def of(self, data: bytes) -> int:
         """What a transaction with this data is charged now, about; 0 elsewhere, wei."""
-        now = asyncio.get_running_loop().time()
+        now = _now()
         if now >= self._until:
             answer = await self._call(GET_L1_FEE + encode(["bytes"], [FEE_SAMPLE]))
             if answer is not None and len(answer) == 32:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 from mesh.base.retry import RetryPolicy
 from mesh.chain.errors import FeeTooHigh
-from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,6 +21,8 @@ GWEI: Final = 10**9
 
 NODES_BUMP_PERCENT: Final = 10
 """By how much nodes want both prices raised to let a transaction take another's place (geth's `pricebump`)."""
+BUMP_PERCENT: Final = 15
+"""By how much they are raised, at least, where the ceiling allows it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,15 +59,6 @@ class Timing:
     """Before the second attempt; doubled before each further one."""
     reorg_depth: int = REORG_DEPTH
     """Blocks, not seconds: how far behind the head replaced blocks are noticed."""
-
-    def __post_init__(self) -> None:
-        intervals = (self.poll_interval, self.receipt_interval, self.replace_after)
-        above_zero = (*intervals, self.receipt_timeout, self.request_timeout, self.first_timeout)
-        counts, others = (self.attempts, self.confirmations, self.reorg_depth), (self.retry_delay, self.repeat_within)
-        if min(counts) < 1 or min(above_zero) <= 0 or min(others) < 0:
-            raise ConfigurationError(
-                "intervals and timeouts must be above zero, attempts and blocks at least one, and no time negative"
-            )
 
     @property
     def request_retry(self) -> RetryPolicy:
@@ -112,16 +104,6 @@ class FeePolicy:
 
     ceiling: int = 500 * GWEI
     """The most that is ever offered, base fee and priority fee together."""
-    patience: float = 0.0
-    """Seconds to wait for a price above the ceiling to come down, before the transaction is refused."""
-    bump_percent: int = 15
-    """How much more a transaction that replaces a stuck one offers, at least."""
-
-    def __post_init__(self) -> None:
-        if self.ceiling < 1 or self.patience < 0 or self.bump_percent < NODES_BUMP_PERCENT:
-            raise ConfigurationError(
-                "fees need a ceiling above zero, patience that is not negative, and a bump of at least 10 %"
-            )
 
     def offer(self, market: GasMarket) -> Fees:
         """What a transaction offers, within the ceiling. Raises `FeeTooHigh` for a price above it."""
@@ -135,12 +117,12 @@ class FeePolicy:
         None if the ceiling leaves no room for what nodes accept as a replacement.
         """
         offered = market.fees
-        maximum = min(self.ceiling, max(offered.maximum, _raised(fees.maximum, self.bump_percent)))
+        maximum = min(self.ceiling, max(offered.maximum, _raised(fees.maximum, BUMP_PERCENT)))
         if maximum < _raised(fees.maximum, NODES_BUMP_PERCENT):
             return None
         if fees.priority is None:
             return Fees(maximum, None)
-        priority = max(offered.priority or 0, _raised(fees.priority, self.bump_percent))
+        priority = max(offered.priority or 0, _raised(fees.priority, BUMP_PERCENT))
         return Fees(maximum, min(priority, maximum))
 
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.amounts import XRT, InvalidAmount, Unit, split_amount
-from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import BoundedDict
 from mesh.base.log_context import log_event
 from mesh.chain._abi import decode
@@ -28,7 +28,6 @@ from schemas.messages import Offer
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Hashable, Iterable, Mapping, Sequence
 
-    from mesh.base.clock import Clock
     from mesh.chain._abi import ContractCall, ContractFunctions
     from mesh.chain._contracts import Contracts
     from mesh.chain._node import Call, Node
@@ -88,16 +87,11 @@ class Funds:
     Used in one event loop.
     """
 
-    def __init__(
-        self, contracts: Contracts, permits: Permits, *, clock: Clock = SYSTEM_CLOCK, kept: int = KEPT
-    ) -> None:
+    def __init__(self, contracts: Contracts, permits: Permits) -> None:
         self._contracts = contracts
         self._permits = permits
-        self._clock = clock
-        self._known: BoundedDict[Holding, _KnownFunding] = BoundedDict(kept)
+        self._known: BoundedDict[Holding, _KnownFunding] = BoundedDict(KEPT)
         self._places = asyncio.Semaphore(AT_ONCE)
-        self.requests = 0
-        """Requests to the node so far."""
 
     async def of(
         self, holdings: Iterable[Holding], *, within: float = KEPT_POLLS, fresh: bool = False
@@ -109,7 +103,7 @@ class Funds:
         found: dict[Holding, Funding | None] = {}
         asked: list[Holding] = []
         latest = self._contracts.node.heads.latest
-        now, block = self._clock.monotonic(), None if latest is None else latest.hash
+        now, block = time.monotonic(), None if latest is None else latest.hash
         for holding in dict.fromkeys(holdings):
             known = self._known.get(holding)
             if known is not None and not fresh and self._is_current(known, now, block, within):
@@ -212,7 +206,6 @@ class Funds:
             calls.append([(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)])
             if self._permits.has_any_of(holder):
                 calls[-1] += [(token, _NONCES + account), (token, _DOMAIN)]
-        self.requests += 1
         answers = await asked_together(self._contracts.node, calls, most=_WORD)
         return [
             None if one is None else self._permitted(holder, _funding(*one[:2]), *one[2:])

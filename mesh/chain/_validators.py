@@ -166,12 +166,9 @@ class Validators:
     created there (EIP-684). `listed` (addresses or ENS names) are safe besides: their owner vouches for them.
     """
 
-    def __init__(
-        self, contracts: Contracts, *, listed: Sequence[str] = (), clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, contracts: Contracts, *, listed: Sequence[str] = ()) -> None:
         self._contracts = contracts
         self._listed = listed
-        self._clock = clock
         self._verdicts: BoundedDict[str, _Verdict] = BoundedDict(REMEMBERED)
         self._juries: BoundedDict[str, _KnownJury] = BoundedDict(REMEMBERED)
         """Contracts that were asked whether they are juries; the fees are 0."""
@@ -302,14 +299,14 @@ class Validators:
 
     def _known(self, validator: str) -> _Verdict | None:
         verdict = self._verdicts.get(validator)
-        return verdict if verdict is not None and self._clock() < verdict.until else None
+        return verdict if verdict is not None and time.monotonic() < verdict.until else None
 
     async def _verdict(self, validator: str) -> _Verdict:
         verdict = self._known(validator)
         if verdict is None:
             asked, is_final = await self._ask(validator)
             recheck = math.inf if is_final else self._contracts.node.timing.validator_recheck
-            verdict = asked._replace(until=self._clock() + recheck)
+            verdict = asked._replace(until=time.monotonic() + recheck)
             self._verdicts[validator] = verdict
         return verdict
 
@@ -337,10 +334,10 @@ class Validators:
     async def _jury(self, contract: str) -> JuryState | None:
         """The jury at an address with code, without its fees; None if it is another contract."""
         known = self._juries.get(contract)
-        if known is None or self._clock() >= known.until:
+        if known is None or time.monotonic() >= known.until:
             state = await read_jury(self._contracts, contract)
             recheck = self._contracts.node.timing.validator_recheck if state is None else math.inf
-            known = self._juries[contract] = _KnownJury(state, self._clock() + recheck)
+            known = self._juries[contract] = _KnownJury(state, time.monotonic() + recheck)
         return known.state
 
 

@@ -23,7 +23,7 @@ from mesh.chain._abi import NAMES, SpoiledAnswer, decode, load_artifact
 from mesh.chain.errors import RequestRefused, Reverted
 from mesh.errors import ChainError
 from schemas import keccak256
-from schemas.address import checksum_address, parse_address
+from schemas.address import checksum_address
 from schemas.cid import format_cid
 from schemas.errors import InvalidCid
 from schemas.records import Liability
@@ -294,13 +294,13 @@ def liability_record(address: str, held: Mapping[str, Any]) -> Liability:
         model=cid("model"),
         objective=cid("objective"),
         result=cid("result"),
-        promisee=parse_address(held["promisee"]),
-        promisor=parse_address(held["promisor"]),
-        lighthouse=parse_address(held["lighthouse"]),
+        promisee=held["promisee"],
+        promisor=held["promisor"],
+        lighthouse=held["lighthouse"],
         lighthouse_fee=held["lighthouseFee"],
-        token=parse_address(held["token"]),
+        token=held["token"],
         cost=held["cost"],
-        validator=parse_address(held["validator"]),
+        validator=held["validator"],
         validator_fee=held["validatorFee"],
         is_success=held["isSuccess"],
         is_finalized=held["isFinalized"],

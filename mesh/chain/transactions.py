@@ -23,7 +23,6 @@ from mesh.chain._accounts import created_address
 from mesh.chain._pending import PendingTransaction, TransactionOutcome
 from mesh.chain._policy import Fees
 from mesh.chain.errors import (
-    FeeTooHigh,
     InsufficientFunds,
     NodeUnreachable,
     RequestRefused,
@@ -342,7 +341,8 @@ class TransactionSender:
     async def _send_new(self, fields: dict[str, Any]) -> PendingTransaction:
         """Simulate, price, number, sign and send a transaction."""
         gas = await self._simulate(fields)
-        fees, limit = within_cap(await self._affordable_fees(), await self.node.gas_market(), gas)
+        market = await self.node.gas_market()
+        fees, limit = within_cap(self.node.fees.offer(market), market, gas)
         complete = fields | fees.fields() | {"gas": limit, "chainId": self.node.chain_id}
         async with self._pending.lock:
             return await self._send_numbered(complete)
@@ -357,18 +357,6 @@ class TransactionSender:
         except Reverted:
             self.node.sent.by_outcome[TransactionOutcome.REFUSED] += 1
             raise
-
-    async def _affordable_fees(self) -> Fees:
-        """What to offer now; waits up to `FeePolicy.patience` for the price to come down. Raises `FeeTooHigh`."""
-        policy, loop = self.node.fees, asyncio.get_running_loop()
-        until = loop.time() + policy.patience
-        while True:
-            try:
-                return policy.offer(await self.node.gas_market())
-            except FeeTooHigh:
-                if loop.time() >= until:
-                    raise
-            await asyncio.sleep(self.node.timing.poll_interval)
 
     async def _send_numbered(self, fields: dict[str, Any]) -> PendingTransaction:
         """Sign with the next nonce and send; again if another client was faster."""

@@ -16,17 +16,20 @@ import zenoh
 
 from mesh.base.background import call_in_loop
 from mesh.base.flood import Drops, FairQueue, KnownSenders, Rate, RateLimiter
-from mesh.errors import ClosedError, InputError, InvalidKey
+from mesh.base.lifecycle import Lifecycle
+from mesh.errors import InputError, InvalidKey
 from mesh.network import sending
 from mesh.network._validation import M, MarketRules, MessageValidator, Unresolved, message_key
 from mesh.network.presence import PresenceWatch, present_keys
 from mesh.network.pump import BATCH, Pump
+from mesh.network.services import declared
 from mesh.telemetry.metrics import MetricFamily, MetricSample
 from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, lighthouse_selector, market_selector, parse_key, presence_selector
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
+    from contextlib import AsyncExitStack
 
     from mesh.network._validation import Resolver, ValidationStatistics, ValidatorCheck
 
@@ -207,7 +210,7 @@ ANSWER_TIMEOUT: Final = 5.0
 """Seconds that others have to answer a query."""
 
 
-class Channel:
+class Channel(Lifecycle):
     """The channel of one lighthouse on an open session: `async with Channel(session, lighthouse) as channel`.
 
     `lighthouse` is the ENS name of the market. `address`, if given, is the lighthouse that orders must name;
@@ -216,6 +219,8 @@ class Channel:
     dropped; a query ends after `answer_timeout` seconds. Leaving `async with` withdraws the tokens and ends the
     watches, but does not close the session. Raises `InvalidKey` for a name that no key may contain.
     """
+
+    title = "channel"
 
     def __init__(
         self,
@@ -239,25 +244,9 @@ class Channel:
             self.lighthouse, address=address, head=head, resolver=resolver, validators=validators, blocked=blocked
         )
         self._drops = Drops() if drops is None else drops
-        self._declarations: list[Any] = []
-        self._watches: list[PresenceWatch] = []
-        self._open = False
 
-    async def __aenter__(self) -> Self:
-        if self._open:
-            raise ClosedError("this channel is already open")
-        self._open = True
-        return self
-
-    async def __aexit__(self, *exc_info: object) -> None:
-        self._open = False
-        if not self._session.is_closed():
-            for declaration in self._declarations:
-                declaration.undeclare()
-        for watch in self._watches:
-            watch.end()
-        self._declarations.clear()
-        self._watches.clear()
+    async def _open(self, stack: AsyncExitStack) -> None:
+        """Announcements and watches are added later."""
 
     def publish(self, message: SignedMessage) -> str:
         """Put a signed message on its key, at most once and without waiting; return the key.
@@ -265,7 +254,7 @@ class Channel:
         Delivery is not confirmed: send a message that must arrive again until its effect is seen. Raises `InputError`
         for a message without a signature.
         """
-        self._check_open()
+        self.check_open()
         if not message.signature:
             raise InputError("an unsigned message can't be published", hint="sign it first")
         key = message_key(self.lighthouse, message)
@@ -274,7 +263,7 @@ class Channel:
 
     def put(self, key: str, payload: bytes) -> None:
         """Put bytes on a key; a congested link drops them. Raises `InvalidKey` for a wildcard: it would reach all."""
-        self._check_open()
+        self.check_open()
         if "*" in key:
             raise InvalidKey(key, "it contains a wildcard")
         sending.put(self._session, key, payload)
@@ -284,7 +273,7 @@ class Channel:
 
         `model` (CIDv0) limits orders to that model; the network filters at the source.
         """
-        self._check_open()
+        self.check_open()
         selector = market_selector(self.lighthouse, kind.kind, model)
         return Subscription(
             self._session, selector, MessageValidator(kind, self._rules), self._drops, self.answer_timeout
@@ -292,14 +281,13 @@ class Channel:
 
     async def verified(self, message: M) -> Verified[M]:
         """A message that came another way, checked as a subscription does. Raises `InvalidMessage`."""
-        self._check_open()
+        self.check_open()
         return await self._rules.verified(message)
 
     def announce(self, role: str, address: str) -> None:
         """Announce the agent at `address` as present in `role`, for as long as the channel is open."""
-        self._check_open()
-        key = str(PresenceKey(self.lighthouse, role, address))
-        self._declarations.append(self._session.liveliness().declare_token(key))
+        stack, key = self.check_open(), str(PresenceKey(self.lighthouse, role, address))
+        stack.enter_context(declared(self._session, self._session.liveliness().declare_token(key)))
 
     def watch_presence(
         self,
@@ -314,14 +302,14 @@ class Channel:
         caller's context, until the channel closes. An agent whose link to its router broke is gone, too, and appears
         again when the link is restored.
         """
-        self._check_open()
+        stack = self.check_open()
         loop, context = asyncio.get_running_loop(), copy_context()
 
         def changed(text: str, is_present: bool) -> None:
             for key in _presence_keys([text]):
                 call_in_loop(loop, appeared if is_present else gone, key, context=context)
 
-        self._watches.append(PresenceWatch(self._session, presence_selector(self.lighthouse, role), changed))
+        stack.callback(PresenceWatch(self._session, presence_selector(self.lighthouse, role), changed).end)
 
     async def present(self, role: str = "*", agent: str = "*") -> list[PresenceKey]:
         """The agents that are announced on the channel now, or those in a `role`, or an `agent` (address).
@@ -329,16 +317,12 @@ class Channel:
         At most `PRESENT_LIMIT`, in the order of their keys; more are counted in `drops`. Anybody may announce any
         number of agents: ask for the role, or the agent, that matters.
         """
-        self._check_open()
+        self.check_open()
         selector = presence_selector(self.lighthouse, role, agent)
         found = await asyncio.to_thread(
             present_keys, self._session, selector, timeout=self.answer_timeout, drops=self._drops
         )
         return list(_presence_keys(found))
-
-    def _check_open(self) -> None:
-        if not self._open:
-            raise ClosedError("the channel is not open", hint="use it inside `async with`")
 
 
 def _presence_keys(texts: list[str]) -> Iterator[PresenceKey]:

@@ -13,20 +13,22 @@ from collections import Counter
 from contextlib import asynccontextmanager, contextmanager
 from contextvars import copy_context
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 import zenoh
 
 from mesh.base.background import Background, call_in_loop
 from mesh.base.flood import Drops, Rate, RateLimiter
+from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.base.suggestions import nearest
-from mesh.errors import AiraError, ClosedError, RemoteError, public_text
+from mesh.errors import AiraError, RemoteError, public_text
 from schemas import InvalidRecord, Record, RpcKey
 from schemas.rpc import SERVICES, SPENDING
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
+    from contextlib import AsyncExitStack
 
     from schemas.rpc import Service
 
@@ -84,12 +86,14 @@ def no_answer(address: str, service: str = "", *, device: str = "") -> ServiceFa
     return ServiceFailed(f"{who} does not answer", service=service, hint=hint, reason="no-agent", code="no-answer")
 
 
-class Services:
+class Services(Lifecycle):
     """The services of the agent at `address`: `async with Services(session, address)`, then `offer` each.
 
     Requests that are too many get an error reply, and are counted in `drops`. Leaving `async with` withdraws the
     services and cancels requests in progress.
     """
+
+    title = "agent's services"
 
     def __init__(self, session: zenoh.Session, address: str, *, drops: Drops | None = None) -> None:
         self._drops = Drops() if drops is None else drops
@@ -97,26 +101,11 @@ class Services:
         self._lock = threading.Lock()
         self._session = session
         self._address = address
-        self._queryables: list[Any] = []
-        self._requests: set[asyncio.Task[None]] = set()
         self._running: Counter[str] = Counter()
-        """The requests that are being handled, by key."""
-        self._open = False
+        """The requests that are being handled, by key; those of all have the empty one."""
 
-    async def __aenter__(self) -> Self:
-        self._open = True
-        return self
-
-    async def __aexit__(self, *exc_info: object) -> None:
-        self._open = False
-        queryables, self._queryables = self._queryables, []
-        if not self._session.is_closed():
-            for queryable in queryables:
-                queryable.undeclare()
-        for request in self._requests:
-            request.cancel()
-        if self._requests:
-            await asyncio.wait(self._requests)
+    async def _open(self, stack: AsyncExitStack) -> None:
+        self._requests = await stack.enter_async_context(Background())
 
     def offer(self, service: str, handler: Callable[[Any], Awaitable[Record]]) -> None:
         """Reply to requests for `service` (one of `schemas.rpc.SERVICES`) with the result of `handler`.
@@ -124,8 +113,7 @@ class Services:
         Requests are handled concurrently; an `AiraError` of the handler is sent to the caller. Raises `ServiceFailed`
         for an unknown service, `ClosedError` outside `async with`.
         """
-        if not self._open:
-            raise ClosedError("the services are not open", hint="use them inside `async with`")
+        stack = self.check_open()
         loop, key, context = asyncio.get_running_loop(), str(RpcKey(self._address, service)), copy_context()
         handle = partial(_handle, key, _service(service).request, handler)
 
@@ -139,26 +127,22 @@ class Services:
                 self._drops.count("request")
                 _refuse(query)
 
-        self._queryables.append(self._session.declare_queryable(key, received))
+        stack.enter_context(declared(self._session, self._session.declare_queryable(key, received)))
 
     def _has_place(self, key: str) -> bool:
-        return self._running[key] < CONCURRENT_REQUESTS and len(self._requests) < CONCURRENT_IN_TOTAL
+        return self._running[key] < CONCURRENT_REQUESTS and self._running[""] < CONCURRENT_IN_TOTAL
 
     def _accept(self, query: zenoh.Query, key: str, handle: Callable[[zenoh.Query], Coroutine[Any, Any, None]]) -> None:
-        if not self._open:
+        if not self.is_open:
             query.drop()  # type: ignore[no-untyped-call]
             return
         if not self._has_place(key):
             _refuse(query)
             return
-        request = asyncio.create_task(handle(query), name=f"handle {key}")
-        self._requests.add(request)
-        self._running[key] += 1
-        request.add_done_callback(partial(self._ended, key))
-
-    def _ended(self, key: str, request: asyncio.Task[None]) -> None:
-        self._requests.discard(request)
-        self._running[key] -= 1
+        self._running.update((key, ""))
+        self._requests.start(handle(query), f"handle {key}").add_done_callback(
+            lambda _: self._running.subtract((key, ""))
+        )
 
 
 async def _handle(

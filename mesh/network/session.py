@@ -27,7 +27,6 @@ import zenoh
 
 from mesh.base.background import call_in_loop
 from mesh.base.blocklist import Blocklist
-from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import HEAVIEST, REPORT_INTERVAL
 from mesh.base.fresh_file import CHECK_INTERVAL
 from mesh.base.log_context import log_event
@@ -41,7 +40,6 @@ from schemas.status import ALIVE
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Collection, Iterator
 
-    from mesh.base.clock import Clock
     from mesh.base.flood import Drops
 
 
@@ -126,8 +124,8 @@ class BlockedSessions:
     from. Raises `ConfigurationError`.
     """
 
-    def __init__(self, path: str | Path, *, clock: Clock = SYSTEM_CLOCK) -> None:
-        self._list = Blocklist(Path(path).expanduser(), parse=parse_session, clock=clock)
+    def __init__(self, path: str | Path) -> None:
+        self._list = Blocklist(Path(path).expanduser(), parse=parse_session)
         self._read: frozenset[str] = frozenset()
         self._networks: list[IPv4Network | IPv6Network] = []
 

@@ -38,7 +38,7 @@ from mesh.chain import (
     Reorganisation,
     RequestRefused,
 )
-from mesh.chain.following import QUICK
+from mesh.chain.following import QUICK, history_at
 from mesh.telemetry.metrics import gauge
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ async def first_position(store: CursorStore, chain: Chain, *, lookback: int | No
     (handled, _), head = await store.cursor(), await chain.block_number()
     start = max(head - (lookback or 0), 0)
     if handled is None or (lookback is not None and handled < start):
-        await store.set_cursor(start, history=(await chain.history_at(start)).encode())
+        await store.set_cursor(start, history=(await history_at(chain.node, start)).encode())
         return start
     if handled > head + chain.node.timing.reorg_depth:
         raise ChainWentBack(handled + 1, head)

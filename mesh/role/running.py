@@ -167,26 +167,23 @@ def waits_forever(settings: NetworkSettings) -> bool:
     return settings.connect_timeout < 0
 
 
-async def wait_for_files(settings: Settings, *, retry: RetryPolicy = STARTUP) -> None:
+async def wait_for_files(settings: Settings) -> None:
     """Wait until the files that the settings name are readable, if the settings say to wait."""
     import asyncio  # here, as an edge agent has no event loop
 
-    for delay in file_delays(settings, retry=retry):
+    for delay in file_delays(settings):
         await asyncio.sleep(delay)
 
 
-def file_delays(settings: Settings, *, retry: RetryPolicy = STARTUP) -> Iterator[float]:
+def file_delays(settings: Settings) -> Iterator[float]:
     """Yield the seconds until the next check, as long as a file that the settings name is not readable.
 
     Ends at once if the settings don't say to wait; reading the file then reports the error.
     """
-    outages, backoff = OutageLog(log, "files"), Backoff(retry)
+    outages, backoff = OutageLog(log, "files"), Backoff(STARTUP)
     while waits_forever(settings) and (error := _file_error(settings)) is not None:
         outages.failed(error, "waiting for files")
-        delay = backoff.next_delay()
-        if delay is None:
-            return
-        yield delay
+        yield backoff.next_delay() or 0.0
     outages.recovered("the files are readable")
 
 

@@ -389,7 +389,7 @@ CANDIDATES: Final = (
     Mutation(
         "a new agent does not remember the block at which it began",
         "mesh.role.following:first_position",
-        "start, history=(await chain.history_at(start)).encode()",
+        "start, history=(await history_at(chain.node, start)).encode()",
         "start",
         REORGANISATIONS,
     ),

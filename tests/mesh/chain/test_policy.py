@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +10,9 @@ import pytest
 from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSender
 from mesh.chain._policy import Fees
 from mesh.chain.rpc import HttpTransport
-from mesh.errors import ConfigurationError
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.senders import unused_address
 from tests.support.nodes import Anvil
-from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -45,18 +42,6 @@ async def test_above_the_ceiling_nothing_is_sent(anvil: Anvil) -> None:
         assert (caught.value.price, caught.value.ceiling) == (31 * GWEI, 20 * GWEI)
         assert caught.value.hint
         assert await node.transaction_count(sender.account.address, block="pending") == 0
-
-
-async def test_with_patience_a_transaction_waits_for_a_lower_price(anvil: Anvil) -> None:
-    async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=20 * GWEI, patience=20)) as node:
-        friend = unused_address()
-        await _next_base_fee(node, 30 * GWEI)
-        sending = asyncio.create_task(_sender(node, anvil).send(to=friend, data=b"", value=1))
-        await asyncio.sleep(5 * QUICK.poll_interval)
-        assert not sending.done()
-        await _next_base_fee(node, 3 * GWEI)
-        await sending
-        assert await node.eth_balance(friend) == 1
 
 
 async def test_never_more_than_the_ceiling_is_offered(anvil: Anvil) -> None:
@@ -99,9 +84,3 @@ async def test_without_a_suggested_priority_fee_the_gas_price_is_used(anvil: Anv
     assert int(sent["maxPriorityFeePerGas"], 16) == price - base
     assert int(sent["maxFeePerGas"], 16) == base + price
     await wire.close()
-
-
-@pytest.mark.parametrize("wrong", [{"ceiling": 0}, {"patience": -1}, {"bump_percent": 9}])
-def test_invalid_policies_are_refused(wrong: dict[str, Any]) -> None:
-    with raises_with(ConfigurationError, code="configuration-error"):
-        FeePolicy(**wrong)

@@ -192,7 +192,7 @@ async def test_requests_beyond_the_limit_get_an_error_reply(here: zenoh.Session,
     async with offering(there, here, start=start) as services:
         key = str(RpcKey(ADDRESS, "start"))
         waiting = [here.get(key, payload=REQUEST.encode(), timeout=60) for _ in range(CONCURRENT_REQUESTS)]
-        await until(lambda: len(services._requests) == CONCURRENT_REQUESTS, what="the limit", seconds=30)
+        await until(lambda: services._running[""] == CONCURRENT_REQUESTS, what="the limit", seconds=30)
         with pytest.raises(ServiceFailed) as caught:
             await call(here, ADDRESS, "start", REQUEST)
         assert (caught.value.reason, caught.value.hint) == ("busy", "try again later")
