@@ -1,9 +1,9 @@
 """Settings: the options in groups, and how they are loaded."""
 
 from mesh.settings._loading import NOT_OPTIONS, load
-from mesh.settings._options import LONGEST
 from mesh.settings.groups import (
     DEFAULTS,
+    LONGEST,
     MEANING,
     OPTIONS,
     AccountSettings,

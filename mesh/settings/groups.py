@@ -8,24 +8,36 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, get_args
+
+from msgspec import Meta
 
 from mesh.errors import ConfigurationError
-from mesh.settings._options import (
-    Gwei,
-    Interval,
-    Line,
-    NaturalInt,
-    PositiveInt,
-    Seconds,
-    SecondsOrEver,
-    Sentence,
-    option,
-)
 from mesh.settings.chains import ANY, CHAINS, FILLED, ChainProfile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+LONGEST: Final = 1e9
+"""The most seconds that an option can hold, about thirty years: not every file format can express infinity."""
+
+PositiveInt = Annotated[int, Meta(ge=1)]
+NaturalInt = Annotated[int, Meta(ge=0)]
+Seconds = Annotated[float, Meta(ge=0, le=LONGEST)]
+Interval = Annotated[float, Meta(gt=0, le=LONGEST)]
+SecondsOrEver = Annotated[float, Meta(ge=-1, le=LONGEST)]
+Gwei = Annotated[float, Meta(ge=1e-9, le=1e9)]
+
+Line = Annotated[str, Meta(max_length=80)]
+Sentence = Annotated[str, Meta(max_length=200)]
+
+T = TypeVar("T")
+
+
+def option(default: T, meaning: str) -> T:
+    """A field of a group: its default, and one line that explains it."""
+    return field(default=default, metadata={"meaning": meaning})
+
 
 DEADLINE_LIMIT: Final = ANY.deadline_limit
 """Blocks, about a day where one takes 12 seconds."""

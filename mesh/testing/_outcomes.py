@@ -1,4 +1,7 @@
-"""How a job of a test ended, and what was recorded of it."""
+"""How a job of a test ended, what was recorded of it, and assertions about that.
+
+What they say when they fail is what a person would look for next.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from mesh.agent.contracts import Outcome
+from mesh.agent.errors import Declined, DemandDeclined
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -42,3 +46,54 @@ class RecordedOutcome(Outcome, frozen=True, kw_only=True):
     seconds: float = 0.0
     """How long it took from the beginning to the end: for a fake job by its own clock, which `asyncio.sleep` advances
     at once."""
+
+
+def assert_paid(outcome: Outcome) -> None:
+    """Raise `AssertionError`, with the reason of the failure, unless the job was done and its robot paid."""
+    __tracebackhide__ = True
+    if not outcome.success:
+        raise AssertionError(f"the robot was not paid: {_reason(outcome)}{_published(outcome)}")
+
+
+def assert_refunded(outcome: Outcome, *, code: str = "") -> None:
+    """Raise `AssertionError` unless the job failed, so that its customer got the cost back; with `code`, for that."""
+    __tracebackhide__ = True
+    wanted = f"a refund with the code {code}" if code else "a refund"
+    if outcome.success:
+        raise AssertionError(f"expected {wanted}, but the robot was paid{_published(outcome)}")
+    if code and outcome.code != code:
+        raise AssertionError(f"expected {wanted}, but it was refunded for another reason: {_reason(outcome)}")
+
+
+def assert_declined(error: BaseException, *, code: str = "") -> None:
+    """Raise `AssertionError` unless `error` says that robots declined; with `code`, at least one of them for that.
+
+    It is what ordering raises, a `DemandDeclined`, or what a handler raises, a `Declined`:
+
+        with pytest.raises(DemandDeclined) as caught:
+            await market.order(robot, [("/lift", 1.5)])
+        assert_declined(caught.value, code="too-cheap")
+    """
+    __tracebackhide__ = True
+    match error:
+        case DemandDeclined():
+            said = {one.code: one.detail for one in error.declines}
+        case Declined():
+            said = {error.reason: error.detail}
+        case _:
+            raise AssertionError(f"expected that a robot declines, but it is {type(error).__name__}: {error}")
+    if code and code not in said:
+        words = "; ".join(f"{reason} ({detail})" if detail else reason for reason, detail in said.items())
+        raise AssertionError(f"expected a decline with the code {code}, but the robots said: {words}")
+
+
+def _reason(outcome: Outcome) -> str:
+    return f"{outcome.reason or 'nothing says why'} [{outcome.code or 'no code'}]"
+
+
+def _published(outcome: Outcome) -> str:
+    if not isinstance(outcome, RecordedOutcome):
+        return ""
+    published = outcome.recording.published
+    lines = [f"\n  {topic} {str(value)[:100]}" for topic, value in published[-10:]]
+    return f"\nthe last of {len(published)} messages that it published:{''.join(lines)}" if lines else ""
