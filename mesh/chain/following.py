@@ -51,13 +51,15 @@ import asyncio
 import logging
 import time
 from contextlib import aclosing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar, get_args
 
 import msgspec
 from eth_utils.abi import event_abi_to_log_topic
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mesh.base.log_context import log_event
 from mesh.base.outage_log import OutageLog
@@ -66,10 +68,10 @@ from mesh.chain._abi import SpoiledAnswer, decode, load_artifact
 from mesh.chain._policy import REORG_DEPTH
 from mesh.chain.answers import InvalidAnswer
 from mesh.chain.errors import ChainWentBack, NoContracts, NodeUnreachable, RequestRefused
-from mesh.errors import ConfigurationError, InputError
+from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS, address_bytes
 from schemas.cid import format_cid
-from schemas.decoding import decode_json
+from schemas.decoding import InvalidData, decode_json
 from schemas.errors import InvalidCid
 
 if TYPE_CHECKING:
@@ -87,16 +89,14 @@ LONGEST_NAME: Final = 255
 """Characters of a lighthouse's name; the original factories take any text."""
 
 
-@dataclass(frozen=True, slots=True)
-class NewLiability:
+class NewLiability(Struct, frozen=True, tag=True):
     """A liability was created."""
 
     liability: str
     tx: str
 
 
-@dataclass(frozen=True, slots=True)
-class Finalized:
+class Finalized(Struct, frozen=True, tag=True):
     """A liability was finalized. `result` is a CID, empty when it was refunded."""
 
     liability: str
@@ -105,8 +105,7 @@ class Finalized:
     tx: str
 
 
-@dataclass(frozen=True, slots=True)
-class NewLighthouse:
+class NewLighthouse(Struct, frozen=True, tag=True):
     """A lighthouse was created; `name` is its label."""
 
     lighthouse: str
@@ -114,8 +113,7 @@ class NewLighthouse:
     tx: str
 
 
-@dataclass(frozen=True, slots=True)
-class Transfer:
+class Transfer(Struct, frozen=True, tag=True):
     """Tokens were transferred: XRT (`value` in wn) or the followed token. The zero address mints and burns."""
 
     sender: str
@@ -124,8 +122,7 @@ class Transfer:
     tx: str
 
 
-@dataclass(frozen=True, slots=True)
-class Approval:
+class Approval(Struct, frozen=True, tag=True):
     """An owner allowed a spender to take up to `value` of its tokens: XRT (wn) or the followed token."""
 
     owner: str
@@ -137,7 +134,6 @@ class Approval:
 ChainEvent: TypeAlias = NewLiability | Finalized | NewLighthouse | Transfer | Approval
 
 EVENT_CLASSES: Final[Mapping[str, type[ChainEvent]]] = {kind.__name__: kind for kind in get_args(ChainEvent)}
-"""By name, as a saved history has them."""
 
 
 def decode_log(log: Log) -> ChainEvent | None:
@@ -238,8 +234,7 @@ LIST_ATTEMPTS: Final = 5
 """How often blocks are read again that were replaced meanwhile, where nothing is followed."""
 
 
-@dataclass(frozen=True, slots=True)
-class SeenBlock:
+class SeenBlock(Struct, frozen=True):
     """A block that was read: its number, its hash (32 bytes) and its events, in order."""
 
     block_number: int
@@ -526,12 +521,10 @@ class History:
     """The last blocks that `follow` yielded, back to `depth` blocks behind the newest.
 
     It holds every block with events, and the newest one without. One more block is kept below the depth: what a
-    reorganisation of the whole depth goes back to. Raises `ConfigurationError` for a depth below 1.
+    reorganisation of the whole depth goes back to.
     """
 
     def __init__(self, depth: int = REORG_DEPTH) -> None:
-        if depth < 1:
-            raise ConfigurationError("a history remembers at least one block")
         self.depth = depth
         self._blocks: list[SeenBlock] = []
 
@@ -557,23 +550,18 @@ class History:
 
     def encode(self) -> bytes:
         """The history as JSON."""
-        blocks = [
-            (block.block_number, block.block_hash.hex(), [(type(event).__name__, event) for event in block.events])
-            for block in self._blocks
-        ]
-        return msgspec.json.encode({"depth": self.depth, "blocks": blocks})
+        return msgspec.json.encode((self.depth, self._blocks))
 
     @classmethod
     def decode(cls, data: bytes) -> History:
         """The history that `encode` returned as `data`. Raises `InputError` for anything else."""
         try:
-            decoded = decode_json(data)
-            history = cls(decoded["depth"])
-            for number, block_hash, events in decoded["blocks"]:
-                of_block: Any = tuple(msgspec.convert(fields, EVENT_CLASSES[name]) for name, fields in events)
-                history.remember(SeenBlock(int(number), bytes.fromhex(block_hash), of_block))
-        except (msgspec.MsgspecError, KeyError, TypeError, ValueError, ConfigurationError) as error:
+            depth, blocks = decode_json(data, tuple[int, list[SeenBlock]])
+        except InvalidData as error:
             raise InputError(f"this is not a chain history ({error})", hint="start with an empty one") from None
+        history = cls(depth)
+        for block in blocks:
+            history.remember(block)
         return history
 
 
