@@ -27,13 +27,11 @@ READ_ATTEMPTS: Final = 2
 """Of a command that only reads: its user sees at once that a node is missing, and can repeat it."""
 
 
-@asynccontextmanager
-async def open_chain(settings: Settings) -> AsyncIterator[Chain]:
-    """The chain of the settings, opened for reading. Raises `NodeUnreachable`, `NoContracts`."""
+def open_chain(settings: Settings) -> Chain:
+    """The chain of the settings, for reading: `async with` opens it. Raises `ConfigurationError`."""
     from mesh.role.composition import chain_of
 
-    async with chain_of(settings, None, attempts=READ_ATTEMPTS) as chain:
-        yield chain
+    return chain_of(settings, None, attempts=READ_ATTEMPTS)
 
 
 @asynccontextmanager

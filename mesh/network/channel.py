@@ -43,11 +43,10 @@ KNOWN: Final = 65_536
 
 
 class PresentAgents:
-    """The agents that were found present on `channel`, in a `role` or in any. They are remembered."""
+    """The agents that were found present on `channel`, in any role. They are remembered."""
 
-    def __init__(self, channel: Channel, *, role: str = "*") -> None:
+    def __init__(self, channel: Channel) -> None:
         self._channel = channel
-        self._role = role
         self._known = KnownSenders(KNOWN)
         self._questions = RateLimiter(per_sender=PER_AGENT, total=QUESTIONS)
 
@@ -55,7 +54,7 @@ class PresentAgents:
         """Whether an agent (address) was found present. Who is unknown is asked after, at a limited rate."""
         if agent in self._known:
             return True
-        is_present = self._questions.allow(agent) and bool(await self._channel.present(self._role, agent))
+        is_present = self._questions.allow(agent) and bool(await self._channel.present(agent=agent))
         if is_present:
             self._known.add(agent)
         return is_present
