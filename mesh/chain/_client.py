@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mesh.base.outage_log import OutageLog
     from mesh.chain._accounts import Account
     from mesh.chain._contracts import ContractKind
-    from mesh.chain._policy import FeePolicy, Timing
+    from mesh.chain._node import FeePolicy, Timing
     from mesh.chain.following import BlockEvents, Choose, History
     from mesh.chain.rpc import Endpoint
     from mesh.errors import AiraError

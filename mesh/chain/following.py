@@ -65,7 +65,7 @@ from mesh.base.log_context import log_event
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff
 from mesh.chain._abi import SpoiledAnswer, decode, load_artifact
-from mesh.chain._policy import REORG_DEPTH
+from mesh.chain._node import REORG_DEPTH
 from mesh.chain.answers import InvalidAnswer
 from mesh.chain.errors import ChainWentBack, NoContracts, NodeUnreachable, RequestRefused
 from mesh.errors import InputError

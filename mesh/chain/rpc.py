@@ -43,8 +43,6 @@ from schemas.decoding import InvalidData, decode_json
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from mesh.chain._policy import Timing
-
 
 PIECE: Final = 1 << 16
 """Bytes that are read of an answer at a time."""
@@ -361,16 +359,17 @@ class RpcClient:
     """One or several nodes, with bounded retries.
 
     The nodes are at an endpoint: `http(s)://…`, `ws(s)://…`, a `Transport`, or several of them, as a sequence or as one
-    text with commas. Nothing is connected yet. Raises `ConfigurationError` for any other text.
+    text with commas. Nothing is connected yet. Raises `ConfigurationError` for any other text. An answer may take
+    `timeout` seconds, and `first_timeout` that of a server that has not answered yet as a node does.
 
     A request goes to the node that answered last; if its connection fails or its answer is spoiled, to the next, and
-    so on around all of them, again and again by `Timing.request_retry`. Only a transaction goes to one node once,
-    because its sender must know whether an earlier attempt may have arrived; the sender's next attempt goes to the
-    next node. A node that is over its quota is asked again when it says, or a little later each time. A node on another
-    chain than the first that answered is an error when opening, if it answers soon, and skipped later.
+    so on around all of them, again and again by `retry`. Only a transaction goes to one node once, because its sender
+    must know whether an earlier attempt may have arrived; the sender's next attempt goes to the next node. A node that
+    is over its quota is asked again when it says, or a little later each time. A node on another chain than the first
+    that answered is an error when opening, if it answers soon, and skipped later.
     """
 
-    def __init__(self, endpoint: Endpoint, *, timing: Timing) -> None:
+    def __init__(self, endpoint: Endpoint, *, retry: RetryPolicy, timeout: float, first_timeout: float) -> None:
         given = endpoint if isinstance(endpoint, Sequence) and not isinstance(endpoint, str) else [endpoint]
         upstreams: list[Upstream] = []
         for one in given or [""]:
@@ -380,7 +379,8 @@ class RpcClient:
                 upstreams.append(Upstream(one, endpoint=str(one)))
         self.endpoint = ", ".join(upstream.endpoint for upstream in upstreams)
         self._upstreams = tuple(upstreams)
-        self._timing = timing
+        self._retry = retry
+        self._timeout, self._first_timeout = timeout, min(first_timeout, timeout)
         self.failures = 0
         """Requests that no node answered in any attempt."""
         self.losses = 0
@@ -464,7 +464,7 @@ class RpcClient:
         """A response of a node, and what it says: a result of the type `kind`, or an `RpcFailure`."""
         if not self._is_open:
             raise ClosedError("the connection to the node is not open: use it with `async with`")
-        backoff, quota = Backoff(self._timing.request_retry), Backoff(QUOTA_RETRY)
+        backoff, quota = Backoff(self._retry), Backoff(QUOTA_RETRY)
         began = asyncio.get_running_loop().time()
         while True:
             may_pass = False
@@ -507,9 +507,7 @@ class RpcClient:
 
     async def _ask(self, upstream: Upstream, method: str, params: Any, kind: Any) -> tuple[dict[str, Any], Any]:
         """What a node answers, as `answered`. Raises `CONNECTION_ERRORS`."""
-        timing = self._timing
-        most = timing.request_timeout if upstream.is_node else min(timing.first_timeout, timing.request_timeout)
-        async with asyncio.timeout(most) as limit:
+        async with asyncio.timeout(self._timeout if upstream.is_node else self._first_timeout) as limit:
             if not upstream.is_on_chain and len(self._upstreams) > 1:
                 await self._check_chain(upstream)
             try:

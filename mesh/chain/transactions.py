@@ -20,8 +20,8 @@ from mesh.amounts import ETH
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.chain._accounts import created_address
+from mesh.chain._node import Fees
 from mesh.chain._pending import PendingTransaction, TransactionOutcome
-from mesh.chain._policy import Fees
 from mesh.chain.errors import (
     InsufficientFunds,
     NodeUnreachable,
@@ -35,9 +35,8 @@ if TYPE_CHECKING:
 
     from mesh.chain._abi import ContractCall
     from mesh.chain._accounts import Account, SignedTransaction
-    from mesh.chain._node import Node
+    from mesh.chain._node import GasMarket, Node
     from mesh.chain._pending import PendingTransactions
-    from mesh.chain._policy import GasMarket
     from mesh.chain.answers import Log, MinedTransaction
     from mesh.errors import ChainError
 

@@ -11,7 +11,7 @@ from aiohttp import web
 
 from mesh.chain import Account, Node, NodeUnreachable, RequestRefused
 from mesh.chain._abi import SpoiledAnswer
-from mesh.chain._policy import GWEI, Fees, GasMarket
+from mesh.chain._node import GWEI, Fees, GasMarket
 from mesh.chain.answers import OverQuota, RpcFailure, decode_answer, decode_revert
 from mesh.chain.rpc import secrets_in
 from mesh.chain.transactions import within_cap

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSender
-from mesh.chain._policy import Fees
+from mesh.chain._node import Fees
 from mesh.chain.rpc import HttpTransport
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.senders import unused_address

@@ -6,7 +6,7 @@ import errno
 import os
 from typing import TYPE_CHECKING
 
-from mesh.chain._policy import REORG_DEPTH
+from mesh.chain._node import REORG_DEPTH
 from mesh.market import order_id
 from mesh.market.withdrawals import withdrawn_id
 from schemas import Withdrawal, verify_message
