@@ -23,7 +23,7 @@ from bridges.ros2._wire import (
 from mesh.base.extras import needs_extra
 from mesh.base.flood import Drops
 from mesh.base.lifecycle import Lifecycle
-from mesh.errors import ClosedError, ConfigurationError, InputError
+from mesh.errors import ConfigurationError, InputError
 from schemas.payloads import Payload
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class Robot(Lifecycle):
 
         Raises `RosError` after `timeout` seconds.
         """
-        self._check_open()
+        self.check_open()
         await self._node.wait(self._node.resolve(name), timeout)
 
     def publish(
@@ -150,7 +150,7 @@ class Robot(Lifecycle):
 
         Raises `ConfigurationError`, `UnknownRosType`, and `RosError` if the topic has another type.
         """
-        self._check_open()
+        self.check_open()
         topic, type_name = self._node.resolve(topic), full_type(type_name)
         self._allow.check("publish", topic)
         publisher = self._publishers.get(topic)
@@ -170,7 +170,7 @@ class Robot(Lifecycle):
 
         Without a type it waits for a publisher, `timeout` seconds at most. Raises `ConfigurationError`.
         """
-        self._check_open()
+        self.check_open()
         topic = self._node.resolve(topic)
         self._allow.check("subscribe", topic)
         return RosSubscription(self._node, topic, type_name, qos, timeout)
@@ -206,7 +206,7 @@ class Robot(Lifecycle):
         feedback and result become part of its recording. Raises `RosGoalFailed` if the server rejects, aborts or
         cancels the goal, and what `call` raises.
         """
-        self._check_open()
+        self.check_open()
         name, type_name = self._node.resolve(name), full_type(type_name, "action")
         self._allow.check("call", name)
         service = f"{name}{ACTION}send_goal"
@@ -235,7 +235,7 @@ class Robot(Lifecycle):
         `handler` takes the decoded request, and returns a dict of the reply's fields, a message or a payload. `limit`
         requests are handled at a time. Raises `ConfigurationError`, `UnknownRosType`.
         """
-        self._check_open()
+        self.check_open()
         name = self._node.resolve(name)
         self._allow.check("serve", name)
         server = RosServer(self._node, name, full_type(type_name, "srv"), handler, limit=limit)
@@ -264,7 +264,7 @@ class Robot(Lifecycle):
         when the client cancels the goal; it may then return a result all the same. Raises `ConfigurationError`,
         `UnknownRosType`.
         """
-        self._check_open()
+        self.check_open()
         name = self._node.resolve(name)
         self._allow.check("serve", name)
         server = RosActionServer(self._node, name, full_type(type_name, "action"), handler)
@@ -272,7 +272,7 @@ class Robot(Lifecycle):
         return server
 
     async def _call(self, name: str, type_name: str, request: object, timeout: float, job: RosRecorder | None) -> Any:
-        self._check_open()
+        self.check_open()
         self.types.type_hash(type_name)
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
@@ -286,10 +286,6 @@ class Robot(Lifecycle):
                 raise _too_many(name)
             client = self._clients[name, type_name] = RosClient(self._node, name, type_name, type_hash)
         return client
-
-    def _check_open(self) -> None:
-        if not self.is_open:
-            raise ClosedError("this robot is not open", hint="use it inside `async with`")
 
     async def _close_endpoints(self) -> None:
         servers, self._servers = self._servers, []
