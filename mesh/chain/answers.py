@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 from eth_utils.abi import abi_to_signature, get_abi_input_types
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 from msgspec.structs import force_setattr
 
 from mesh.chain._abi import NAMES, SpoiledAnswer, decode, load_artifact
@@ -75,6 +75,10 @@ LIABILITY_GETTERS: Final = (
     *("token", "cost", "validator", "validatorFee", "isSuccess", "isFinalized", "demandHash", "offerHash"),
 )
 """The functions of a liability that return its record, and the hashes of its orders."""
+
+
+RECORD_FIELDS: Final = structs.fields(Liability)
+"""The fields of the record; those that a contract tells have the names of its functions in JSON."""
 
 
 class OverQuota(ValueError):
@@ -289,22 +293,8 @@ def liability_record(address: str, held: Mapping[str, Any]) -> Liability:
         except InvalidCid:
             return ""
 
-    return Liability(
-        address=address,
-        model=cid("model"),
-        objective=cid("objective"),
-        result=cid("result"),
-        promisee=held["promisee"],
-        promisor=held["promisor"],
-        lighthouse=held["lighthouse"],
-        lighthouse_fee=held["lighthouseFee"],
-        token=held["token"],
-        cost=held["cost"],
-        validator=held["validator"],
-        validator_fee=held["validatorFee"],
-        is_success=held["isSuccess"],
-        is_finalized=held["isFinalized"],
-    )
+    fields = {field.name: held[field.encode_name] for field in RECORD_FIELDS if field.encode_name in held}
+    return Liability(**fields | {"address": address} | {name: cid(name) for name in ("model", "objective", "result")})
 
 
 @lru_cache(maxsize=1_024)
