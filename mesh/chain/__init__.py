@@ -23,7 +23,7 @@ with needs_extra("chain", "the chain"):
     from mesh.chain._names import namehash
     from mesh.chain._node import GWEI, FeePolicy, Node, Timing
     from mesh.chain._permits import permit_fee
-    from mesh.chain._tokens import Allowances, Funding, Holding, Token
+    from mesh.chain._tokens import Allowances, Funding, Holding
     from mesh.chain._validators import (
         CollectedFees,
         DeployedJury,

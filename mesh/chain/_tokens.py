@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.amounts import XRT, InvalidAmount, Unit, split_amount
@@ -28,7 +27,7 @@ from schemas.messages import Offer
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Hashable, Iterable, Mapping, Sequence
 
-    from mesh.chain._abi import ContractCall, ContractFunctions
+    from mesh.chain._abi import ContractFunctions
     from mesh.chain._contracts import Contracts
     from mesh.chain._node import Call, Node
     from mesh.chain._permits import Permits
@@ -392,21 +391,6 @@ class Amounts(NamedTuple):
     values: Sequence[int]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Token:
-    """An ERC-20 token as it describes itself; only the address can be trusted.
-
-    `symbol` and `name` are empty and `decimals` is 0 if it has none. `total_supply` is in its smallest unit, of
-    which 10^`decimals` are one token.
-    """
-
-    address: str
-    symbol: str
-    name: str
-    decimals: int
-    total_supply: int
-
-
 class Tokens:
     """Balances, allowances and transfers. The default token is XRT, the default account one's own."""
 
@@ -490,17 +474,9 @@ class Tokens:
         """Send `value` wei; the transaction's hash."""
         return (await self._contracts.signing().send(to=await self._address(to), data=b"", value=value)).tx
 
-    async def info(self, token: str | None = None) -> Token:
-        """A token's description (XRT by default). Raises `NoContracts` for an address without an ERC-20 token."""
-        functions = await self._token(token)
-        total_supply = int(await self._node.read(functions.totalSupply()))
-        return Token(
-            address=functions.address,
-            symbol=_label(await self._ask(functions.symbol()))[:LONGEST_SYMBOL].strip(),
-            name=_label(await self._ask(functions.name())),
-            decimals=_decimals(await self._ask(functions.decimals())),
-            total_supply=total_supply,
-        )
+    async def supply(self, token: str | None = None) -> int:
+        """Units of a token (XRT by default) that there are. Raises `NoContracts` for an address without a token."""
+        return int(await self._node.read((await self._token(token)).totalSupply()))
 
     async def unit(self, token: str | None = None) -> Unit:
         """The unit that a token is counted in (named as for `address`; XRT by default), asked of the chain once.
@@ -589,13 +565,6 @@ class Tokens:
     async def _token(self, token: str | None) -> ContractFunctions:
         address = self._contracts.xrt if token is None else await self.address(token)
         return self._node.contract("XRT", address)
-
-    async def _ask(self, call: ContractCall) -> bytes:
-        """The bytes that an optional function of a token returns; empty if the token lacks it."""
-        try:
-            return await self._node.call({"to": call.address, "data": "0x" + call.data.hex()})
-        except (Reverted, NoContracts):
-            return b""
 
 
 def _label(answer: bytes) -> str:

@@ -206,10 +206,12 @@ class ChainChecks:
 
     async def check_token(self) -> CheckResult:
         """Whether the token that pays is an ERC-20 token. Raises `UnknownName`, `NoContracts`."""
-        token = await self.chain.tokens.info(self._settings.erc20_token)
-        if not token.total_supply:
-            raise NoContracts(f"token with any supply at {token.address}", self.node.chain_id)
-        return passed(f"{token.symbol or 'no symbol'}, {token.decimals} decimals, at {token.address}")
+        tokens = self.chain.tokens
+        address = await tokens.address(self._settings.erc20_token)
+        if not await tokens.supply(address):
+            raise NoContracts(f"token with any supply at {address}", self.node.chain_id)
+        unit = await tokens.unit(address)
+        return passed(f"{unit.symbol}, {unit.decimals} decimals, at {address}")
 
 
 async def check_node_clock(endpoint: str) -> CheckResult:

@@ -1,4 +1,4 @@
-"""Descriptions of tokens."""
+"""How tokens describe themselves, and amounts of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.amounts import InvalidAmount, Unit
-from mesh.chain import XRT, Token, TransactionSender
+from mesh.chain import XRT, TransactionSender
 from mesh.errors import InputError
 from schemas.address import shortened
 from tests.mesh.chain.conftest import no_contracts
@@ -20,19 +20,16 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 async def test_the_token_of_the_network_is_described(market: DeployedMarket) -> None:
     async with market.chain() as chain:
-        token = await chain.tokens.info()
-        assert (
-            token == await chain.tokens.info("xrt.5.robonomics.eth") == await chain.tokens.info(market.deployment.xrt)
-        )
-    assert (token.address, token.symbol, token.name) == (market.deployment.xrt, "XRT", "Robonomics")
-    assert 10**token.decimals == XRT
-    assert token.total_supply >= 1_000_000 * XRT
+        for named in (None, "xrt.5.robonomics.eth", market.deployment.xrt):
+            unit = await chain.tokens.unit(named)
+            assert (unit.symbol, 10**unit.decimals) == ("XRT", XRT)
+            assert await chain.tokens.supply(named) >= 1_000_000 * XRT
 
 
 async def test_an_address_without_a_token_is_an_error(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         with no_contracts("totalSupply"):
-            await chain.tokens.info(market.stranger.address)
+            await chain.tokens.supply(market.stranger.address)
 
 
 async def _deployed(market: DeployedMarket, runtime: bytes) -> str:
@@ -52,9 +49,9 @@ def _answering(word: bytes) -> bytes:
 async def test_a_symbol_of_32_bytes_is_decoded(market: DeployedMarket) -> None:
     address = await _deployed(market, _answering(b"MKR"))
     async with market.chain() as chain:
-        token = await chain.tokens.info(address)
-    assert (token.symbol, token.name) == ("MKR", "MKR")
-    assert token.decimals == 0, "an answer that is not a number counts as no decimals"
+        unit = await chain.tokens.unit(address)
+    assert unit.symbol == f"MKR ({shortened(address)})"
+    assert unit.decimals == 0, "an answer that is not a number counts as no decimals"
 
 
 async def test_a_token_without_a_description_has_no_symbol_and_no_decimals(market: DeployedMarket) -> None:
@@ -62,15 +59,14 @@ async def test_a_token_without_a_description_has_no_symbol_and_no_decimals(marke
     supply = bytes.fromhex("60003560e01c6318160ddd14601357600080fd5b600760005260206000f3")
     address = await _deployed(market, supply)
     async with market.chain() as chain:
-        assert await chain.tokens.info(address) == Token(
-            address=address, symbol="", name="", decimals=0, total_supply=7
-        )
+        assert await chain.tokens.supply(address) == 7
+        assert await chain.tokens.unit(address) == Unit(f"units ({shortened(address)})", 0)
 
 
 async def test_control_characters_in_a_tokens_name_are_removed(market: DeployedMarket) -> None:
     address = await _deployed(market, _answering(b"\x1b[31mXRT\n\xe2\x80\xae"))
     async with market.chain() as chain:
-        assert (await chain.tokens.info(address)).symbol == "[31mXRT"
+        assert (await chain.tokens.unit(address)).symbol == f"[31mXRT ({shortened(address)})"
 
 
 LIAR = "XRT\u202e\x00 USDC that is long"
