@@ -110,12 +110,6 @@ def _check_count(address: str, count: int) -> None:
 ContractKind = Literal["mesh", "original"]
 """Ours, or the legacy ones."""
 
-AGREE: Final = True
-"""A provider always agrees with a result; only a validator, who finalizes on its own, can disagree."""
-
-RECOGNISED_LIABILITIES: Final = 65_536
-"""Liabilities that are remembered as such; the factory is asked about others."""
-
 GAS_OF: Final = {3: "gasUtilizing", 5: "gasConsumedOf"}
 
 
@@ -126,7 +120,7 @@ class ContractVersion:
         self.generation = generation
         self._node = node
         self._factory = node.contract("Factory", factory)
-        self._liabilities: BoundedDict[str, None] = BoundedDict(RECOGNISED_LIABILITIES)
+        self._liabilities: BoundedDict[str, None] = BoundedDict(65_536)
 
     takes_permits: ClassVar[bool] = True
     """Whether a contract can be created with a permit (EIP-2612)."""
@@ -164,7 +158,7 @@ class ContractVersion:
 
     def recognise(self, liability: str) -> None:
         """Remember an address as a liability, because the factory named it in an event."""
-        self._liabilities[liability] = None  # the factory still knows those that are forgotten
+        self._liabilities[liability] = None  # the factory is asked about those that are forgotten
 
     async def is_liability(self, address: str) -> bool:
         """Whether the factory created the contract at an address.
@@ -252,7 +246,7 @@ class OriginalContracts(ContractVersion):
             raise NotOffered("finalization by several signers", self.generation)
         if self.generation == 5:
             return super().finalization(lighthouse, result)
-        call = super().validation(result, agree=AGREE)
+        call = super().validation(result, agree=True)  # only a validator, who finalizes on its own, can disagree
         return lighthouse.to(result.liability, call.data)
 
     def validation(self, result: Result, *, agree: bool) -> ContractCall:

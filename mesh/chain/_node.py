@@ -472,8 +472,6 @@ GET_L1_FEE: Final = bytes.fromhex("49948e0e")
 """Selector of its `getL1Fee(bytes)`: what a transaction with these bytes, unsigned, pays for its data, wei."""
 FEE_SAMPLE: Final = b"".join([keccak256(bytes([number])) for number in range(32)])
 """Bytes that can't be compressed: what the oracle is asked about."""
-OTHER_FIELDS: Final = 64
-"""Bytes of a transaction beside its data, about: number, fees, gas, recipient."""
 FEE_SECONDS: Final = 60.0
 """How long what the oracle said is used."""
 NO_ORACLE_SECONDS: Final = 600.0
@@ -501,7 +499,8 @@ class DataFees:
                 self._per_byte = int.from_bytes(answer) / len(FEE_SAMPLE)
             has_oracle = self._per_byte or answer != b""
             self._until = now + (FEE_SECONDS if has_oracle else NO_ORACLE_SECONDS)
-        return round(self._per_byte * (len(data) - data.count(0) + OTHER_FIELDS))
+        other_fields = 64  # bytes, about: number, fees, gas, recipient
+        return round(self._per_byte * (len(data) - data.count(0) + other_fields))
 
 
 log = logging.getLogger(__name__)
@@ -511,7 +510,6 @@ READ_ATTEMPTS: Final = 3
 
 CALLS_AT_ONCE: Final = 100
 """Most calls in one: the creation code has 49,152 bytes at most (EIP-3860), and what it returns 24,576 (EIP-170)."""
-UNLIMITED_GAS: Final = 2**256 - 1
 LONGEST: Final = 0xFFFF
 """Bytes of an answer."""
 
@@ -558,15 +556,6 @@ LOGS_REFUSED: Final = 5
 
 DOUBTS: Final = 8
 """Empty answers for a block, against its Bloom filter and without receipts, of which the last one is believed."""
-
-LONGEST_QUANTITY: Final = 66
-"""Characters of a number of a node: 0x and 64 digits."""
-
-USUAL_PRIORITY: Final = GWEI
-"""The priority fee where the node suggests none in any way, wei."""
-
-FINALITY_LOOKS: Final = 30
-"""How often the final block is asked for in the time that it is behind the latest one."""
 
 PRIORITY_SECONDS: Final = 60.0
 """How long the priority fee that the node suggests is used; the base fee is that of the latest block."""
@@ -745,7 +734,7 @@ class Node:
         if final is None:
             raise FinalityNotOffered(self.endpoint, tag, "it answers none")
         behind = (await self.heads.recent()).timestamp - final.timestamp
-        pause = max(self.timing.poll_interval, min(behind / FINALITY_LOOKS, SILENCE))
+        pause = max(self.timing.poll_interval, min(behind / 30, SILENCE))
         self._final, self._final_until = max(self._final, final.number), time.monotonic() + pause
 
     async def _ask_latest(self) -> BlockHeader:
@@ -1041,7 +1030,7 @@ class Node:
         raise InvalidAnswer(f"{len(calls)} calls in one", str(failure))
 
     async def _call_together(
-        self, calls: Sequence[Call], block: int | str, *, gas: int = UNLIMITED_GAS, most: int = LONGEST
+        self, calls: Sequence[Call], block: int | str, *, gas: int = 2**256 - 1, most: int = LONGEST
     ) -> list[bytes | None]:
         code = encode_calls(calls, gas=gas, most=most)
         return decode_answers(await self.call({"data": "0x" + code.hex()}, block=block), number=len(calls))
@@ -1097,13 +1086,13 @@ class Node:
             history = await self.rpc.request("eth_feeHistory", ["0x5", "latest", [50]])
             return max(int(rewards[0], 16) for rewards in history["reward"])
         except (RequestRefused, TypeError, KeyError, ValueError, IndexError):
-            return USUAL_PRIORITY
+            return GWEI
 
     async def _quantity_or_none(self, method: str) -> int | None:
         """A node's suggestion; None where the node lacks the method, in whatever words, or answers nothing."""
         try:
             found = await self.rpc.request(method, [])
-            return int(found, 16) if isinstance(found, str) and len(found) <= LONGEST_QUANTITY else None
+            return int(found, 16) if isinstance(found, str) and len(found) <= len("0x") + 64 else None
         except (RequestRefused, ValueError):
             return None
 

@@ -173,10 +173,6 @@ class TransactionStore:
             ) from None
 
 
-MINED_KEPT: Final = 256
-"""Mined transactions of an account that are remembered: a reorganisation may send them back to the pool."""
-
-
 @dataclass(slots=True, kw_only=True, eq=False)
 class PendingTransaction:
     """A nonce of the account, and the transaction that was sent with it, in one or several versions.
@@ -238,7 +234,8 @@ class PendingTransactions:
         self._store = store
         self._entries: dict[int, PendingTransaction] = {}
         self._elsewhere: frozenset[int] = frozenset()
-        self._mined: BoundedDict[int, PendingTransaction] = BoundedDict(MINED_KEPT)
+        self._mined: BoundedDict[int, PendingTransaction] = BoundedDict(256)
+        """The latest: a reorganisation may send them back to the pool."""
         self._counted: _Count | None = None
         self._unblock_at = 0.0
         self.missing: int | None = None

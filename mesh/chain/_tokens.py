@@ -374,8 +374,6 @@ LONGEST_LABEL: Final = 64
 LONGEST_SYMBOL: Final = 16
 MOST_DECIMALS: Final = 77
 """Of a token: 10^77 is the largest power of ten in a word."""
-UNITS_KEPT: Final = 1024
-"""Tokens whose units are remembered."""
 UNITS_AT_ONCE: Final = 64
 """Tokens that are asked for their units in one request."""
 _SYMBOL, _DECIMALS, _SUPPLY = (bytes.fromhex(selector) for selector in ("95d89b41", "313ce567", "18160ddd"))
@@ -400,7 +398,7 @@ class Tokens:
         known = (profile if profile.tokens else profile_of(contracts.node.chain_id) or profile).tokens
         self._known: Mapping[str, str] = {XRT.symbol: contracts.xrt, **known}
         """The addresses of well-known tokens by their symbols."""
-        self._units: BoundedDict[str, Unit] = BoundedDict(UNITS_KEPT)
+        self._units: BoundedDict[str, Unit] = BoundedDict(1024)
 
     async def address(self, named: str) -> str:
         """The address of a token: of a well-known one by its symbol (XRT, and those of the chain's profile), of any

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 MOST_JURORS: Final = 7
 """Jurors of a jury: a finalization looks through all sets of its quorum's size."""
-JURY_GETTERS: Final = ("xrt", "keeper", "jurors", "quorum")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +80,7 @@ async def read_jury(contracts: Contracts, address: str) -> JuryState | None:
     if not is_code_of("Jury", await node.code(address)):
         return None
     try:
-        calls = getters("Jury", address, JURY_GETTERS)
+        calls = getters("Jury", address, ("xrt", "keeper", "jurors", "quorum"))
         xrt, keeper, jurors, quorum = await node.read_all(calls, block="latest")
     except Reverted:
         return None

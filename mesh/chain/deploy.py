@@ -39,9 +39,6 @@ OLD_CODE: Final = "0x600160005260206000f3"
 LOOKED_BACK: Final = 40
 """Transactions of an account among which those of an interrupted deployment are looked for; it has 22."""
 
-NEW_FACTORY: Final = 3
-"""The nonce of a factory that has made its two templates and no lighthouse."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeploymentPlan:
@@ -123,7 +120,7 @@ async def interrupted_deployment(node: Node, owner: str, plan: DeploymentPlan) -
         address = created_address(owner, nonce)
         code = await node.code(address)
         name = next((name for name in ("Factory", "XRT", "Resolver", "ENSRegistry") if is_code_of(name, code)), None)
-        if name == "Factory" and await node.transaction_count(address) > NEW_FACTORY:
+        if name == "Factory" and await node.transaction_count(address) > 3:  # it has made more than its two templates
             return {}
         if name is not None and name not in found:
             found[name] = address

@@ -230,9 +230,6 @@ AT_ONCE: Final = 32
 ASKED: Final = 3
 """How often the logs of a range are asked for."""
 
-LIST_ATTEMPTS: Final = 5
-"""How often blocks are read again that were replaced meanwhile, where nothing is followed."""
-
 
 class SeenBlock(Struct, frozen=True):
     """A block that was read: its number, its hash (32 bytes) and its events, in order."""
@@ -438,7 +435,7 @@ async def list_blocks(node: Node, read: ReadRange, from_block: int, to_block: in
 
     Raises `NodeUnreachable`, `RequestRefused`.
     """
-    for _ in range(LIST_ATTEMPTS):
+    for _ in range(5):  # they may be replaced meanwhile
         ranges = RangeReader(node, read)
         head = await node.heads.look() if to_block is None else await node.header(to_block)
         if head is None:
@@ -495,8 +492,6 @@ GLANCE_SECONDS: Final = 30.0
 """How far each look glances back there."""
 REPLACED_SECONDS: Final = 10.0
 """How often it looks there for replaced blocks without events; for those with events it does each time."""
-LAGGING: Final = 3
-"""Failures one after the other of a node that answers otherwise, before they are an outage: its machines may differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -607,7 +602,7 @@ async def follow(
                     yield block
         except READ_ERRORS as error:
             follower.must_check_cursor = True
-            if lagging < LAGGING and not outages.is_down and await _answers(node):
+            if lagging < 3 and not outages.is_down and await _answers(node):
                 lagging += 1  # one of the node's machines may be a block behind
                 await asyncio.sleep(node.timing.poll_interval)
                 continue

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from schemas.messages import Demand, Offer, Order, Permit, Result
     from schemas.records import Liability
 
-OUTCOME_GETTERS: Final = ("promisor", "isFinalized", "isSuccess")
 FINALIZATION_DATA: Final = 130
 """Bytes of the data of a finalization, about, without zeros, …"""
 USUAL_DATA: Final = 660
@@ -287,7 +286,8 @@ class Liabilities:
         head = await self._node.block_number()
         events = await list_created(self._node, self._contracts.factory, max(0, head - blocks + 1))
         made = [event.liability for event in events if isinstance(event, NewLiability)][-most:]
-        calls = [call for address in made for call in getters("Liability", address, OUTCOME_GETTERS)]
+        names = ("promisor", "isFinalized", "isSuccess")
+        calls = [call for address in made for call in getters("Liability", address, names)]
         values = iter(await self._node.read_all(calls, block="latest"))
         found: dict[str, tuple[int, int]] = {}
         for promisor, is_finalized, is_success in zip(values, values, values, strict=True):

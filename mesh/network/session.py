@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-CLOSE_INTERVAL: Final = 0.05
-"""Seconds between two searches for the sockets of blocked sessions that connect again and again."""
 REPORTED: Final = 1024 * 1024
 """Bytes that a router receives between two reports, below which nothing is logged."""
 DESCRIPTORS: Final = "/proc/self/fd"
@@ -186,7 +184,7 @@ async def guard(session: zenoh.Session, blocked: BlockedSessions, drops: Drops) 
                 await asyncio.to_thread(close, unwanted)
                 for each in unwanted:
                     drops.count("blocked-session", each.name or each.host)
-                await asyncio.sleep(CLOSE_INTERVAL)
+                await asyncio.sleep(0.05)  # blocked sessions may connect again and again
     finally:
         if not session.is_closed():
             listener.undeclare()

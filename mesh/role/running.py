@@ -34,8 +34,6 @@ INTERRUPTED: Final = 130
 """Exit code of a command that was interrupted by Ctrl-C or SIGTERM."""
 STOPPING: Final = (signal.SIGINT, signal.SIGTERM)
 """The signals that stop a program."""
-WAKE_INTERVAL: Final = 0.1
-"""Seconds between two wake-ups of the event loop during cleanup, at which a second Ctrl-C takes effect."""
 
 
 def run_to_end(main: Callable[[], Coroutine[Any, Any, object]], *, interrupted: int = INTERRUPTED) -> None:
@@ -133,8 +131,8 @@ async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool
         wake()
 
     def wake() -> None:
-        """Keep the loop awake: without handlers a signal to another thread would not end its sleep."""
-        loop.call_later(WAKE_INTERVAL, wake)
+        """Keep the loop awake for a second Ctrl-C: without handlers, a signal to a thread would not end its sleep."""
+        loop.call_later(0.1, wake)
 
     for number in STOPPING:
         loop.add_signal_handler(number, stop, number)
