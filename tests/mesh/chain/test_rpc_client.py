@@ -296,15 +296,6 @@ async def test_too_many_requests_are_retried() -> None:
         assert node.chain_id == 7
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"attempts": 0}, {"request_timeout": 0}, {"receipt_timeout": 0}, {"retry_delay": -1}, {"repeat_within": -1}],
-)
-def test_invalid_timings_are_refused(wrong: dict[str, Any]) -> None:
-    with raises_with(ConfigurationError, code="configuration-error"):
-        replace(QUICK, **wrong)
-
-
 @pytest.mark.parametrize("endpoint", [(), "http://127.0.0.1:1,", ["http://127.0.0.1:1", "ftp://x"]])
 def test_each_of_several_endpoints_is_validated(endpoint: Any) -> None:
     with pytest.raises(ConfigurationError, match="is not the address of a node"):
