@@ -163,7 +163,7 @@ def _uses(chain: Chain) -> list[Callable[[], Awaitable[Any]]]:
         node.is_syncing,
         node.gas_price,
         chain.tokens.eth_balance,
-        chain.tokens.info,
+        chain.tokens.supply,
         chain.lighthouses.list,
         chain.has_mesh_contracts,
         lambda: node.block_hash(0),
