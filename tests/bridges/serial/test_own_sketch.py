@@ -5,32 +5,30 @@ from __future__ import annotations
 import asyncio
 import re
 import runpy
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bridges.serial._device import Device
 from bridges.serial.firmware import compile_sketch, size_of
-from mesh.recording import open_objective
-from schemas.payloads import decode_value
+from mesh import Agent
+from mesh.testing import assert_paid
 from tests.support.boards import DIMMER, LIBRARIES, ROOT, board, edge, firmware
 from tests.support.market import offering
-from tests.support.objectives import objective
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.handlers import Job
-    from tests.support.market import Place
+    from mesh.testing import Market
 
 
 LONG = 60.0
 BUTTON = 2
 
 
-async def test_a_lamp_is_dimmed_for_money_and_a_button_ends_the_job(place: Place) -> None:
+async def test_a_lamp_is_dimmed_for_money_and_a_button_ends_the_job(market: Market) -> None:
     """The sketch knows pins and numbers from 0 to 255; the robot's code makes percents and a wish of it."""
-    robot = offering(place.agent("robot"))
-    device = Device(robot, patience=LONG)
-    cost, waiting = 5, asyncio.Event()
+    robot = offering(Agent())
+    device, waiting = Device(robot, patience=LONG), asyncio.Event()
 
     @robot.on("/brightness")
     async def brightness(job: Job, percent: float) -> None:
@@ -44,23 +42,19 @@ async def test_a_lamp_is_dimmed_for_money_and_a_button_ends_the_job(place: Place
             if pressed:
                 return
 
-    source = place.save(objective(("/brightness", 25.0), ("/brightness", 50.0), ("/until_pressed", True)))
-    before = await place.balance("robot")
-    with board(DIMMER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
-        async with place.at_work(robot) as person:
-            contract = await person.demand(source, cost=cost)
+    wanted = [("/brightness", 25.0), ("/brightness", 50.0), ("/until_pressed", True)]
+    async with market.robot(robot):
+        with board(DIMMER) as uno, edge(uno.port, robot.address, market.endpoint):
+            before = await market.balance(robot)
+            contract = await market.demand(robot, wanted, cost=5)
             async with asyncio.timeout(LONG):
                 await waiting.wait()
             uno.set_pin(BUTTON, False)
-            assert (await contract.outcome()).success
-            recording = await contract.recording()
-            assert await place.balance("robot") == before + cost
+            assert_paid(outcome := await market.outcome(contract))
+            assert await market.balance(robot) == before + 5
     assert [(dimming.pin, dimming.value) for dimming in uno.dimmings] == [(9, 64), (9, 128)]
-    values: dict[str, list[Any]] = {}
-    for message in open_objective(recording).messages():
-        values.setdefault(message.topic, []).append(decode_value(message.payload, message.type))
-    assert values["/dim"][:2] == [64, 128]
-    assert values["/button"] == [True]
+    assert outcome.recording.values("/dim")[:2] == [64, 128]
+    assert outcome.recording.values("/button") == [True]
 
 
 def test_the_sketch_and_the_robot_of_the_page_about_devices_are_complete(tmp_path: Path) -> None:

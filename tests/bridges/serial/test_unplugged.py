@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import pytest
 
 from bridges.serial._device import Device
 from bridges.serial.dialect import BoardLost, CallStatus, CommandFinished
 from bridges.serial.rosserial import RosserialDialect
-from mesh.recording import open_objective
+from mesh import Agent
 from schemas import Empty, String
-from schemas.payloads import decode_value
 from tests.support.boards import ROSSERIAL_ECHO, board, edge
 from tests.support.lines import LineClient
 from tests.support.market import offering
-from tests.support.objectives import objective
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from bridges.serial.boards import SimulatedBoard
-    from mesh.agent.agent import Agent
     from mesh.agent.handlers import Job
-    from tests.support.market import Place
+    from mesh.testing import Market
 
 
 LONG = 60.0
@@ -69,19 +64,15 @@ def test_a_command_is_in_doubt_if_the_board_has_restarted() -> None:
         assert client.next(CommandFinished).status is CallStatus.READ
 
 
-def working(robot: Agent, in_doubt: Literal["fail", "again"] = "fail") -> Agent:
+def working(in_doubt: Literal["fail", "again"]) -> Agent:
+    robot = offering(Agent())
     device = Device(robot, patience=LONG, in_doubt=in_doubt)
 
     @robot.on("/work", Empty)
     async def work(job: Job, message: Empty) -> None:
         await device.call("/work", job=job)
 
-    return offering(robot)
-
-
-def recorded(recording: Path, topic: str) -> list[Any]:
-    messages = open_objective(recording).messages()
-    return [decode_value(message.payload, message.type) for message in messages if message.topic == topic]
+    return robot
 
 
 @pytest.mark.sample("reset", "in_doubt", "success", "flashing")
@@ -91,21 +82,18 @@ def recorded(recording: Path, topic: str) -> list[Any]:
     ids=["the board kept running", "the board was restarted", "what is in doubt is done again"],
 )
 async def test_a_job_waits_for_its_board_as_far_as_the_sketch_allows(
-    place: Place, reset: bool, in_doubt: Literal["fail", "again"], success: bool, flashing: int
+    market: Market, reset: bool, in_doubt: Literal["fail", "again"], success: bool, flashing: int
 ) -> None:
-    robot = working(place.agent("robot"), in_doubt)
-    source = place.save(objective(("/work", Empty())))
-    with board(ROSSERIAL_ECHO, WORK) as uno, edge(uno.port, place.address("robot"), place.endpoint):
-        async with place.at_work(robot) as person:
-            contract = await person.demand(source, cost=1)
+    async with market.robot(working(in_doubt)) as robot:
+        with board(ROSSERIAL_ECHO, WORK) as uno, edge(uno.port, robot.address, market.endpoint):
+            contract = await market.demand(robot, [("/work", Empty())], cost=1)
             await asyncio.to_thread(unplug_during_a_command, uno, reset=reset)
-            outcome = await contract.outcome()
-            recording = await contract.recording()
-        assert outcome.success is success
-        await until(lambda: flashes(uno) == flashing, what="the flashes", seconds=LONG)
-    said = recorded(recording, "/aira/device/board")
-    absent = said.index(String("absent: the line is closed"))
+            outcome = await market.outcome(contract, timeout=LONG)
+            await until(lambda: flashes(uno) == flashing, what="the flashes", seconds=LONG)
+    assert outcome.success is success
+    said = outcome.recording.values("/aira/device/board")
+    absent = said.index("absent: the line is closed")
     if success:
-        assert String("present") in said[absent:]
+        assert "present" in said[absent:]
     else:
-        assert "(doubt)" in recorded(recording, "/aira/note")[0].data
+        assert "(doubt)" in outcome.reason

@@ -16,15 +16,16 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.agent.agent import Agent
+    from mesh.chain import Chain
     from schemas import Record
     from tests.support.market import Place
 
 
-async def other_token(place: Place, role: str, *, supply: int) -> str:
-    """The address of a token, XRT in all but its name, of which a role has all."""
-    chain = place.chains[role]
+async def other_token(chain: Chain, *, supply: int) -> str:
+    """The address of a token, XRT in all but its name, of which the account of the chain has all."""
+    assert chain.account is not None
     data = chain.node.creation_code("XRT", supply)
-    receipt = await TransactionSender(chain.node, place.market.accounts[role]).send(to=None, data=data)
+    receipt = await TransactionSender(chain.node, chain.account).send(to=None, data=data)
     assert receipt.contract is not None
     return receipt.contract
 

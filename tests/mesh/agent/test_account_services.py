@@ -87,7 +87,7 @@ async def test_everyone_may_read_allowances(place: Place, closed: Asker) -> None
 
 
 async def test_the_token_is_that_of_the_settings(place: Place) -> None:
-    token, person = await other_token(place, "robot", supply=1000), place.address("person")
+    token, person = await other_token(place.chains["robot"], supply=1000), place.address("person")
     robot = place.agent("robot", erc20_token=token, open_services=True)
     async with asking(place, robot) as asker:
         assert await asker.ask("eth/xrt_balance") == Balance(1000)

@@ -13,7 +13,7 @@ from mesh.chain import DeploymentPlan, Reverted
 from mesh.chain.liabilities import Liabilities
 from mesh.role.following import ChainHead
 from mesh.testing import MarketChain
-from tests.mesh.agent.restarts import COST, made_by_a_provider_that_leaves, speaking, words
+from tests.mesh.agent.restarts import COST, SAYING, made_by_a_provider_that_leaves, speaking
 from tests.support.log_events import logged_facts
 from tests.support.market import Place, in_phase, offering
 from tests.support.waiting import until, until_found
@@ -103,7 +103,7 @@ async def test_the_parties_of_a_silent_validator_are_told_and_the_cost_is_refund
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), []) as robot:
         async with place.provider():
             silent = place.address("provider")
-            contract = await person.demand(words(place), cost=COST, validator=silent, validator_fee=0)
+            contract = await person.demand(SAYING, cost=COST, validator=silent, validator_fee=0)
         await in_phase(robot, contract, Phase.COMPLETE)
         await _deadline_known(robot, place)
         refundable = await place.chains["person"].liabilities.refundable_from(contract.address)

@@ -9,30 +9,31 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from mesh import Agent, AiraError, ConfigurationError, Empty, Progress
+from mesh import Agent, AiraError, ConfigurationError, Empty, Progress, Settings
 from mesh.agent.contracts import Contract
 from mesh.agent.errors import DemandDeclined
 from mesh.amounts import InvalidAmount
 from mesh.base.hours import Hours
-from mesh.testing._market import RESEND
+from mesh.testing import assert_paid
 from tests.mesh.agent.conftest import other_token
-from tests.support.market import MODEL, Place, offering
+from tests.support.market import MODEL, offering
+from tests.support.raising import raises_with
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from mesh.agent.handlers import Job
     from mesh.agent.trade import Order
+    from mesh.testing import Market
     from schemas import Demand, Verified
 
 STRANGER = "0x000000000000000000000000000000000000bEEF"
+GO = [("/go", Empty())]
 
 
-def working(place: Place, *, parallel: int = 1, **options: Any) -> tuple[Agent, asyncio.Event, list[str]]:
+def working(*, parallel: int = 1, **options: Any) -> tuple[Agent, asyncio.Event, list[str]]:
     """A robot that offers for all demands, works on `/go` until the event is set, and lists the jobs that it began."""
     released, begun = asyncio.Event(), list[str]()
-    account, chain = place.market.accounts["robot"], place.chains["robot"]
-    settings = place.settings("robot", **options)
-    robot = Agent(MODEL, settings=settings, account=account, chain=chain, resend=RESEND, parallel=parallel)
+    robot = Agent(MODEL, settings=Settings(**options), parallel=parallel)
 
     @robot.on("/go")
     async def go(job: Job, message: Empty) -> None:
@@ -45,7 +46,7 @@ def working(place: Place, *, parallel: int = 1, **options: Any) -> tuple[Agent, 
 async def decline_of(person: Agent, **terms: Any) -> Progress:
     """The first decline of a demand, which is withdrawn then."""
     heard: list[Progress] = []
-    demand = asyncio.create_task(person.demand([("/go", Empty())], on_progress=heard.append, **terms))
+    demand = asyncio.create_task(person.demand(GO, model=MODEL, on_progress=heard.append, **terms))
     await until(lambda: any(progress.kind == "declined" for progress in heard), seconds=60)
     demand.cancel()
     await asyncio.wait([demand])
@@ -62,17 +63,14 @@ async def decline_of(person: Agent, **terms: Any) -> Progress:
     ],
 )
 async def test_a_demand_that_the_owner_excludes_is_declined_before_the_handlers(
-    place: Place, options: dict[str, Any], code: str, said: str
+    market: Market, options: dict[str, Any], code: str, said: str
 ) -> None:
-    person_address = place.address("person")
-    options = {
-        name: tuple(person_address if one == "person" else one for one in value) if isinstance(value, tuple) else value
-        for name, value in options.items()
-    }
-    robot, _, _ = working(place, **options)
-    seen: list[object] = []
+    person, seen = await market.person(), list[object]()
+    if "refuse" in options:
+        options = {"refuse": (person.address,)}
+    robot, _, _ = working(**options)
     robot.on_demand(seen.append)
-    async with place.at_work(robot) as person:
+    async with market.robot(robot):
         progress = await decline_of(person, cost=10**9)
         assert (progress.agent, progress.code) == (robot.address, code)
         assert said in progress.detail
@@ -80,9 +78,8 @@ async def test_a_demand_that_the_owner_excludes_is_declined_before_the_handlers(
 
 
 @pytest.mark.parametrize(("hours", "state"), [("00:00-24:00 UTC", "idle"), ("Mon 00:00-00:01 UTC", "closed")])
-async def test_the_profile_says_whether_the_robot_is_closed(place: Place, hours: str, state: str) -> None:
-    robot, _, _ = working(place, hours=(hours,))
-    async with robot:
+async def test_the_profile_says_whether_the_robot_is_closed(market: Market, hours: str, state: str) -> None:
+    async with market.robot(working(hours=(hours,))[0]) as robot:
 
         async def says_so() -> bool:
             return (await robot.runtime.profile.present()).state == state
@@ -90,65 +87,57 @@ async def test_the_profile_says_whether_the_robot_is_closed(place: Place, hours:
         await until_found(says_so, what=state)
 
 
-async def test_a_quote_follows_the_same_rules(place: Place) -> None:
-    robot, _, _ = working(place, refuse=(place.address("person"),))
+async def test_a_quote_and_an_order_for_this_robot_alone_follow_the_same_rules(market: Market) -> None:
+    person = await market.person()
+    robot, _, _ = working(refuse=(person.address,))
     robot.on_quote(lambda request: "3")
-    async with place.at_work(robot) as person:
-        (quote,) = await person.quotes(MODEL, [("/go", Empty())], timeout=20)
+    async with market.robot(robot):
+        (quote,) = await person.quotes(MODEL, GO, timeout=20)
         assert (quote.agent, quote.code) == (robot.address, "refused")
+        with pytest.raises(AiraError, match="refused"):
+            await market.demand(robot, GO, by=person)
 
 
-async def test_an_order_for_this_robot_alone_follows_the_same_rules(place: Place) -> None:
-    robot, _, _ = working(place, refuse=(place.address("person"),))
-    async with place.at_work(robot) as person:
-        with pytest.raises(AiraError) as caught:
-            await person.demand([("/go", Empty())], robot=robot.address)
-        assert "refused" in str(caught.value)
-
-
-async def test_who_is_accepted_and_pays_enough_is_served(place: Place) -> None:
-    terms: dict[str, Any] = {
-        "accept": (place.address("person"),),
-        "refuse": (STRANGER,),
-        "least_price": "2",
-        "queue_limit": 1,
-    }
-    robot, released, _ = working(place, hours=("00:00-24:00",), **terms)
+async def test_who_is_accepted_and_pays_enough_is_served(market: Market) -> None:
+    person = await market.person()
+    terms: dict[str, Any] = {"accept": (person.address,), "refuse": (STRANGER,), "least_price": "2"}
+    robot, released, _ = working(hours=("00:00-24:00",), queue_limit=1, **terms)
     released.set()
-    async with place.at_work(robot) as person:
-        contract = await person.demand([("/go", Empty())], cost="2")
-        assert (await contract.outcome()).success
+    async with market.robot(robot):
+        assert_paid(await market.order(MODEL, GO, by=person, cost="2"))
 
 
 @pytest.mark.parametrize(("options", "code"), [({"least_price": "2"}, "price-too-low"), ({}, "other-token")])
 async def test_any_amount_of_a_token_that_the_robot_is_not_paid_in_is_declined(
-    place: Place, options: dict[str, Any], code: str
+    market: Market, options: dict[str, Any], code: str
 ) -> None:
-    token = await other_token(place, "person", supply=10**18)
-    robot, _, _ = working(place, **options)
-    async with place.at_work(robot) as person:
+    person = await market.person()
+    token = await other_token(person.chain, supply=10**18)
+    async with market.robot(working(**options)[0]):
         declined = await decline_of(person, cost=10**18, token=token)
         assert (declined.code, "XRT" in declined.detail) == (code, True)
 
 
-async def test_a_full_queue_takes_the_next_job_when_one_has_ended(place: Place) -> None:
-    robot, released, begun = working(place, queue_limit=1)
-    async with place.at_work(robot) as person:
-        first = await person.demand([("/go", Empty())])
+async def test_a_full_queue_takes_the_next_job_when_one_has_ended(market: Market) -> None:
+    robot, released, begun = working(queue_limit=1)
+    person = await market.person()
+    async with market.robot(robot):
+        first = await market.demand(MODEL, GO, by=person)
         await until(lambda: begun == [first.address], seconds=30)
         heard: list[Progress] = []
-        second = asyncio.create_task(person.demand([("/go", Empty())], cost=1, wait=True, on_progress=heard.append))
+        second = asyncio.create_task(person.demand(GO, model=MODEL, cost=1, wait=True, on_progress=heard.append))
         await until(lambda: any(progress.code == "queue-full" for progress in heard), seconds=30)
         released.set()
         assert (await first.outcome()).success
         assert (await (await second).outcome()).success
 
 
-async def test_a_burst_of_demands_never_gets_more_contracts_than_the_queue_has_places(place: Place) -> None:
-    robot, released, _ = working(place, queue_limit=2)
+async def test_a_burst_of_demands_never_gets_more_contracts_than_the_queue_has_places(market: Market) -> None:
+    robot, released, _ = working(queue_limit=2)
     most = 0
-    async with place.at_work(robot) as person:
-        orders: list[Order] = [await person.order([("/go", Empty())], cost=number) for number in range(1, 7)]
+    person = await market.person()
+    async with market.robot(robot):
+        orders: list[Order] = [await person.order(GO, model=MODEL, cost=number) for number in range(1, 7)]
         contracts = [asyncio.create_task(order.contract()) for order in orders]
         await until(lambda: sum(task.done() for task in contracts) == 2, seconds=60)
         for _ in range(40):  # every order is sent again meanwhile
@@ -163,10 +152,10 @@ async def test_a_burst_of_demands_never_gets_more_contracts_than_the_queue_has_p
 
 
 async def test_two_people_who_want_this_robot_alone_never_get_more_contracts_than_the_queue_has_places(
-    place: Place,
+    market: Market,
 ) -> None:
     """Both find a place when the robot is asked, and one of them none when it makes its offer."""
-    robot, asked = place.agent("robot", queue_limit=1), asyncio.Barrier(2)
+    robot, asked = Agent(MODEL, settings=Settings(queue_limit=1)), asyncio.Barrier(2)
 
     @robot.on_demand
     async def offer(demand: Verified[Demand]) -> None:
@@ -176,8 +165,8 @@ async def test_two_people_who_want_this_robot_alone_never_get_more_contracts_tha
     @robot.on("/go")
     async def go(job: Job, message: Empty) -> None: ...
 
-    async with place.at_work(robot) as person, place.agent("provider") as other:
-        wanted = [one.demand([("/go", Empty())], cost=1, robot=robot.address) for one in (person, other)]
+    async with market.robot(robot):
+        wanted = [market.demand(robot, GO, by=await market.person(), cost=1) for _ in range(2)]
         found = await asyncio.gather(*wanted, return_exceptions=True)
         (declined,) = [one for one in found if isinstance(one, DemandDeclined)]
         (contract,) = [one for one in found if isinstance(one, Contract)]
@@ -186,10 +175,10 @@ async def test_two_people_who_want_this_robot_alone_never_get_more_contracts_tha
 
 
 @pytest.mark.parametrize("parallel", [1, 2])
-async def test_jobs_run_one_after_the_other_or_as_many_at_a_time_as_the_robot_can(place: Place, parallel: int) -> None:
-    robot, released, begun = working(place, parallel=parallel)
-    async with place.at_work(robot) as person:
-        contracts = [await person.demand([("/go", Empty())], cost=number) for number in range(3)]
+async def test_jobs_run_one_after_the_other_or_as_many_at_once_as_the_robot_can(market: Market, parallel: int) -> None:
+    robot, released, begun = working(parallel=parallel)
+    async with market.robot(robot):
+        contracts = [await market.demand(MODEL, GO, cost=number) for number in range(3)]
         await until(lambda: len(begun) == parallel, seconds=30)
 
         await until(lambda: len(robot.runtime.executor.at_hand) == 3, seconds=30)
@@ -239,19 +228,16 @@ def test_hours_that_make_no_sense_are_refused(hours: str, why: str) -> None:
 
 
 @pytest.mark.parametrize("options", [{"hours": ("always",)}, {"refuse": ("0x12",)}, {"accept": ("me",)}])
-async def test_settings_that_can_not_be_read_stop_the_agent_with_their_name(place: Place, options: Any) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        async with place.agent("robot", **options):
+async def test_settings_that_can_not_be_read_stop_the_agent_with_their_name(market: Market, options: Any) -> None:
+    with raises_with(ConfigurationError, code="invalid-option", match=next(iter(options))):
+        async with market.robot(working(**options)[0]):
             pass
-    assert caught.value.code == "invalid-option"
-    assert next(iter(options)) in str(caught.value)
 
 
-async def test_a_least_price_that_is_no_amount_stops_the_agent(place: Place) -> None:
-    robot, _, _ = working(place, least_price="a lot")
+async def test_a_least_price_that_is_no_amount_stops_the_agent(market: Market) -> None:
     with pytest.raises(InvalidAmount):
-        async with asyncio.timeout(30):
-            await robot.serve()
+        async with market.robot(working(least_price="a lot")[0]):
+            pass
 
 
 @pytest.mark.parametrize("parallel", [0, -1, 1.5])

@@ -19,7 +19,7 @@ from mesh.network import call
 from mesh.testing import MarketChain
 from schemas import Demand
 from schemas.rpc import PermitFeeRequest
-from tests.mesh.agent.restarts import COST, speaking, words
+from tests.mesh.agent.restarts import COST, SAYING, speaking
 from tests.mesh.agent.trades import job, working
 from tests.support.market import MODEL, Place, offering
 from tests.support.waiting import until, until_found
@@ -220,7 +220,7 @@ async def test_the_provider_takes_back_what_nobody_earned(impatient: Place, tmp_
     async with speaking(offering(place.agent("robot")), said, stuck_at="3"), penniless(place, 3) as person:
         tokens = person.chain.tokens
         async with place.provider(store=tmp_path / "provider.sqlite"):
-            contract = await person.demand(words(place), cost=COST)
+            contract = await person.demand(SAYING, cost=COST)
             await until(lambda: len(said) == 3)
             assert await tokens.balance() == FUNDS - COST
             if not is_restarted:

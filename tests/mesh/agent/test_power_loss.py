@@ -9,8 +9,9 @@ from mesh.recording import open_objective
 from mesh.validator.verification import Claim, JobFiles, verify
 from schemas import String
 from tests.mesh.agent.power import powered_robot
-from tests.mesh.agent.restarts import COST, WORDS, Paying, paid, speaking, words
+from tests.mesh.agent.restarts import COST, SAYING, WORDS, Paying, paid, speaking
 from tests.support.log_events import logged_facts
+from tests.support.objectives import objective
 
 if TYPE_CHECKING:
     import pytest
@@ -29,10 +30,10 @@ async def test_a_success_after_a_power_cut_has_a_complete_recording(
 ) -> None:
     """Killed when the ledger says that all was played, before the recording is closed."""
     said: list[str] = []
-    objective = words(place)
+    task = place.save(objective(*SAYING))
     async with place.provider(), place.agent("person") as person:
         async with powered_robot(place, market_chain.node.funded_keys[ROBOT], last=len(WORDS)) as powered:
-            contract = await person.demand(objective, cost=COST)
+            contract = await person.demand(task, cost=COST)
             await powered.lose_power()
         async with speaking(place.agent("robot"), said):
             assert (await contract.outcome()).success
@@ -42,7 +43,7 @@ async def test_a_success_after_a_power_cut_has_a_complete_recording(
     assert said == [], "the ledger knew that all was played"
     assert [data for topic, data in messages if topic == "/say"] == WORDS
     assert [data for topic, data in messages if topic == "/said"] == WORDS, "what the handlers published is synced, too"
-    verdict = await asyncio.to_thread(verify, claim, JobFiles(objective=objective, result=recording))
+    verdict = await asyncio.to_thread(verify, claim, JobFiles(objective=task, result=recording))
     assert verdict.holds
     assert await paid.once()
 
@@ -54,7 +55,7 @@ async def test_a_job_whose_recording_lost_what_was_played_is_no_success(
     said: list[str] = []
     async with place.provider(), place.agent("person") as person:
         async with powered_robot(place, market_chain.node.funded_keys[ROBOT], last=len(WORDS)) as powered:
-            contract = await person.demand(words(place), cost=COST)
+            contract = await person.demand(SAYING, cost=COST)
             await powered.lose_power(keeps="nothing")
         async with speaking(place.agent("robot"), said) as robot:
             assert not (await contract.outcome()).success

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.agent.agent import Agent
 from mesh.agent.ledger import Ledger, Phase
-from mesh.recording import open_objective
-from schemas import String, cid_of_file
-from tests.mesh.agent.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
-from tests.support.market import in_phase, offering, offering_unseen
+from mesh.testing import assert_paid
+from mesh.testing._market import ALLOWANCE
+from schemas import cid_of_bytes
+from tests.mesh.agent.restarts import COST, SAYING, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking
+from tests.support.market import MODEL, in_phase, offering, offering_unseen
+from tests.support.objectives import objective
 from tests.support.orders import result
 from tests.support.waiting import until, until_found
 
@@ -21,54 +23,40 @@ if TYPE_CHECKING:
 
     from mesh.agent.contracts import Contract
     from mesh.agent.handlers import Job
+    from mesh.testing import Market
     from schemas import Liability
     from tests.support.market import Place
 
 __all__ = ["paid"]
 
 
-async def test_a_ready_job_is_done_after_a_restart(place: Place, paid: Paying) -> None:
+async def test_a_ready_job_is_done_after_a_restart(market: Market) -> None:
     said: list[str] = []
-    async with place.provider(), place.agent("person") as person:
-        async with offering(place.agent("robot")) as robot:
-            contract = await person.demand(words(place), cost=COST)
-            await in_phase(robot, contract, Phase.READY)
-        async with speaking(place.agent("robot"), said) as robot:
-            assert (await contract.outcome()).success
-            await in_phase(robot, contract, Phase.FINALIZED)
+    async with market.robot(offering(Agent(MODEL))) as robot:
+        contract = await market.demand(robot, SAYING, cost=COST)
+        await in_phase(robot, contract, Phase.READY)
+    async with market.robot(speaking(robot, said)):
+        assert_paid(await market.outcome(contract))
+        await in_phase(robot, contract, Phase.FINALIZED)
+        assert await market.balance(robot) == ALLOWANCE + COST
     assert said == WORDS
-    assert await paid.once()
 
 
-async def test_a_running_job_continues_where_it_was(place: Place, paid: Paying) -> None:
-    first: list[str] = []
-    second: list[str] = []
-    async with place.provider(), place.agent("person") as person:
-        async with speaking(offering(place.agent("robot")), first, stuck_at="3"):
-            contract = await person.demand(words(place), cost=COST)
-            await until(lambda: len(first) == 3)
-        async with speaking(place.agent("robot"), second):
-            assert (await contract.outcome()).success
-            recording = open_objective(await contract.recording())
-    assert first + second == WORDS
-    assert await paid.once()
-    said = [String.decode(message.payload).data for message in recording.messages() if message.topic == "/said"]
-    assert said == WORDS, "what was recorded before the restart is not lost"
-
-
-async def test_a_running_job_can_be_stopped_again_and_again(place: Place, paid: Paying) -> None:
-    said: list[str] = []
-    async with place.provider(), place.agent("person") as person:
-        async with speaking(offering(place.agent("robot")), said, stuck_at="0") as robot:
-            contract = await person.demand(words(place), cost=COST)
-            await in_phase(robot, contract, Phase.RUNNING)
+async def test_a_running_job_continues_where_it_was_however_often_it_is_stopped(market: Market) -> None:
+    said, stuck_at = list[str](), {"0"}
+    async with market.robot(speaking(offering(Agent(MODEL)), said, stuck_at=stuck_at)) as robot:
+        contract = await market.demand(robot, SAYING, cost=COST)
+        await market.running(contract)
         for stop in ("2", "2", "4"):
-            async with speaking(place.agent("robot"), said, stuck_at=stop) as robot:
-                await until(lambda stop=stop: len(said) == int(stop))  # type: ignore[misc]
-        async with speaking(place.agent("robot"), said):
-            assert (await contract.outcome()).success
-    assert said == WORDS
-    assert await paid.once()
+            stuck_at.clear()
+            stuck_at.add(stop)
+            await market.restart(robot)
+            await until(lambda stop=stop: said == WORDS[: int(stop)])  # type: ignore[misc]
+        stuck_at.clear()
+        await market.restart(robot)
+        assert_paid(outcome := await market.outcome(contract))
+        assert await market.balance(robot) == ALLOWANCE + COST
+    assert said == outcome.recording.values("/said") == WORDS, "what was recorded before a restart is not lost"
 
 
 async def test_a_job_that_ended_on_the_chain_during_the_downtime_is_not_done(place: Place) -> None:
@@ -76,7 +64,7 @@ async def test_a_job_that_ended_on_the_chain_during_the_downtime_is_not_done(pla
     seen: list[Phase] = []
     async with place.provider(), place.agent("person") as person:
         async with offering(place.agent("robot")) as robot:
-            contract = await person.demand(words(place))
+            contract = await person.demand(SAYING)
             await in_phase(robot, contract, Phase.READY)
             failed = result(signer=robot.parts.signer, liability=contract.address, success=False)
         await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, failed)
@@ -112,7 +100,7 @@ async def test_a_liability_that_ended_before_the_agent_read_it_is_not_a_job(plac
         async with offering(place.agent("robot", enable_executor=False)) as robot:
             await reading(robot)
             head, robot_memory = robot.parts.chain_head.head, robot.parts.directory
-            contract = await person.demand(words(place))
+            contract = await person.demand(SAYING)
         failed = result(signer=place.market.accounts["robot"].signer, liability=contract.address, success=False)
         await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, failed)
         # As if it had been down since before the contract was made.
@@ -135,48 +123,38 @@ async def created_again(robot: Agent, contract: Contract) -> None:
     await robot.runtime.new_liability(contract.liability, demand_hash=hashes[0], offer_hash=hashes[1])
 
 
-async def test_a_job_that_was_set_aside_continues_where_it_was(place: Place, paid: Paying) -> None:
-    said: list[str] = []
-    released = asyncio.Event()
-    robot = offering(place.agent("robot"))
+async def test_a_job_that_was_set_aside_continues_where_it_was(market: Market) -> None:
+    said, released = list[str](), asyncio.Event()
+    robot = offering(Agent(MODEL))
 
     @robot.on("/say")
-    async def say(job: Job, message: String) -> None:
-        if message.data == "3":
+    async def say(job: Job, message: str) -> None:
+        if message == "3":
             await released.wait()
-        said.append(message.data)
-        job.publish("/said", message.data)
+        said.append(message)
+        job.publish("/said", message)
 
-    async with place.provider(), robot, place.agent("person") as person:
-        contract = await person.demand(words(place), cost=COST)
+    async with market.robot(robot):
+        contract = await market.demand(robot, SAYING, cost=COST)
         await until(lambda: len(said) == 3)
         await created_again(robot, contract)
         released.set()
-        assert (await contract.outcome()).success
-        recording = open_objective(await contract.recording())
-    assert said == WORDS
-    heard = [String.decode(message.payload).data for message in recording.messages() if message.topic == "/said"]
-    assert heard == WORDS
-    assert await paid.once()
+        assert_paid(outcome := await market.outcome(contract))
+        assert await market.balance(robot) == ALLOWANCE + COST
+    assert said == outcome.recording.values("/said") == WORDS
 
 
-async def test_a_job_may_be_set_aside_while_its_objective_is_fetched(place: Place) -> None:
-    robot = offering_unseen(place.agent("robot", fetch_timeout=30.0))
-    said: list[str] = []
-    async with place.provider(), speaking(robot, said), place.agent("person") as person:
-        path = words(place)
-        contract = await person.demand(cid_of_file(path))
+async def test_a_job_may_be_set_aside_while_its_objective_is_fetched(market: Market) -> None:
+    said, content, person = list[str](), objective(*SAYING), await market.person()
+    async with market.robot(speaking(offering_unseen(Agent(MODEL)), said)) as robot:
+        contract = await market.demand(MODEL, cid_of_bytes(content), by=person)
         await in_phase(robot, contract, Phase.INCOMING)
         await robot.runtime.liability_reverted(contract.address)
-        await asyncio.to_thread(person.parts.store.put_file, path)
-        await until_found(lambda: held(robot, contract), what="the objective")
+        cid = person.parts.store.put_bytes(content)
+        await until(lambda: robot.parts.store.has(cid), what="the objective")
         await created_again(robot, contract)
-        assert (await contract.outcome()).success
+        assert_paid(await market.outcome(contract))
     assert said == WORDS
-
-
-async def held(robot: Agent, contract: Contract) -> bool:
-    return robot.parts.store.has(contract.liability.objective)
 
 
 async def test_a_finished_job_that_was_set_aside_sends_its_result_again(place: Place, paid: Paying) -> None:
@@ -214,7 +192,7 @@ async def test_a_job_of_a_run_that_does_none_is_done_by_the_next_one(place: Plac
     said: list[str] = []
     async with place.provider(), place.agent("person") as person:
         async with offering(place.agent("robot", enable_executor=False)) as robot:
-            contract = await person.demand(words(place), cost=COST)
+            contract = await person.demand(SAYING, cost=COST)
             head = await place.chains["person"].block_number()
             await robot.parts.chain_head.reached(head)
         async with speaking(place.agent("robot"), said):
@@ -242,7 +220,7 @@ async def test_a_program_of_the_account_that_does_no_jobs_leaves_them_to_the_rob
             await opened()
 
         robot.runtime.executor.wait_until_open = later  # type: ignore[method-assign]
-        contract = await person.demand(words(place), cost=COST)
+        contract = await person.demand(SAYING, cost=COST)
         assert (await contract.outcome()).success
         await in_phase(robot, contract, Phase.FINALIZED)
     assert said == WORDS

@@ -15,7 +15,7 @@ from mesh.agent.ledger import Phase
 from mesh.chain.liabilities import Liabilities
 from mesh.recording import open_objective
 from schemas import String, cid_of_file
-from tests.mesh.agent.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
+from tests.mesh.agent.restarts import COST, SAYING, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking
 from tests.mesh.agent.samples import liability
 from tests.support.market import in_phase, offering
 from tests.support.orders import result
@@ -38,7 +38,7 @@ async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(p
     """Without handlers: the result holds the messages of the device before the restart."""
     async with place.provider(), place.agent("person") as person:
         async with offering(place.agent("robot")) as robot:
-            contract = await person.demand(words(place))
+            contract = await person.demand(SAYING)
             await in_phase(robot, contract, Phase.READY)
             executor = robot.runtime.executor
             await executor.start(contract.address)
@@ -144,7 +144,7 @@ async def crashed_at(refuse: Callable[[Path], None], place: Place, person: Agent
         async with speaking(offering(place.agent("robot")), []) as robot, place.provider():
             ledgers.append(robot.parts.directory / "ledger.sqlite")
             refuse(*ledgers)
-            await person.order(words(place), cost=COST)  # `demand` would withdraw it when it is cancelled
+            await person.order(SAYING, cost=COST)  # `demand` would withdraw it when it is cancelled
             await asyncio.sleep(60)
 
     with pytest.raises(sqlite3.IntegrityError):
@@ -156,7 +156,7 @@ async def test_the_result_of_a_reverted_payment_is_sent_again(place: Place, paid
     said: list[str] = []
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
         async with place.provider():
-            contract = await person.demand(words(place), cost=COST)
+            contract = await person.demand(SAYING, cost=COST)
             await in_phase(robot, contract, Phase.FINALIZED)
             assert await paid.once()
         await place.forget_blocks(1)
@@ -207,7 +207,7 @@ async def test_a_contract_created_again_at_another_address_is_paid_once(place: P
     said: list[str] = []
     async with place.agent("person") as person, place.provider():
         async with offering(place.agent("robot")) as robot:
-            contract = await person.demand(words(place), cost=COST)
+            contract = await person.demand(SAYING, cost=COST)
             first = contract.address
             await in_phase(robot, contract, Phase.READY)
             await place.forget_blocks(1)
@@ -240,7 +240,7 @@ async def test_a_contract_that_is_gone_when_it_is_read_does_not_stop_the_reading
 
     monkeypatch.setattr(Liabilities, "get_with_orders", get_too_late)
     async with place.agent("person") as person, place.provider(), speaking(offering(place.agent("robot")), said):
-        await person.demand(words(place), cost=COST)
+        await person.demand(SAYING, cost=COST)
         await until_found(paid.once, what="the payment")
     assert gone
     assert said == WORDS
@@ -251,7 +251,7 @@ async def test_no_recording_of_an_ended_job_is_left(place: Place) -> None:
     said: list[str] = []
     async with place.provider(), place.agent("person") as person:
         async with speaking(offering(place.agent("robot")), said, stuck_at="0") as robot:
-            contract = await person.demand(words(place))
+            contract = await person.demand(SAYING)
             await in_phase(robot, contract, Phase.RUNNING)
             recordings = robot.parts.recordings
             assert os.listdir(recordings) == [f"{contract.address}.mcap.part"]

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from tests.mesh.agent.restarts import COST, speaking, words
+from tests.mesh.agent.restarts import COST, SAYING, speaking
 
 if TYPE_CHECKING:
     import pytest
@@ -30,7 +30,7 @@ async def test_a_job_syncs_its_recording_and_result_and_no_more(place: Place, mo
     robot.on_demand(robot.offer)
     async with place.provider(), place.agent("person") as person, robot:
         monkeypatch.setattr(os, "fsync", count)
-        contract = await person.demand(words(place), cost=COST)
+        contract = await person.demand(SAYING, cost=COST)
         assert (await contract.outcome()).success
 
     recording = synced.pop("….mcap.part")

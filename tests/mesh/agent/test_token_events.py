@@ -80,7 +80,7 @@ async def test_transfers_and_approvals_between_others_are_not_published(place: P
 
 
 async def test_events_are_of_the_token_of_the_settings(place: Place) -> None:
-    token, person = await other_token(place, "robot", supply=100), place.address("person")
+    token, person = await other_token(place.chains["robot"], supply=100), place.address("person")
     async with place.agent("robot", erc20_token=token) as agent, heard(place, agent) as events:
         await place.chains["robot"].tokens.transfer(person, 1)
         await place.chains["robot"].tokens.transfer(person, 2, token=token)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mesh.agent.ledger import Outgoing
 
 OBJECTIVE = cid_of_bytes(b"something to be done")
+JOB = [("/go", "there")]
 
 
 def working(robot: Agent) -> Agent:
@@ -30,7 +31,7 @@ def working(robot: Agent) -> Agent:
 
 
 def job(place: Place) -> Path:
-    return place.save(objective(("/go", "there")))
+    return place.save(objective(*JOB))
 
 
 async def unsettled(agent: Agent) -> list[Outgoing]:

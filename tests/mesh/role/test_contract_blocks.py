@@ -13,7 +13,7 @@ from mesh.chain import DeploymentPlan, Node, Reverted
 from mesh.chain._node import RUN_NUMBER
 from mesh.dev import EmbeddedChain
 from mesh.testing import MarketChain
-from tests.mesh.agent.restarts import COST, made_by_a_provider_that_leaves, speaking, words
+from tests.mesh.agent.restarts import COST, SAYING, made_by_a_provider_that_leaves, speaking
 from tests.support.market import Place, offering
 from tests.support.rollups import FIRST, ForeignBlocks, seen_in
 from tests.support.waiting import until_found
@@ -96,11 +96,11 @@ async def test_a_whole_job_is_done_and_orders_expire_by_the_blocks_that_contract
     before, chain = await place.balance("robot"), place.chains["person"]
     async with place.agent("person") as person:
         async with speaking(offering(place.agent("robot")), []) as robot, place.provider():
-            contract = await person.demand(words(place), cost=COST)
+            contract = await person.demand(SAYING, cost=COST)
             async with asyncio.timeout(60):
                 assert (await contract.outcome()).success
             assert robot.parts.chain_head.contract_block > FIRST > robot.parts.chain_head.head
-        order = await person.order(words(place), cost=COST, lifetime=20)
+        order = await person.order(SAYING, cost=COST, lifetime=20)
         assert FIRST < order.deadline <= seen_in(await chain.block_number()) + 20
         ended = asyncio.create_task(order.contract())
         while seen_in(await chain.block_number() + 1) <= order.deadline:
