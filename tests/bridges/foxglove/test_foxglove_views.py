@@ -10,31 +10,31 @@ from bridges.foxglove._player import show_job_until_end, show_recording
 from bridges.foxglove.server import FoxgloveServer
 from bridges.foxglove.sources import show_agent, show_market
 from bridges.web.components import opened
-from mesh import Job, String  # noqa: TC001  handlers are read at run time
+from mesh import Agent, Job, String
 from mesh.base.background import Background
 from mesh.errors import InputError
 from mesh.role.composition import watching
+from mesh.testing import assert_paid
 from schemas.keys import DeviceTopicKey, ReadingKey
 from schemas.payloads import Payload, PayloadType, SentDefinitions
 from tests.bridges.foxglove.viewer import PLAY, viewing
 from tests.support.market import MODEL, offering
-from tests.support.objectives import objective
 from tests.support.raising import raises_with
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from tests.support.market import Place
+    from mesh.testing import Market
 
-COST = 100
+BLINK = [("/blink", "on")]
 OWN = PayloadType("ros1", "my_msgs/Own", "ros1msg", b"uint8 a\n")
 SAID = PayloadType("ros1", "my_msgs/Said", "ros1msg", b"uint8 a\n")
 
 
-def blinking(place: Place) -> Any:
+def blinking() -> Agent:
     """A robot that says on `/blinked` what it plays, and on `/own` something of a type of its own."""
-    robot = offering(place.agent("robot"))
+    robot = offering(Agent())
 
     @robot.on("/blink")
     async def blink(job: Job, message: String) -> None:
@@ -45,45 +45,44 @@ def blinking(place: Place) -> Any:
 
 
 @asynccontextmanager
-async def showing_market(place: Place, front: Any) -> AsyncIterator[str]:
+async def showing_market(market: Market, front: Any) -> AsyncIterator[str]:
     async with AsyncExitStack() as stack:
         enter = stack.enter_async_context
         view = await enter(front())
-        network, channel = await enter(watching(place.settings("viewer")))
+        network, channel = await enter(watching(market.settings("viewer")))
         server = await enter(FoxgloveServer(view, "market"))
         tasks = await enter(Background())
         tasks.start(show_market(server, network.session, channel), "market")
         yield view.url
 
 
-async def test_the_market_is_seen_as_a_stream(place: Place, front: Any) -> None:
-    robot = blinking(place)
-    async with showing_market(place, front) as url, viewing(url) as viewer, place.at_work(robot) as person:
-        path = place.save(objective(("/blink", "on")))
-        contract = await person.demand(path, model=MODEL, cost=COST)
-        await contract.outcome()
+async def test_the_market_is_seen_as_a_stream(market: Market, front: Any) -> None:
+    robot = blinking()
+    async with showing_market(market, front) as url, viewing(url) as viewer, market.robot(robot):
+        person = await market.person()
+        outcome = await market.order(MODEL, BLINK, by=person, cost=100)
         (demand, *_) = await viewer.until_seen("/market/demand")
-        assert (demand["signer"], demand["cost"]) == (person.address, str(COST))
+        assert (demand["signer"], demand["cost"]) == (person.address, "100")
         (result, *_) = await viewer.until_seen("/market/result")
-        assert result["liability"] == contract.address
+        assert result["liability"] == outcome.contract
         await until(lambda: "complete" in {job["event"] for job in viewer.values("/market/job")})
         robot.publish("/battery", 0.5)
         await viewer.until_seen(f"/{robot.address.lower()}/battery")
         await until(lambda: any(counts["reading"] for counts in viewer.values("/aira/counts")))
         await until(
-            lambda: any(str(contract.address) in line["message"] for line in viewer.values("/aira/log")),
+            lambda: any(outcome.contract in line["message"] for line in viewer.values("/aira/log")),
             what="the contract in the log",
         )
 
 
-async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, front: Any) -> None:
-    robot = blinking(place)
+async def test_an_agent_is_seen_with_its_devices_and_its_jobs(market: Market, front: Any) -> None:
+    robot = blinking()
     async with AsyncExitStack() as stack:
         enter = stack.enter_async_context
         view = await enter(front())
-        network, channel = await enter(watching(place.settings("viewer")))
+        network, channel = await enter(watching(market.settings("viewer")))
         server = await enter(FoxgloveServer(view, "agent"))
-        person = await enter(place.at_work(robot))
+        await enter(market.robot(robot))
         tasks = await enter(Background())
         shown = show_agent(server, network.session, robot.address, channel.lighthouse)
         tasks.start(shown, "agent")
@@ -101,16 +100,15 @@ async def test_an_agent_is_seen_with_its_devices_and_its_jobs(place: Place, fron
         defined = SentDefinitions().attachment(b"", "", OWN, 0.0)
         robot.parts.network.session.put(key, b"\x05", encoding=OWN.zenoh_encoding, attachment=defined)
         assert [value.a for value in await viewer.until_seen("/device/arm/own")] == [5]
-        contract = await person.demand(place.save(objective(("/blink", "on"))), model=MODEL, cost=COST)
-        await contract.outcome()
+        await market.order(robot, BLINK)
         assert (await viewer.until_seen("/job/blinked"))[0].data == "on"
         assert [value.a for value in await viewer.until_seen("/job/own")] == [7]
         await until(lambda: "complete" in {job["event"] for job in viewer.values("/aira/job")})
         await until(lambda: viewer.values("/aira/log"))
 
 
-async def test_a_job_is_seen_live_and_then_played_from_its_recording(place: Place, front: Any) -> None:
-    robot, released = offering(place.agent("robot")), asyncio.Event()
+async def test_a_job_is_seen_live_and_then_played_from_its_recording(market: Market, front: Any) -> None:
+    robot, released = offering(Agent()), asyncio.Event()
 
     @robot.on("/blink")
     async def blink(job: Job, message: String) -> None:
@@ -123,10 +121,9 @@ async def test_a_job_is_seen_live_and_then_played_from_its_recording(place: Plac
     async with AsyncExitStack() as stack:
         enter = stack.enter_async_context
         view = await enter(front())
-        parts = await enter(opened(place.settings("viewer"), chain=place.chains["provider"]))
-        person = await enter(place.at_work(robot))
-        held = place.save(objective(*(("/blink", f"{number}") for number in range(100))))
-        contract = await person.demand(held, model=MODEL, cost=COST)
+        parts = await enter(opened(market.settings("viewer"), chain=(await market.person()).chain))
+        await enter(market.robot(robot))
+        contract = await market.demand(robot, [("/blink", f"{number}") for number in range(100)])
         tasks = await enter(Background())
         tasks.start(show(parts, view, contract.address), "job")
         await until(lambda: view.inner)
@@ -136,7 +133,7 @@ async def test_a_job_is_seen_live_and_then_played_from_its_recording(place: Plac
             released.set()
             await until(lambda: any(message.data == "99" for message in viewer.values("/blinked")))
             assert (await viewer.until_seen("/aira/progress"))[0]["total"] == 100
-        assert (await contract.outcome()).success
+        assert_paid(await market.outcome(contract))
         await until(lambda: view.inner not in ("", live), what="the playback")
         async with viewing(view.url) as viewer:
             assert "playbackControl" in viewer.info["capabilities"]
@@ -146,11 +143,12 @@ async def test_a_job_is_seen_live_and_then_played_from_its_recording(place: Plac
             assert {message.data for message in await viewer.until_seen("/blinked", 100)} == set(played)
 
 
-async def test_a_job_without_a_recording_is_told(place: Place, front: Any) -> None:
-    async with front() as view, opened(place.settings("viewer"), chain=place.chains["provider"]) as parts:
+async def test_a_job_without_a_recording_is_told(market: Market, front: Any) -> None:
+    person = await market.person()
+    async with front() as view, opened(market.settings("viewer"), chain=person.chain) as parts:
 
         class Ended:
-            result, address = "", place.address("robot")
+            result, address = "", person.address
 
         ended: Any = Ended()
         with raises_with(InputError, code="no-recording"):

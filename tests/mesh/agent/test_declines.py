@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec.structs import replace
 
-from mesh import Declined, DemandDeclined, InputError, Progress
+from mesh import Agent, Declined, DemandDeclined, InputError, Progress, Settings
 from mesh.agent.demands import PER_MAKER, DeclinePublisher, Grounds
 from mesh.base.flood import Drops
 from mesh.network import Endpoints, Network
@@ -20,32 +20,33 @@ from schemas.signing import Decline
 from tests.mesh.agent.trades import OBJECTIVE, posted
 from tests.support import orders
 from tests.support.log_events import logged_facts
-from tests.support.market import MODEL, Place, offering
-from tests.support.objectives import objective
+from tests.support.market import MODEL, offering
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from mesh.agent.agent import Agent
     from mesh.agent.handlers import Job
     from mesh.agent.trade import Order
+    from mesh.testing import Market
+    from tests.support.market import Place
 
 
-def taking_speeds(robot: Agent) -> Agent:
-    """The same robot, which offers for all that it can play: numbers on `/go`."""
+def taking_speeds() -> Agent:
+    """A robot that offers for all that it can play: numbers on `/go`."""
+    robot = offering(Agent(MODEL))
 
     @robot.on("/go", float)
     async def go(job: Job, speed: float) -> None:
         pass
 
-    return offering(robot)
+    return robot
 
 
-async def declined(person: Agent, wanted: Any) -> Progress:
+async def declined(market: Market, wanted: Any) -> Progress:
     """The first decline that a person hears who demands something."""
-    heard: list[Progress] = []
-    demand = asyncio.create_task(person.demand(wanted, on_progress=heard.append))
+    person, heard = await market.person(), list[Progress]()
+    demand = asyncio.create_task(person.demand(wanted, model=MODEL, on_progress=heard.append))
     await until(lambda: any(progress.kind == "declined" for progress in heard), seconds=60)
     demand.cancel()
     await asyncio.wait([demand])
@@ -53,31 +54,26 @@ async def declined(person: Agent, wanted: Any) -> Progress:
 
 
 @pytest.mark.parametrize(
-    ("messages", "code"), [((("/fly", Empty()),), "unknown-topic"), ((("/go", "fast"),), "unfit-message")]
+    ("message", "code"), [(("/fly", Empty()), "unknown-topic"), (("/go", "fast"), "unfit-message")]
 )
-async def test_a_robot_says_why_an_objective_does_not_fit(place: Place, messages: Any, code: str) -> None:
-    async with place.at_work(taking_speeds(place.agent("robot"))) as person:
-        progress = await declined(person, place.save(objective(*messages)))
-        assert (progress.agent, progress.code) == (place.address("robot"), code)
-        assert messages[0][0] in progress.detail
+async def test_a_robot_says_why_an_objective_does_not_fit(market: Market, message: Any, code: str) -> None:
+    async with market.robot(taking_speeds()) as robot:
+        progress = await declined(market, [message])
+        assert (progress.agent, progress.code) == (robot.address, code)
+        assert message[0] in progress.detail
 
 
-async def test_a_robot_says_that_it_found_nobody_with_the_objective(place: Place) -> None:
-    async with place.at_work(offering(place.agent("robot", fetch_timeout=0.5))) as person:
-        progress = await declined(person, cid_of_bytes(b"nobody has this"))
+async def test_a_robot_says_that_it_found_nobody_with_the_objective(market: Market) -> None:
+    async with market.robot(offering(Agent(MODEL, settings=Settings(fetch_timeout=0.5)))) as robot:
+        progress = await declined(market, cid_of_bytes(b"nobody has this"))
         assert progress.code == "objective-unavailable"
-        assert str(place.folder) not in progress.detail
+        assert robot.settings.data_dir not in progress.detail
 
 
-async def test_a_handler_declines_with_a_word_of_its_own(place: Place, caplog: pytest.LogCaptureFixture) -> None:
-    robot = place.agent("robot")
-
-    @robot.on_demand
-    async def weigh(demand: Verified[Demand]) -> None:
-        raise Declined("too-cheap", "costs at least 5 XRT" + "!" * 1000)
-
-    async with place.at_work(robot) as person:
-        progress = await declined(person, OBJECTIVE)
+async def test_a_handler_declines_with_a_word_of_its_own(market: Market, caplog: pytest.LogCaptureFixture) -> None:
+    robot = _declining("costs at least 5 XRT" + "!" * 1000)
+    async with market.robot(robot):
+        progress = await declined(market, OBJECTIVE)
         assert progress.code == "too-cheap"
         assert progress.detail.startswith("costs at least 5 XRT")
         assert len(progress.detail) == 500
@@ -174,36 +170,36 @@ async def test_only_those_who_demand_subscribe_to_declines(place: Place) -> None
             await order.withdraw()
 
 
-async def test_a_demand_ends_when_all_robots_of_its_model_have_declined(place: Place) -> None:
-    async with place.another(5) as second, asyncio.timeout(60):
-        for robot in (first := place.agent("robot"), second):
-            _decline_all(robot)
-        async with place.at_work(first, second) as person:
-            with pytest.raises(DemandDeclined) as caught:
-                await person.demand(OBJECTIVE)
-            assert {one.agent: one.code for one in caught.value.declines} == {
-                first.address: "too-cheap",
-                second.address: "too-cheap",
-            }
-            assert person.orders() == []
-            # One that waits stays open.
-            kept = asyncio.create_task(person.demand(OBJECTIVE, cost=1, wait=True))
-            await until(lambda: any(len(order._traded.declines) == 2 for order in person.orders()))
-            assert not kept.done()
-            kept.cancel()
-            await asyncio.wait([kept])
+async def test_a_demand_ends_when_all_robots_of_its_model_have_declined(market: Market) -> None:
+    person = await market.person()
+    async with market.robot(_declining("dear")) as first, market.robot(_declining("dear")) as second:
+        with pytest.raises(DemandDeclined) as caught:
+            await market.demand(MODEL, OBJECTIVE, by=person)
+        assert {one.agent: one.code for one in caught.value.declines} == {
+            first.address: "too-cheap",
+            second.address: "too-cheap",
+        }
+        assert person.orders() == []
+        # One that waits stays open.
+        kept = asyncio.create_task(person.demand(OBJECTIVE, model=MODEL, cost=1, wait=True))
+        await until(lambda: any(len(order._traded.declines) == 2 for order in person.orders()))
+        assert not kept.done()
+        kept.cancel()
+        await asyncio.wait([kept])
 
 
-async def test_a_demand_goes_on_while_one_robot_has_not_declined(place: Place) -> None:
-    async with place.another(5) as second, asyncio.timeout(60):
-        _decline_all(second)
-
-        async with place.at_work(second, silent := taking_speeds(place.agent("robot", MODEL))) as person:
-            contract = await person.demand(place.save(objective(("/go", 1.0))))
-            assert contract.robot == silent.address
+async def test_a_demand_goes_on_while_one_robot_has_not_declined(market: Market) -> None:
+    async with market.robot(_declining("dear")), market.robot(taking_speeds()) as silent:
+        contract = await market.demand(MODEL, [("/go", 1.0)])
+        assert contract.robot == silent.address
 
 
-def _decline_all(robot: Agent) -> None:
+def _declining(why: str) -> Agent:
+    """A robot that finds all too cheap."""
+    robot = Agent(MODEL)
+
     @robot.on_demand
     async def decline(demand: Verified[Demand]) -> None:
-        raise Declined("too-cheap", "costs more")
+        raise Declined("too-cheap", why)
+
+    return robot

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from mesh import Agent, ConfigurationError, ModelDescription, ModelLimits, ModelUnfit, ObjectiveUnfit, Settings
+from mesh.testing import assert_paid
 from schemas import Empty, String, cid_of_file
 from schemas.model import InvalidDescription, ModelTopic, ValueSchema
 from tests.support.market import offering
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.handlers import Job
-    from tests.support.market import Place
+    from mesh.testing import Market
 
 
 class Move(msgspec.Struct):
@@ -51,17 +52,14 @@ DRIVE = driver().model_description(
 )
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "model.json"
-    path.write_bytes(DRIVE.encode())
+def saved(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
     return path
 
 
-def robot_with(place: Place, model: Path) -> Agent:
-    """A robot whose model is a file."""
-    settings, account = place.settings("robot"), place.market.accounts["robot"]
-    return Agent(model, settings=settings, account=account, chain=place.chains["robot"])
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return saved(tmp_path / "model.json", DRIVE.encode())
 
 
 def test_handlers_say_what_a_model_is() -> None:
@@ -122,98 +120,94 @@ def changed(**fields: Any) -> ModelDescription:
     ],
 )
 async def test_an_agent_starts_only_if_its_handlers_fit_its_model(
-    place: Place, tmp_path: Path, description: ModelDescription, fits: bool
+    market: Market, file: Path, description: ModelDescription, fits: bool
 ) -> None:
-    path = tmp_path / "model.json"
-    path.write_bytes(description.encode())
-    robot = driving(robot_with(place, path))
+    robot = driving(Agent(saved(file, description.encode())))
     if fits:
-        async with robot:
-            assert robot.model == description.cid == cid_of_file(path)
+        async with market.robot(robot):
+            assert robot.model == description.cid == cid_of_file(file)
             assert robot.parts.store.has(robot.model)
     else:
-        with pytest.raises(ModelUnfit) as caught:
-            await robot.__aenter__()
-        assert caught.value.model == description.cid
+        with raises_with(ModelUnfit, model=description.cid):
+            async with market.robot(robot):
+                pass
 
 
-async def test_an_agent_without_handlers_fits_any_model(place: Place, file: Path) -> None:
-    async with robot_with(place, file) as robot:
+async def test_an_agent_without_handlers_fits_any_model(market: Market, file: Path) -> None:
+    async with market.robot(Agent(file)) as robot:
         assert robot.model == DRIVE.cid
 
 
-async def test_a_text_is_a_model_too(place: Place, tmp_path: Path) -> None:
-    text = tmp_path / "model.md"
-    text.write_text("# A robot that drives\n")
-    async with driving(robot_with(place, text)) as robot:
+async def test_a_text_is_a_model_too(market: Market, tmp_path: Path) -> None:
+    text = saved(tmp_path / "model.md", b"# A robot that drives\n")
+    async with market.robot(driving(Agent(text))) as robot:
         assert robot.model == cid_of_file(text)
         assert robot.parts.store.has(robot.model)
 
 
-async def test_a_description_that_is_not_valid_ends_the_start(place: Place) -> None:
+async def test_a_description_that_is_not_valid_ends_the_start(market: Market, file: Path) -> None:
     with pytest.raises(InvalidDescription):
-        await robot_with(place, place.save(DRIVE.encode().rstrip())).__aenter__()
+        async with market.robot(Agent(saved(file, DRIVE.encode().rstrip()))):
+            pass
 
 
-async def test_a_file_that_is_missing_ends_the_start(place: Place) -> None:
-    missing = place.folder / "model.json"
+async def test_a_file_that_is_missing_ends_the_start(market: Market, tmp_path: Path) -> None:
+    missing = tmp_path / "model.json"
     with raises_with(ConfigurationError, code="model-unreadable", match=re.escape(str(missing))):
-        await robot_with(place, missing).__aenter__()
+        async with market.robot(Agent(missing)):
+            pass
 
 
-async def test_a_robot_finds_the_description_of_its_model_in_its_store(place: Place) -> None:
-    async with place.agent("robot", DRIVE.cid) as robot:
+async def test_a_robot_finds_the_description_of_its_model_in_its_store(market: Market) -> None:
+    async with market.robot(Agent(DRIVE.cid)) as robot:
         robot.parts.store.put_bytes(DRIVE.encode(), pin="test")
-    unfit = place.agent("robot", DRIVE.cid)
 
-    @unfit.on("/fly")
+    @robot.on("/fly")
     async def fly(job: Job, message: object) -> None: ...
 
     with pytest.raises(ModelUnfit):
-        await unfit.__aenter__()
+        async with market.robot(robot):
+            pass
 
 
-FAST = objective(("/drive", {"speed": 3.0}))
-GOOD = objective(("/drive", {"speed": 1.0}), ("/stop", Empty()))
+FAST = [("/drive", {"speed": 3.0})]
+GOOD = [("/drive", {"speed": 1.0}), ("/stop", Empty())]
 
 
-async def test_a_robot_examines_objectives_by_its_models_description(place: Place, file: Path) -> None:
-    robot = robot_with(place, file)  # without handlers: only the description speaks
-    async with robot:
+async def test_a_robot_examines_objectives_by_its_models_description(market: Market, file: Path) -> None:
+    async with market.robot(Agent(file)) as robot:  # without handlers: only the description speaks
         store = robot.parts.store
-        assert (await robot.examine(store.put_bytes(GOOD))).count == 2
-        for content, reason in (
+        assert (await robot.examine(store.put_bytes(objective(*GOOD)))).count == 2
+        for messages, reason in (
             (FAST, "unfit-message"),
-            (objective(("/stop", String(""))), "unfit-message"),
-            (objective(("/fly", Empty())), "unknown-topic"),
-            (objective(*[("/stop", Empty())] * 4), "too-many-messages"),
+            ([("/stop", String(""))], "unfit-message"),
+            ([("/fly", Empty())], "unknown-topic"),
+            ([("/stop", Empty())] * 4, "too-many-messages"),
         ):
-            with pytest.raises(ObjectiveUnfit) as caught:
-                await robot.examine(store.put_bytes(content))
-            assert caught.value.reason == reason
+            with raises_with(ObjectiveUnfit, reason=reason):
+                await robot.examine(store.put_bytes(objective(*messages)))
 
 
-async def test_a_person_orders_nothing_that_the_model_excludes(place: Place, file: Path) -> None:
-    async with place.at_work(offering(driving(robot_with(place, file)))) as person:
-        person.parts.store.put_bytes(DRIVE.encode())  # found without waiting for the robot's store
-        with pytest.raises(ObjectiveUnfit) as caught:
-            await person.demand(place.save(FAST, "fast.mcap"), model=DRIVE.cid)
-        assert caught.value.reason == "unfit-message"
+async def test_a_person_orders_nothing_that_the_model_excludes(market: Market, file: Path) -> None:
+    person = await market.person()
+    person.parts.store.put_bytes(DRIVE.encode())  # found without waiting for the robot's store
+    async with market.robot(offering(driving(Agent(file)))):
+        with raises_with(ObjectiveUnfit, reason="unfit-message"):
+            await market.demand(DRIVE.cid, FAST, by=person)
         assert person.orders() == []
-        contract = await person.demand(place.save(GOOD), model=DRIVE.cid)
-        assert (await contract.outcome()).success
+        assert_paid(await market.order(DRIVE.cid, GOOD, by=person))
 
 
-async def test_a_person_orders_nothing_of_a_model_that_is_not_valid(place: Place) -> None:
-    async with place.agent("person") as person:
-        model = person.parts.store.put_bytes(DRIVE.encode().rstrip())
-        with pytest.raises(InvalidDescription):
-            await person.order(place.save(GOOD), model=model)
-        assert person.orders() == []
+async def test_a_person_orders_nothing_of_a_model_that_is_not_valid(market: Market) -> None:
+    person = await market.person()
+    model = person.parts.store.put_bytes(DRIVE.encode().rstrip())
+    with pytest.raises(InvalidDescription):
+        await person.order(GOOD, model=model)
+    assert person.orders() == []
 
 
-async def test_a_person_orders_an_objective_that_is_not_available_to_it(place: Place) -> None:
-    async with place.agent("person") as person:
-        person.parts.store.put_bytes(DRIVE.encode())
-        order = await person.order(changed(title="Nobody has this").cid, model=DRIVE.cid)
-        assert person.orders() == [order]
+async def test_a_person_orders_an_objective_that_is_not_available_to_it(market: Market) -> None:
+    person = await market.person()
+    person.parts.store.put_bytes(DRIVE.encode())
+    order = await person.order(changed(title="Nobody has this").cid, model=DRIVE.cid)
+    assert person.orders() == [order]
