@@ -120,24 +120,6 @@ async def test_all_handlers_of_a_kind_are_called_and_a_failing_one_stops_nothing
     assert logged_facts(caplog, "handler-cancelled") == [{"handler": "be_cancelled"}] * 2
 
 
-async def test_a_late_agent_receives_open_orders(place: Place) -> None:
-    late = place.agent("robot")
-    heard: list[Demand] = []
-
-    @late.on_demand
-    async def hear(message: Verified[Demand]) -> None:
-        heard.append(message.message)
-
-    async with place.provider() as provider, place.agent("person") as person:
-        asking = asyncio.create_task(person.demand(cid_of_bytes(b"a job"), cost=5))
-        await until(lambda: len(provider.book) == 1)
-        async with late:
-            await until(lambda: heard)
-        asking.cancel()
-        await asyncio.wait([asking])
-    assert heard[0].cost == 5
-
-
 async def test_a_late_agent_receives_all_of_many_open_orders(place: Place) -> None:
     """More of them than what waits between Zenoh and the agent."""
     late = place.agent("robot", model="")

@@ -13,9 +13,10 @@ from mesh import Agent, Settings
 from mesh.agent.objectives import ObjectiveUnfit
 from mesh.content import ContentUnavailable
 from mesh.testing import Market, assert_paid
-from schemas import Empty, cid_of_bytes, cid_of_file
-from tests.support.market import MODEL, Place, offering
+from schemas import Empty, cid_of_bytes
+from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
+from tests.support.raising import raises_with
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -102,15 +103,25 @@ async def test_demands_with_unavailable_objectives_do_not_delay_others(market: M
             task.cancel()
 
 
-async def test_an_objective_may_be_examined_by_hand(place: Place) -> None:
-    async with going(place.agent("robot", fetch_timeout=60.0)) as robot, place.agent("person") as person:
-        fit, unfit = (place.save(objective((topic, Empty())), f"{topic[1:]}.mcap") for topic in ("/go", "/fly"))
-        for path in (fit, unfit):
-            await asyncio.to_thread(person.parts.store.put_file, path)
-        assert (await robot.examine(cid_of_file(fit))).count == 1
-        with pytest.raises(ObjectiveUnfit) as caught:
-            await robot.examine(cid_of_file(unfit))
-        assert caught.value.reason == "unknown-topic"
-    async with going(place.agent("robot", fetch_timeout=0.2)) as robot:
+async def test_an_objective_may_be_examined_by_hand(market: Market) -> None:
+    store = (await market.person()).parts.store
+    fit, unfit = (store.put_bytes(objective((topic, Empty()))) for topic in ("/go", "/fly"))
+    async with market.robot(going(Agent())) as robot:
+        assert (await robot.examine(fit)).count == 1
+        with raises_with(ObjectiveUnfit, cid=unfit, reason="unknown-topic", code="objective-unfit"):
+            await robot.examine(unfit)
+    async with market.robot(going(Agent(settings=Settings(fetch_timeout=0.2)))) as robot:
         with pytest.raises(ContentUnavailable):
             await robot.examine(MISSING)
+
+
+async def test_an_objective_damaged_in_the_store_is_fetched_again(market: Market) -> None:
+    content = objective(("/a", Empty()))
+    (await market.person()).parts.store.put_bytes(content)
+    async with market.robot(Agent()) as robot:
+        held = robot.parts.store.path(cid := robot.parts.store.put_bytes(content))
+        assert held is not None
+        held.chmod(0o600)
+        held.write_bytes(content.replace(b"/a", b"/b"))
+        found = await robot.examine(cid)
+    assert [topic.name for topic in found.topics] == ["/a"]

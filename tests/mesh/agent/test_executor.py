@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from mesh import Agent, Settings
 from mesh.agent.ledger import Phase
+from mesh.recording import open_objective
 from mesh.testing import assert_paid, assert_refunded
 from schemas import Empty, String, cid_of_file
-from tests.mesh.agent.executions import COST, doing_nothing, heard, recorded
+from tests.mesh.agent.restarts import COST
+from tests.mesh.agent.trades import doing_nothing
 from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import MILLISECOND, objective, timed
 from tests.support.waiting import until, until_found
@@ -59,10 +61,10 @@ async def test_the_recording_holds_the_played_messages_and_those_of_the_handler(
 
     async with market.robot(robot):
         contract = await market.demand(MODEL, [("/go", "one"), ("/go", "two")])
-        recording = await recorded(contract)
-        assert heard(recording, "/go") == [String("one").encode(), String("two").encode()]
-        assert heard(recording, "/done") == [String("did one").encode(), String("did two").encode()]
-        about = recording.metadata["aira"]
+        recording = (await market.outcome(contract)).recording
+        assert [message.value for message in recording.messages if message.role == "objective"] == ["one", "two"]
+        assert recording.published == [("/done", "did one"), ("/done", "did two")]
+        about = open_objective(await contract.recording()).metadata["aira"]
         assert about["liability"] == contract.address
         assert about["agent"] == robot.address
         assert about["objective"] == contract.liability.objective
@@ -169,17 +171,20 @@ async def test_a_phase_handler_may_end_the_job_that_has_just_started(market: Mar
         assert_refunded(await market.order(MODEL, [("/go", Empty())]))
 
 
-async def test_only_the_chosen_topics_are_recorded(market: Market) -> None:
-    robot = offering(Agent(MODEL, settings=Settings(recording_topics="/go, /led")))
+async def test_only_the_chosen_topics_are_recorded_and_all_are_played(market: Market) -> None:
+    robot, played = offering(Agent(MODEL, settings=Settings(recording_topics=" /go,/led ,"))), list[str]()
 
     @robot.on("*")
     async def anything(job: Job, message: Any) -> None:
+        assert job.playing is not None
+        played.append(job.playing.topic)
         job.publish("/led", "on")
         job.publish("/camera", b"a picture")
 
     async with market.robot(robot):
-        contract = await market.demand(MODEL, [("/go", Empty()), ("/quietly", Empty())])
-        assert {topic.name for topic in (await recorded(contract)).topics} == {"/go", "/led"}
+        outcome = await market.order(MODEL, [("/go", Empty()), ("/quietly", Empty())])
+    assert {message.topic for message in outcome.recording.messages} == {"/go", "/led"}
+    assert played == ["/go", "/quietly"]
 
 
 async def test_an_agent_without_executor_does_no_jobs(market: Market) -> None:
@@ -222,10 +227,10 @@ async def test_a_burst_of_played_messages_is_recorded_whole_and_heard_in_order(m
             f"aira/agent/{robot.address.lower()}/liability/*/objective/say",
             lambda sample: heard_by_listener.append(sample.payload.to_bytes()),
         )
-        recording = await recorded(await market.demand(MODEL, path, by=person))
+        outcome = await market.order(MODEL, path, by=person)
         await until(lambda: heard_by_listener)
         listener.undeclare()
-    assert heard(recording, "/say") == words
+    assert [message.payload for message in outcome.recording.messages] == words
     positions = [words.index(word) for word in heard_by_listener]
     assert positions == sorted(set(positions))
 

@@ -16,29 +16,24 @@ import pytest
 from mesh import Agent, Settings
 from mesh.agent.handlers import JobFailed
 from mesh.agent.ledger import Phase
-from mesh.recording import NOTE_TOPIC
 from mesh.role.database import LedgerUnusable
 from mesh.role.running import cause_of
 from mesh.testing import Market, assert_paid, assert_refunded
-from schemas import Empty, String, cid_of_bytes
-from tests.mesh.agent.executions import COST, doing_nothing, heard, recorded
+from schemas import Empty, cid_of_bytes
+from tests.mesh.agent.restarts import COST, notes
+from tests.mesh.agent.trades import doing_nothing
 from tests.support.market import MODEL, Place, offering, offering_unseen
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
     from mesh.agent.agent import Messages
     from mesh.agent.handlers import Job
-    from mesh.recording import Objective
 
 
 class Speed(msgspec.Struct):
     """What a handler asks for."""
 
     wheel: int
-
-
-def notes(recording: Objective) -> list[str]:
-    return [String.decode(payload).data for payload in heard(recording, NOTE_TOPIC)]
 
 
 async def refusal(market: Market, robot: Agent, content: Messages | str | Path) -> tuple[str, str]:
@@ -56,9 +51,8 @@ async def refusal(market: Market, robot: Agent, content: Messages | str | Path) 
         job = await robot.parts.ledger.job(contract.address)
         assert job is not None
         assert job.success is False
-        recording = await recorded(contract)
     assert job.note == f"{outcome.reason} [{outcome.code}]"
-    return job.note, "\n".join(notes(recording))
+    return job.note, "\n".join(notes(outcome))
 
 
 @pytest.mark.parametrize(

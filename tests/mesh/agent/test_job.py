@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh import AiraError
 from mesh.agent.handlers import WAITING, Job
 from mesh.agent.jobs import QUEUED
 from mesh.errors import ClosedError, InvalidKey
@@ -15,29 +14,12 @@ from mesh.recording import NOTE_TOPIC
 from schemas import InvalidPayload, LiabilityTopicKey, String
 from tests.mesh.agent.runs import AGENT, Making, making, session
 from tests.support.objectives import objective
-from tests.support.raising import raises_with
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from mesh.recording import Played
 
 __all__ = ["making", "session"]
-
-
-async def test_only_chosen_topics_are_recorded_and_all_are_played(making: Making) -> None:
-    run = making.run(objective(("/a", "a"), ("/b", "b")), topics=frozenset({"/a", "/said"}))
-    run.open()
-    run.publish("/said", "x")
-    run.publish("/unsaid", "y")
-    performed: list[str] = []
-
-    async def note(_: Job, message: Played) -> None:
-        performed.append(message.topic)
-
-    await run.play(note)
-    await run.close()
-    assert performed == ["/a", "/b"]
-    assert sorted(topic for topic, _, _ in making.recorded()) == ["/a", "/said"]
 
 
 async def test_the_position_counts_the_handled_messages(making: Making) -> None:
@@ -83,20 +65,6 @@ async def test_a_failing_handler_stops_the_playback_with_its_error_and_its_cause
         await run.play(fail)
     assert isinstance(caught.value.__cause__, KeyError)
     assert run.position == 0
-    await run.close()
-
-
-async def test_a_handler_that_ends_cancelled_fails_without_cancelling_the_playback(making: Making) -> None:
-    run = making.run(objective(("/a", "0"), ("/a", "1")))
-    run.open()
-
-    async def wait_for_what_is_cancelled(_: Job, message: Played) -> None:
-        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        future.cancel()
-        await future
-
-    with raises_with(AiraError, code="handler-cancelled"):
-        await run.play(wait_for_what_is_cancelled)
     await run.close()
 
 
@@ -150,14 +118,6 @@ async def test_a_run_that_is_closed_while_its_handler_waits_for_a_message_ends(m
     async with asyncio.timeout(60):
         await playing
     assert run.position == 1
-
-
-async def test_a_note_is_the_last_message(making: Making) -> None:
-    run = making.run()
-    run.open()
-    run.publish("/led", "on")
-    await run.close("the lamp is broken")
-    assert [topic for topic, _, _ in making.recorded()] == ["/led", NOTE_TOPIC]
 
 
 async def test_a_run_that_was_never_opened_can_be_closed_with_a_note(making: Making) -> None:

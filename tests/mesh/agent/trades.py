@@ -20,14 +20,19 @@ OBJECTIVE = cid_of_bytes(b"something to be done")
 JOB = [("/go", "there")]
 
 
-def working(robot: Agent) -> Agent:
-    """The same robot, which offers work for every demand and handles every message."""
+def doing_nothing(robot: Agent) -> Agent:
+    """The same robot, which handles every message."""
 
     @robot.on("*")
     async def nothing(job: Job, message: Any) -> None:
         pass
 
-    return offering_unseen(robot)
+    return robot
+
+
+def working(robot: Agent) -> Agent:
+    """The same robot, which offers work for every demand and handles every message."""
+    return offering_unseen(doing_nothing(robot))
 
 
 def job(place: Place) -> Path:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.content import Assembly, BlockRef, ContentCorrupt, ContentTooLarge, Store
-from mesh.content._blocks import MAX_DEPTH
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream
 from tests.support.content import block_of, leaf, parent
 
@@ -90,13 +89,6 @@ def test_a_block_that_is_not_a_file_is_refused(store: Store) -> None:
 def test_links_to_empty_parts_are_refused(store: Store) -> None:
     empty = leaf(b"")
     assert refused(store, [empty, parent([(empty, 0), (empty, 0)])]).reason == "empty-part"
-
-
-def test_a_tree_that_is_too_deep_is_refused(store: Store) -> None:
-    chain = [leaf(b"x")]
-    for _ in range(MAX_DEPTH + 1):
-        chain.append(parent([(chain[-1], 1)]))
-    assert refused(store, chain).reason == "too-deep"
 
 
 def test_an_inner_node_may_contain_bytes_of_the_file(store: Store) -> None:

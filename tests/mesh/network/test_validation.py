@@ -153,15 +153,6 @@ def test_the_same_message_is_accepted_once() -> None:
     )
 
 
-def test_equal_terms_of_generation_3_signed_by_two_people_are_two_messages() -> None:
-    checked, same = validator(), terms()
-    first, second = (signer.sign(Demand(**same, validator_fee=0)) for signer in (PERSON, STRANGER))
-
-    assert message_key(MARKET, first) == message_key(MARKET, second)
-    accepted = [check(checked, message) for message in (first, second)]
-    assert [one.signer for one in accepted if one is not None] == [PERSON.address, STRANGER.address]
-
-
 def test_a_rejected_message_may_be_accepted_later() -> None:
     head = HEAD
     checked, message = validator(head=lambda: head), demand(deadline=HEAD)
