@@ -55,6 +55,13 @@ async def asking(place: Place, agent: Agent) -> AsyncIterator[Asker]:
 
 
 @pytest.fixture
+async def person(place: Place) -> AsyncIterator[Agent]:
+    """The person's agent at work."""
+    async with place.agent("person") as person:
+        yield person
+
+
+@pytest.fixture
 async def opened(place: Place) -> AsyncIterator[Asker]:
     """The robot with services that are open to all."""
     async with asking(place, place.agent("robot", open_services=True)) as asker:

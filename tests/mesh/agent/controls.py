@@ -84,12 +84,6 @@ async def controlled(place: Place, robot: Agent) -> AsyncIterator[Control]:
         yield Control(network.session, robot)
 
 
-@pytest.fixture
-async def person(place: Place, control: Control) -> AsyncIterator[Agent]:
-    async with place.agent("person") as person:
-        yield person
-
-
 async def ready(control: Control, person: Agent, place: Place, *, step_ns: int = 0, cost: int = 0) -> Contract:
     """A contract whose objective the robot has examined."""
     path = place.save(objective(*(("/say", word) for word in WORDS), step_ns=step_ns))

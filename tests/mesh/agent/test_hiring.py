@@ -129,10 +129,9 @@ async def test_a_robot_is_named_by_its_name(place: Place) -> None:
         assert caught.value.code == "robot-unknown"
 
 
-async def test_who_is_not_there_is_an_error_at_once(place: Place) -> None:
-    async with place.agent("person") as person:
-        with pytest.raises(ServiceFailed, match="does not answer"):
-            await person.order(job(place), robot=place.address("robot"))
+async def test_who_is_not_there_is_an_error_at_once(place: Place, person: Agent) -> None:
+    with pytest.raises(ServiceFailed, match="does not answer"):
+        await person.order(job(place), robot=place.address("robot"))
 
 
 async def test_a_restarted_person_gets_the_robot_that_was_named(place: Place) -> None:
@@ -152,14 +151,13 @@ async def _contract(person: Agent, order: str) -> str | None:
     return None
 
 
-async def test_a_restarted_robot_is_asked_again(place: Place) -> None:
-    async with place.agent("person") as person:
-        async with working(place.agent("robot")) as robot:
-            order = await person.order(job(place), cost=4, robot=robot.address)
-        async with place.provider(), working(place.agent("robot")), asyncio.timeout(60):
-            contract = await order.contract()
-            assert contract.robot == place.address("robot")
-            assert (await contract.outcome()).success
+async def test_a_restarted_robot_is_asked_again(place: Place, person: Agent) -> None:
+    async with working(place.agent("robot")) as robot:
+        order = await person.order(job(place), cost=4, robot=robot.address)
+    async with place.provider(), working(place.agent("robot")), asyncio.timeout(60):
+        contract = await order.contract()
+        assert contract.robot == place.address("robot")
+        assert (await contract.outcome()).success
 
 
 async def test_an_offer_of_another_robot_is_not_taken(place: Place) -> None:

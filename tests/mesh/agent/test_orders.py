@@ -152,20 +152,19 @@ async def test_a_withdrawn_order_is_sent_no_more_and_its_withdrawal_until_the_de
 
 
 async def test_a_withdrawal_that_failed_on_the_disk_can_be_repeated(
-    place: Place, monkeypatch: pytest.MonkeyPatch
+    place: Place, monkeypatch: pytest.MonkeyPatch, person: Agent
 ) -> None:
-    async with place.agent("person") as person:
-        order = await person.order(OBJECTIVE, cost=300)
+    order = await person.order(OBJECTIVE, cost=300)
 
-        async def full(*_: object) -> None:
-            raise LedgerUnusable(place.folder, "database or disk is full")
+    async def full(*_: object) -> None:
+        raise LedgerUnusable(place.folder, "database or disk is full")
 
-        with monkeypatch.context() as patch:
-            patch.setattr(person.parts.ledger, "withdraw", full)
-            with pytest.raises(LedgerUnusable):
-                await order.withdraw()
-        assert (await order.withdraw()).state is OrderState.WITHDRAWN
-        assert await waiting(person) == ["withdrawal"]
+    with monkeypatch.context() as patch:
+        patch.setattr(person.parts.ledger, "withdraw", full)
+        with pytest.raises(LedgerUnusable):
+            await order.withdraw()
+    assert (await order.withdraw()).state is OrderState.WITHDRAWN
+    assert await waiting(person) == ["withdrawal"]
 
 
 async def test_a_provider_confirms_that_it_honours_a_withdrawal(place: Place) -> None:
@@ -201,19 +200,18 @@ async def created(place: Place, demand: Demand | Offer) -> str:
 
 
 @pytest.mark.usefixtures("without_permits")
-async def test_a_withdrawn_order_may_become_a_contract_all_the_same(place: Place) -> None:
+async def test_a_withdrawn_order_may_become_a_contract_all_the_same(place: Place, person: Agent) -> None:
     """A provider had the match already. The person's agent knows, and pays once."""
-    async with place.agent("person") as person:
-        order = await person.order(OBJECTIVE, cost=3)
-        await order.withdraw()
-        made = await created(place, order.message)
-        await until(lambda: not person.orders(OrderState.WITHDRAWN))
-        contract = await order.contract()
-        assert contract.address == made
-        await place.forget_blocks(1)
-        await until(lambda: [one.hash for one in person.orders(OrderState.WITHDRAWN)] == [order.hash])
-        assert person.orders() == [], "a reorganisation does not bring it back"
-        assert await waiting(person) == ["withdrawal"]
+    order = await person.order(OBJECTIVE, cost=3)
+    await order.withdraw()
+    made = await created(place, order.message)
+    await until(lambda: not person.orders(OrderState.WITHDRAWN))
+    contract = await order.contract()
+    assert contract.address == made
+    await place.forget_blocks(1)
+    await until(lambda: [one.hash for one in person.orders(OrderState.WITHDRAWN)] == [order.hash])
+    assert person.orders() == [], "a reorganisation does not bring it back"
+    assert await waiting(person) == ["withdrawal"]
 
 
 @pytest.mark.sample("generation")

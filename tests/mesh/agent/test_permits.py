@@ -188,19 +188,17 @@ async def test_a_fee_without_a_permit_is_not_charged(place: Place) -> None:
 
 
 @pytest.mark.parametrize("terms", [{"permit_fee": 1, "validator": "0x" + "11" * 20}, {"validator_fee": 1}])
-async def test_a_demand_has_one_fee(place: Place, terms: DemandTerms) -> None:
-    async with place.agent("person") as person:
-        with pytest.raises(InputError) as refused:
-            await person.order(job(place), **terms)
-        assert refused.value.code == "fee-misplaced"
+async def test_a_demand_has_one_fee(place: Place, terms: DemandTerms, person: Agent) -> None:
+    with pytest.raises(InputError) as refused:
+        await person.order(job(place), **terms)
+    assert refused.value.code == "fee-misplaced"
 
 
 @pytest.mark.usefixtures("without_permits")
-async def test_a_fee_for_a_permit_needs_a_token_with_permits(place: Place) -> None:
-    async with place.agent("person") as person:
-        with pytest.raises(InputError) as refused:
-            await person.order(job(place), cost=5, permit_fee=1)
-        assert refused.value.code == "token-without-permits"
+async def test_a_fee_for_a_permit_needs_a_token_with_permits(place: Place, person: Agent) -> None:
+    with pytest.raises(InputError) as refused:
+        await person.order(job(place), cost=5, permit_fee=1)
+    assert refused.value.code == "token-without-permits"
 
 
 REFUND_DELAY = 40

@@ -10,7 +10,7 @@ from mesh.recording import open_objective
 from schemas import Liability, String
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
 from schemas.rpc import Done, LiabilityRead, LiabilityRequest
-from tests.mesh.agent.controls import WORDS, Control, control, controlled, person, ready
+from tests.mesh.agent.controls import WORDS, Control, control, controlled, ready
 from tests.support.market import in_phase, offering
 from tests.support.waiting import until, until_heard
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mesh.agent.contracts import Contract
     from tests.support.market import Place
 
-__all__ = ["control", "person"]
+__all__ = ["control"]
 
 HOUR_NS = 3600 * 10**9
 
@@ -101,35 +101,33 @@ async def test_a_ready_job_may_be_restarted_too(place: Place, control: Control, 
     assert (await contract.outcome()).success
 
 
-async def test_resume_continues_a_job_after_a_restart_of_the_agent(place: Place) -> None:
-    async with place.agent("person") as person:
-        async with controlled(place, offering(place.agent("robot"))) as control:
-            contract = await ready(control, person, place)
-            await control.start(contract.address)
-            await control.played(contract.address)
-            await control.say(contract.address, "/state", "before")
-        async with controlled(place, place.agent("robot")) as control:
-            assert await control.ask("resume", LiabilityRequest(contract.address)) == Done(True)
-            await control.say(contract.address, "/state", "after")
-            await control.finish(contract.address)
-            assert (await contract.outcome()).success
-            assert await recorded(contract) == [
-                *(("/say", word) for word in WORDS),
-                ("/state", "before"),
-                ("/state", "after"),
-            ]
+async def test_resume_continues_a_job_after_a_restart_of_the_agent(place: Place, person: Agent) -> None:
+    async with controlled(place, offering(place.agent("robot"))) as control:
+        contract = await ready(control, person, place)
+        await control.start(contract.address)
+        await control.played(contract.address)
+        await control.say(contract.address, "/state", "before")
+    async with controlled(place, place.agent("robot")) as control:
+        assert await control.ask("resume", LiabilityRequest(contract.address)) == Done(True)
+        await control.say(contract.address, "/state", "after")
+        await control.finish(contract.address)
+        assert (await contract.outcome()).success
+        assert await recorded(contract) == [
+            *(("/say", word) for word in WORDS),
+            ("/state", "before"),
+            ("/state", "after"),
+        ]
 
 
-async def test_a_ready_job_can_be_started_right_after_the_agent_has_come_back(place: Place) -> None:
+async def test_a_ready_job_can_be_started_right_after_the_agent_has_come_back(place: Place, person: Agent) -> None:
     """Its objective may not have been examined again yet."""
-    async with place.agent("person") as person:
-        async with controlled(place, offering(place.agent("robot"))) as control:
-            contract = await ready(control, person, place)
-        robot = place.agent("robot")
-        async with place.provider(), robot:
-            await robot.runtime.executor.start(contract.address)
-            await robot.finish(contract.address, success=True)
-            assert (await contract.outcome()).success
+    async with controlled(place, offering(place.agent("robot"))) as control:
+        contract = await ready(control, person, place)
+    robot = place.agent("robot")
+    async with place.provider(), robot:
+        await robot.runtime.executor.start(contract.address)
+        await robot.finish(contract.address, success=True)
+        assert (await contract.outcome()).success
 
 
 async def test_read_returns_the_job_of_the_ledger(place: Place, control: Control, person: Agent) -> None:

@@ -10,14 +10,14 @@ from mesh.agent.ledger import Phase, WrongPhase
 from mesh.network import ServiceFailed
 from schemas import ZERO_ADDRESS, cid_of_bytes
 from schemas.rpc import Done, FinishLiability, LiabilityRead, LiabilityRequest
-from tests.mesh.agent.controls import Control, control, controlled, person, ready
+from tests.mesh.agent.controls import Control, control, controlled, ready
 from tests.support.market import in_phase, offering_unseen
 
 if TYPE_CHECKING:
     from mesh.agent.agent import Agent
     from tests.support.market import Place
 
-__all__ = ["control", "person"]
+__all__ = ["control"]
 
 
 def not_done(address: str, asked: str, phase: Phase | None) -> Done:

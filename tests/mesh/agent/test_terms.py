@@ -23,6 +23,7 @@ from tests.support.raising import raises_with
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from mesh import Agent
     from tests.support.market import Place
 
 
@@ -31,14 +32,13 @@ def blink(place: Place) -> Path:
     return place.save(objective(("/blink", Empty())))
 
 
-async def test_an_order_takes_amounts_as_texts_and_a_path_as_text(place: Place, blink: Path) -> None:
-    async with place.agent("person") as person:
-        order = await person.order(str(blink), cost="0.000001 XRT", permit_fee="2wn")
-        message: Any = order.message
-        assert (message.objective, message.cost, message.validator_fee) == (cid_of_file(blink), 1000, 2)
-        cid = await person.add(str(blink))
-        assert (await person.order(cid, cost="7 units")).message.cost == 7
-        assert (await person.order(blink, cost=42)).message.cost == 42
+async def test_an_order_takes_amounts_as_texts_and_a_path_as_text(blink: Path, person: Agent) -> None:
+    order = await person.order(str(blink), cost="0.000001 XRT", permit_fee="2wn")
+    message: Any = order.message
+    assert (message.objective, message.cost, message.validator_fee) == (cid_of_file(blink), 1000, 2)
+    cid = await person.add(str(blink))
+    assert (await person.order(cid, cost="7 units")).message.cost == 7
+    assert (await person.order(blink, cost=42)).message.cost == 42
 
 
 async def test_an_offer_takes_amounts_as_texts(place: Place, blink: Path) -> None:
@@ -49,17 +49,15 @@ async def test_an_offer_takes_amounts_as_texts(place: Place, blink: Path) -> Non
 
 
 @pytest.mark.parametrize("terms", [{"cost": "5 EUR"}, {"cost": "much"}, {"cost": 1.5}, {"validator_fee": "0.1wn"}])
-async def test_what_is_no_amount_is_refused(place: Place, blink: Path, terms: dict[str, Any]) -> None:
-    async with place.agent("person") as person:
-        with pytest.raises(InputError):  # an amount is wrong, or its token unknown
-            await person.order(blink, **terms)
+async def test_what_is_no_amount_is_refused(blink: Path, terms: dict[str, Any], person: Agent) -> None:
+    with pytest.raises(InputError):  # an amount is wrong, or its token unknown
+        await person.order(blink, **terms)
 
 
-async def test_what_is_neither_cid_nor_file_is_refused(place: Place, tmp_path: Path) -> None:
-    async with place.agent("person") as person:
-        for missing in ("blink.mcap", tmp_path / "none.mcap", tmp_path, ""):
-            with raises_with(InputError, code="not-an-objective", match=re.escape(repr(str(missing)))):
-                await person.order(missing)
+async def test_what_is_neither_cid_nor_file_is_refused(tmp_path: Path, person: Agent) -> None:
+    for missing in ("blink.mcap", tmp_path / "none.mcap", tmp_path, ""):
+        with raises_with(InputError, code="not-an-objective", match=re.escape(repr(str(missing)))):
+            await person.order(missing)
 
 
 async def test_a_file_that_no_robot_can_play_is_refused(place: Place, tmp_path: Path) -> None:

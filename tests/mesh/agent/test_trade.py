@@ -21,6 +21,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from mesh import Agent
     from mesh.agent.handlers import Job
     from schemas import Liability, Verified
 
@@ -132,14 +133,13 @@ async def test_a_contract_may_end_while_it_is_read(place: Place, monkeypatch: py
 
 
 @pytest.mark.usefixtures("without_permits")
-async def test_the_allowance_of_the_factory_covers_all_open_demands(place: Place) -> None:
-    async with place.agent("person") as person:
-        demands = [asyncio.create_task(person.demand(OBJECTIVE, cost=cost)) for cost in (7000, 500)]
-        await until_found(lambda: all_posted(person, 2))
-        assert await allowance(place, "person") >= 7500
-        for demand in demands:
-            demand.cancel()
-        await asyncio.wait(demands)
+async def test_the_allowance_of_the_factory_covers_all_open_demands(place: Place, person: Agent) -> None:
+    demands = [asyncio.create_task(person.demand(OBJECTIVE, cost=cost)) for cost in (7000, 500)]
+    await until_found(lambda: all_posted(person, 2))
+    assert await allowance(place, "person") >= 7500
+    for demand in demands:
+        demand.cancel()
+    await asyncio.wait(demands)
 
 
 async def test_short_funds_raise_before_anything_is_sent(place: Place) -> None:
@@ -177,14 +177,13 @@ async def test_a_refused_demand_does_not_count(place: Place) -> None:
         await asyncio.wait([demand])
 
 
-async def test_a_cancelled_demand_is_withdrawn(place: Place) -> None:
-    async with place.agent("person") as person:
-        demand = asyncio.create_task(person.demand(OBJECTIVE))
-        await posted(person)
-        demand.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await demand
-        assert await waiting(person) == ["withdrawal"]
+async def test_a_cancelled_demand_is_withdrawn(person: Agent) -> None:
+    demand = asyncio.create_task(person.demand(OBJECTIVE))
+    await posted(person)
+    demand.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await demand
+    assert await waiting(person) == ["withdrawal"]
 
 
 async def test_a_demand_that_is_cancelled_when_it_has_just_become_a_contract_is_cancelled(place: Place) -> None:
@@ -317,11 +316,10 @@ async def test_a_contract_that_has_ended_has_its_outcome_at_once(place: Place) -
         assert len(later.runtime.trader.contracts) == 0
 
 
-async def test_waiting_for_an_address_that_is_not_a_contract_raises(place: Place) -> None:
-    async with place.agent("person") as person:
-        with pytest.raises(NotALiability):
-            await person.contract(place.address("robot"))
-        assert len(person.runtime.trader.contracts) == 0
+async def test_waiting_for_an_address_that_is_not_a_contract_raises(place: Place, person: Agent) -> None:
+    with pytest.raises(NotALiability):
+        await person.contract(place.address("robot"))
+    assert len(person.runtime.trader.contracts) == 0
 
 
 async def test_cancelling_one_wait_for_an_outcome_does_not_affect_others(place: Place) -> None:
