@@ -10,21 +10,11 @@ import pytest
 
 from peers.recipes import CERTIFICATES
 from tests.support.containers import BASE_IMAGE, Engine, engine
-from tests.support.peers import require
 from tests.support.waiting import wait_until
 
 __all__ = ["engine"]
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [("dockerd", "Docker version"), ("docker", "Docker version"), ("debootstrap", "debootstrap 1.")],
-)
-def test_the_requirements_of_containers_are_installed(name: str, words: str) -> None:
-    command = [str(require(name)), "--version"]
-    assert subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.startswith(words)
 
 
 RUNS_DOCKER = """

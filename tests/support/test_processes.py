@@ -46,12 +46,6 @@ def test_a_server_runs_inside_with_and_its_folder_is_removed_afterwards() -> Non
     assert not folder.exists()
 
 
-async def test_a_server_is_an_async_context_too() -> None:
-    async with Scripted(SERVE) as server:
-        assert answers(server.port)
-    assert not answers(server.port)
-
-
 def test_a_server_starts_again_on_the_same_port_and_folder() -> None:
     with Scripted(SERVE) as server:
         (server.folder / "state").write_text("kept")
@@ -104,13 +98,6 @@ def test_a_paused_server_stops_without_being_killed() -> None:
     started = time.monotonic()
     server.close()
     assert time.monotonic() - started < server.stop_seconds
-
-
-def test_a_paused_server_continues_after_resume() -> None:
-    with Scripted(SERVE) as server:
-        server.pause()
-        server.resume()
-        assert answers(server.port)
 
 
 def test_starting_twice_is_refused() -> None:
