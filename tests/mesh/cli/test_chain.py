@@ -239,13 +239,6 @@ def test_a_chain_without_the_contracts_is_one_clear_line_in_every_command(bare: 
         assert "aira chain deploy" in hint, command
 
 
-@pytest.mark.parametrize("command", [ON_A_CHAIN[0], ON_A_CHAIN[8], ON_A_CHAIN[12], ("chain", "status")])
-def test_an_unreachable_node_is_one_clear_line(served: ServedChain, command: tuple[str, ...]) -> None:
-    nowhere = f"http://127.0.0.1:{free_port()}"
-    hint = refused(served.aira(*command, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
-    assert "aira chain up" in hint
-
-
 def test_a_server_that_is_no_node_is_one_clear_line(served: ServedChain) -> None:
     refused(served.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER="localhost"), ConfigurationError, "localhost")
     refused(served.aira("xrt", "balance", AIRA_ENS_CONTRACT="0x12"), InvalidAddress, "0x12")

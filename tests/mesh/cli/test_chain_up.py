@@ -6,7 +6,6 @@ import asyncio
 import json
 import os
 import signal
-import socket
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -135,15 +134,6 @@ def test_the_embedded_chain_has_no_state_file(tmp_path: Path) -> None:
     state = ("--state", tmp_path / "chain.json")
     assert "--anvil FILE" in refused(failing(*state, PATH=str(tmp_path)), "anvil-missing", "--state")
     refused(failing(*state, "--engine", "embedded"), "anvil-missing", "--engine embedded")
-
-
-@pytest.mark.parametrize("engine", ["anvil", "embedded"])
-def test_a_taken_port_is_one_clear_line(tmp_path: Path, engine: str, on_path: dict[str, str]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        done = failing("--engine", engine, "--port", str(port), "--data-dir", tmp_path, **on_path)
-        hint = refused(done, ConfigurationError, f"127.0.0.1:{port}", "Address already in use")
-        assert "--port" in hint
 
 
 def test_an_invalid_state_file_is_one_clear_line(tmp_path: Path) -> None:

@@ -54,19 +54,9 @@ def test_a_dash_reads_the_standard_input() -> None:
     assert cid("-", given=CONTENT).stdout == f"{cid_of_bytes(CONTENT)}\n"
 
 
-def test_a_missing_file_is_one_clear_line(tmp_path: Path) -> None:
-    missing = tmp_path / "missing"
-    done = cid(missing)
-    refused(done, "file-unreadable", missing, "No such file or directory")
-
-
 def test_a_folder_is_one_clear_line(tmp_path: Path) -> None:
     done = cid(tmp_path)
     refused(done, "file-unreadable", tmp_path, "Is a directory")
-
-
-def test_without_files_the_missing_argument_is_named() -> None:
-    refused(cid(), "invalid-usage", "FILES")
 
 
 def test_the_script_and_the_module_do_the_same(file: Path) -> None:

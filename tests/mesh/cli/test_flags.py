@@ -77,12 +77,6 @@ def test_seconds_are_finite(option: str, value: str) -> None:
     refused(done, "invalid-option", option[2:].replace("-", "_"))
 
 
-def test_an_unknown_flag_suggests_similar_ones() -> None:
-    done = aira("settings", "--fetch-timeot", "3")
-    assert done.exit_code == 2
-    assert "--fetch-timeout" in done.stderr
-
-
 @pytest.mark.parametrize("command", ["demand", "peers", "provider", "router", "settings", "status", "up", "watch"])
 def test_an_invalid_variable_is_one_clear_line_in_every_command_with_settings(command: str) -> None:
     needed = ("--model", CID, "--objective", CID) if command == "demand" else ()

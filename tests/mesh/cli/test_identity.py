@@ -192,14 +192,6 @@ def test_an_invalid_member_is_one_clear_line(
     assert not (tmp_path / "arm").exists()
 
 
-def test_an_unknown_role_lists_the_roles(tmp_path: Path, site: Path) -> None:
-    done = new(tmp_path / "arm", site, "--address", ARM, "--role", "king")
-
-    assert done.returncode == 2
-    assert "'king' is not one of" in done.stderr
-    assert "'watcher'" in done.stderr
-
-
 def test_errors_name_files_that_are_no_identity(tmp_path: Path, site: Path) -> None:
     folder = tmp_path / "arm"
     made(folder, site, "--address", ARM, "--role", "agent")

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import mesh
 from mesh.cli import COMMANDS, main
 from mesh.cli.lazy import LazyGroup
-from tests.support.commands import refused, run
+from tests.support.commands import run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -62,20 +62,6 @@ def test_a_group_lists_its_commands_with_a_whole_line_each(group: str, names: tu
     lines = CliRunner().invoke(main, [group, "--help"]).stdout.partition("Commands:\n")[2].splitlines()
     assert [line.split()[0] for line in lines] == sorted(names)
     assert not [line for line in lines if line.endswith("...")]
-
-
-@pytest.mark.parametrize(("typed", "meant"), [("dmeo", "demo"), ("demnd", "demand"), ("egde", "edge")])
-def test_a_typing_error_suggests_the_nearest_command(typed: str, meant: str) -> None:
-    done = CliRunner().invoke(main, [typed])
-    assert done.exit_code == 2
-    assert f"no such command {typed!r}; did you mean {meant!r}?" in done.stderr
-
-
-def test_a_word_near_no_command_gets_no_suggestion() -> None:
-    done = CliRunner().invoke(main, ["xyzzy"])
-    assert done.exit_code == 2
-    refused(done, "invalid-usage", "'xyzzy'")
-    assert "did you mean" not in done.stderr
 
 
 def test_an_interrupt_while_a_command_is_loaded_ends_with_130(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,13 +82,6 @@ def test_a_missing_agent_is_one_clear_line(router: EmbeddedRouter, options: tupl
     assert refused(done, "no-answer", f"{who} does not answer").startswith("`aira peers` shows who is present")
 
 
-@pytest.mark.parametrize(
-    "wrong", [("0x12",), (ROBOT.address, "--liability", "0x12"), (ROBOT.address, "--level", "loud")]
-)
-def test_invalid_arguments_are_refused_before_connecting(wrong: tuple[str, ...]) -> None:
-    assert invoke("logs", *wrong).returncode == 2
-
-
 def test_ctrl_c_stops_waiting_for_an_answer(router: EmbeddedRouter) -> None:
     """An agent that never answers."""
     queries: list[zenoh.Query] = []

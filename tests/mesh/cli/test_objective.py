@@ -15,7 +15,7 @@ from mesh.cli.output import format_size
 from mesh.content import Store
 from mesh.errors import AiraError, InvalidCid
 from mesh.recording import Played, Recorder, RecordingAbout, open_objective, pack
-from mesh.recording._source import NotARecording, RecordingError
+from mesh.recording._source import RecordingError
 from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import JSON, STRING, Empty, String, encode_value
 from tests.mesh.cli.calls import call
@@ -246,11 +246,6 @@ def test_without_matplotlib_the_error_says_how_to_install_it(
     assert "pip install '.[plot]'" in done.stderr
 
 
-def test_a_file_that_is_no_recording_can_not_be_shown(tmp_path: Path) -> None:
-    (tmp_path / "text").write_bytes(b"hello")
-    refused(call("show", tmp_path / "text"), NotARecording, "text")
-
-
 def test_a_bag_is_converted_to_a_file_next_to_it(tmp_path: Path) -> None:
     bag = tmp_path / "it.bag"
     sent = [BagMessage("/blink", string(f"{n}"), T0 + n) for n in range(3)]
@@ -284,13 +279,6 @@ def test_a_file_that_robots_refuse_is_added_with_an_error(tmp_path: Path, sound:
     assert done.exit_code == 2
     assert done.stderr.rstrip().endswith(f"[{ObjectiveUnfit.code}]")
     assert [added["reason"] for added in json.loads(done.stdout)] == ["not-a-recording", ""]
-
-
-@pytest.mark.parametrize("setting", ["objective_size_limit", "objective_expanded_limit"])
-def test_a_file_over_a_limit_names_the_setting(sound: Path, setting: str) -> None:
-    done = call("add", sound, f"--{setting.replace('_', '-')}", "10")
-    assert done.exit_code == 2
-    assert setting in done.stderr.splitlines()[-1]
 
 
 def test_adding_without_an_account_says_that_no_agent_serves_the_file(tmp_path: Path, sound: Path) -> None:

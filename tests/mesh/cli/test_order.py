@@ -16,7 +16,7 @@ from mesh.network import Endpoints, Network
 from schemas import RejectKey, verify
 from schemas.signing import Rejection
 from tests.mesh.cli.site import MODEL, Site, settings_of
-from tests.support.commands import coroutine, invoke
+from tests.support.commands import coroutine
 from tests.support.raising import raises_with
 from tests.support.waiting import until
 
@@ -99,11 +99,6 @@ async def test_the_provider_confirms_a_withdrawal_and_does_not_match_the_order(
             assert (await contract.outcome()).success
             assert [order.hash for order in person.orders(OrderState.WITHDRAWN)] == [old.hash]
     assert done == ["wanted"]
-
-
-def test_withdraw_needs_hashes_or_all() -> None:
-    assert invoke("order", "withdraw").returncode == 2
-    assert invoke("order", "withdraw", "ab", "--all").returncode == 2
 
 
 async def test_a_rejection_is_told_with_what_it_means(site: Site, capsys: pytest.CaptureFixture[str]) -> None:

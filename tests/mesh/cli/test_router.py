@@ -177,12 +177,6 @@ def test_acl_lists_the_rights_of_each_member_and_none_of_revoked_ones(site: Site
     assert [subject["id"] for subject in rules["subjects"]] == [ARM]
 
 
-def test_acl_without_a_roster_is_an_error_with_a_hint() -> None:
-    done = invoke("router", "acl", "--check")
-
-    assert "--roster" in refused(done, "roster-missing")
-
-
 async def test_config_configures_zenohd_as_the_same_router(site: Site, tmp_path: Path) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     screen = site.enlist(Member(name="screen", address=ANN, roles=("watcher",)))

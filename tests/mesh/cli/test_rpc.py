@@ -76,30 +76,10 @@ def test_invalid_arguments_are_one_clear_line(service: str, arguments: list[str]
     assert caught.value.hint == hint
 
 
-def test_an_unknown_service_suggests_the_nearest() -> None:
-    with raises_with(InputError, code="unknown-service", match="'strat'") as caught:
-        request_of("strat", [])
-    assert "did you mean start?" in caught.value.hint
-
-
-def test_a_service_near_no_other_suggests_none() -> None:
-    with raises_with(InputError, code="unknown-service", match="'nosuch'") as caught:
-        request_of("nosuch", [])
-    assert "did you mean" not in caught.value.hint
-    assert "--list" in caught.value.hint
-
-
 def test_a_number_beyond_256_bits_is_refused() -> None:
     for value in (str(MOST + 1), "9" * 5000):
         with pytest.raises(InputError, match=r"^eth/transfer: "):
             request_of("eth/transfer", ["to=x", f"value={value}"])
-
-
-@pytest.mark.parametrize("arguments", [[], [LIGHTHOUSE]])
-def test_without_a_service_the_error_lists_what_is_needed(arguments: list[str]) -> None:
-    done = CliRunner().invoke(main, ["rpc", *arguments])
-    assert done.exit_code == 2
-    assert all(word in done.stderr for word in ("ADDRESS", "SERVICE", "--list"))
 
 
 def test_the_list_has_every_service_with_its_arguments() -> None:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain.errors import NodeUnreachable, UnknownName
-from mesh.errors import AiraError, ConfigurationError, InputError, NetworkUnavailable
+from mesh.chain.errors import UnknownName
+from mesh.errors import AiraError, InputError
 from mesh.recording import open_objective
 from schemas import cid_of_file
 from tests.support.commands import AIRA, SOON, Interrupted, Serving, aira, invoke, refused
@@ -189,10 +189,6 @@ def test_ctrl_c_stops_waiting_for_a_contract(development: Development) -> None:
     assert interrupted.seconds < SOON
 
 
-def test_a_demand_without_keyfile_is_one_clear_line() -> None:
-    refused(invoke("demand", *ORDER, SOME_CID), "account-not-set")
-
-
 @pytest.mark.parametrize(
     ("order", "error", "value"),
     [
@@ -214,35 +210,6 @@ def test_an_unwritable_recording_is_an_error_before_anything_is_paid(development
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "result.mcap"
     development.refused("file-unwritable", *ORDER, SOME_CID, "--out", out, value=out)
-
-
-def test_a_wrong_password_is_one_clear_line(development: Development, tmp_path: Path) -> None:
-    (tmp_path / "password").write_text("guessed\n")
-    variables = development.variables("person") | {"AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "password")}
-    for command in (("demand", *ORDER, SOME_CID), ("provider",)):
-        refused(invoke(*command, **variables), "wrong-password")
-
-
-def test_an_unreachable_router_is_one_clear_line(development: Development) -> None:
-    nowhere = f"tcp/127.0.0.1:{free_port()}"
-    variables = development.variables("person") | {"AIRA_CONNECT": nowhere, "AIRA_CONNECT_TIMEOUT": "0.2"}
-    refused(invoke("demand", *ORDER, SOME_CID, **variables), NetworkUnavailable, nowhere)
-
-
-def test_an_unreachable_node_is_one_clear_line(development: Development) -> None:
-    nowhere = f"http://127.0.0.1:{free_port()}"
-    variables = development.variables("person") | {"AIRA_WEB3_HTTP_PROVIDER": nowhere}
-    refused(invoke("provider", **variables), NodeUnreachable, nowhere)
-
-
-def test_a_taken_port_is_one_clear_line(development: Development, tmp_path: Path) -> None:
-    refused(invoke("router", "--listen", development.endpoint), ConfigurationError, development.endpoint)
-    done = invoke("chain", "up", "--port", str(development.port), "--data-dir", tmp_path)
-    refused(done, ConfigurationError, f"127.0.0.1:{development.port}")
-
-
-def test_an_invalid_endpoint_is_one_clear_line() -> None:
-    refused(invoke("router", "--listen", "localhost:7447"), ConfigurationError, "localhost:7447")
 
 
 def test_ctrl_c_stops_waiting_for_a_router() -> None:

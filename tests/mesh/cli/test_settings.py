@@ -85,13 +85,6 @@ def test_an_invalid_setting_is_one_clear_line(arguments: list[str], value: str) 
     refused(done, ConfigurationError, value)
 
 
-def test_an_unknown_option_in_the_file_suggests_the_nearest(tmp_path: Path) -> None:
-    file = tmp_path / "aira.toml"
-    file.write_text('keyfle = "robot.json"\n')
-    done = settings("--config", file)
-    assert "'keyfile'" in refused(done, "unknown-option", "'keyfle'", file)
-
-
 def test_every_option_is_a_flag_with_its_meaning_and_default() -> None:
     text = " ".join(settings("--help").stdout.split())
     for name in OPTIONS:

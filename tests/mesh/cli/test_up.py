@@ -8,13 +8,11 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import pytest
-from click.testing import CliRunner
 
 from mesh.chain import Node
-from mesh.cli import main
 from mesh.dev.page import PAGE_PORT
 from tests.mesh.cli.served_chain import columns
-from tests.support.commands import AIRA, Serving, aira, refused
+from tests.support.commands import AIRA, Serving, aira
 from tests.support.peers import require
 from tests.support.ports import free_port
 from tests.support.waiting import wait_until
@@ -49,12 +47,6 @@ async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
                 first_blocks.append(await node.header(1))
     assert first_blocks[0] == first_blocks[1]
     assert kept_providers(tmp_path) == 2  # of one chain, for the market of each generation
-
-
-def test_a_state_file_without_anvil_is_one_clear_line(tmp_path: Path) -> None:
-    options = ["--engine", "embedded", "--state", str(tmp_path / "chain.json")]
-    done = CliRunner().invoke(main, ["up", "--listen", f"tcp/127.0.0.1:{free_port()}", *options])
-    refused(done, "anvil-missing", "--state")
 
 
 def test_the_page_is_at_a_free_port_if_the_usual_one_is_taken(tmp_path: Path) -> None:

@@ -13,22 +13,19 @@ import msgspec
 import pytest
 
 from mesh.cli.watch import watch
-from mesh.errors import InputError, NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network, Reading, message_key
 from mesh.recording import open_objective
-from mesh.settings import Settings
 from mesh.watching import JobEvent, ReadingFetcher
 from schemas import ReadingKey, RejectKey, Result, encode, message_hash, verify_message
 from schemas.payloads import decode_value
 from schemas.signing import Rejection
 from tests.mesh.watching.test_market import EVENT, JOB
-from tests.support.commands import AIRA, environment, invoke, refused
+from tests.support.commands import AIRA, environment
 from tests.support.jurors import Juror
 from tests.support.log_events import logged_events
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.orders import CONTRACT, MARKET, PERSON, ROBOT, STRANGER, demand, result
-from tests.support.raising import raises_with
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
@@ -36,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.agent import Agent
+    from mesh.settings import Settings
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
 
@@ -134,11 +132,6 @@ async def test_an_order_that_was_open_before_is_printed_when_asked_for(place: Pl
         demanding.cancel()
 
 
-async def test_a_model_that_is_not_a_cid_is_an_error() -> None:
-    with raises_with(InputError, code="not-a-model"):
-        await watch(Settings(), "blink", with_open=False, as_json=False)
-
-
 @pytest.fixture
 def process(router: EmbeddedRouter) -> Iterator[subprocess.Popen[str]]:
     """`aira watch` as another process, and its output in pipes."""
@@ -204,12 +197,6 @@ def test_the_loss_and_return_of_the_router_are_printed(router: EmbeddedRouter, p
     assert process.stderr.readline() == "aira: lost the router; waiting for it\n"
     router.start()
     assert process.stderr.readline() == "aira: connected to the router again\n"
-
-
-@pytest.mark.parametrize("command", [["watch"], ["peers"], ["status"], ["rpc", CONTRACT, "eth/accounts"]])
-def test_an_unreachable_router_is_one_clear_line(command: list[str]) -> None:
-    done = invoke(*command, AIRA_CONNECT="tcp/127.0.0.1:1", AIRA_CONNECT_TIMEOUT="0.3")
-    assert "aira router" in refused(done, NetworkUnavailable, "tcp/127.0.0.1:1", "0.3 s")
 
 
 async def test_the_readings_of_a_result_without_a_contract_are_printed(place: Place, printed: PrintedOutput) -> None:

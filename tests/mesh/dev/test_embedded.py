@@ -15,7 +15,6 @@ from web3.exceptions import Web3RPCError
 from mesh.chain import Account
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import deploy_market
-from mesh.errors import ClosedError
 from tests.mesh.dev.web3_client import web3_of
 
 if TYPE_CHECKING:
@@ -313,10 +312,3 @@ async def test_the_event_loop_is_not_blocked_by_the_chain(node: EmbeddedChain) -
     ticking.cancel()
     assert ticks >= 5
     assert chain_threads() == before
-
-
-async def test_a_closed_embedded_chain_raises() -> None:
-    async with EmbeddedChain() as node:
-        pass
-    with pytest.raises(ClosedError):
-        await node.mine()

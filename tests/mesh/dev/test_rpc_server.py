@@ -10,7 +10,6 @@ import pytest
 from aiohttp import web
 
 from mesh.dev import EmbeddedChain, JsonRpcServer
-from mesh.errors import PortUnavailable
 from tests.support.development import serve_embedded
 
 if TYPE_CHECKING:
@@ -89,14 +88,6 @@ async def test_web_pages_are_refused(url: str) -> None:
 async def test_a_loopback_server_refuses_other_host_names(url: str) -> None:
     request = {"jsonrpc": "2.0", "id": 1, "method": "eth_chainId", "params": []}
     assert (await _post(url, request, Host="evil.example:80"))[0] == 403
-
-
-async def test_a_taken_port_is_an_error(url: str) -> None:
-    port = int(url.rpartition(":")[2])
-    with pytest.raises(PortUnavailable) as caught:
-        async with serve_embedded(port=port):
-            pass
-    assert (caught.value.code, caught.value.port) == ("port-unavailable", port)
 
 
 async def test_a_websocket_that_is_being_opened_lets_the_server_end(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from tests.mesh.market.local_market import LocalMarket
 
-ESTIMATE = "eth_estimateGas"
-
 
 async def test_a_withdrawn_order_leaves_the_book_and_is_refused(local: LocalMarket) -> None:
     async with local.provider() as provider:

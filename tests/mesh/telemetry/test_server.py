@@ -159,16 +159,6 @@ def test_a_failure_is_answered_without_its_details(caplog: pytest.LogCaptureFixt
     assert SECRET in caplog.text
 
 
-def test_a_taken_port_is_a_configuration_error(url: str) -> None:
-    taken = url.removeprefix("http://")
-
-    with raises_with(ConfigurationError, code="metrics-not-served") as raised:
-        open_server(taken, some, lambda: WELL).__enter__()
-
-    assert taken in str(raised.value)
-    assert "--metrics-listen" in raised.value.hint
-
-
 @pytest.mark.parametrize("host", ["192.0.2.1", "no..host", "a" * 70])
 def test_an_unusable_host_is_a_configuration_error(host: str) -> None:
     listen = f"{host}:{free_port()}"
