@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from mcp_types import ElicitRequestFormParams, ElicitResult
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from tests.bridges.mcp.world import PRICE, World, content, ended
-from tests.support.market import Place
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from pathlib import Path
-
-    from mesh.testing import MarketChain
-    from tests.support.routers import EmbeddedRouter
 
 BOTH = pytest.mark.parametrize("version", [LATEST_MODERN_VERSION, LATEST_HANDSHAKE_VERSION])
-
-
-@pytest.fixture
-async def world(market_chain: MarketChain, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[World]:
-    async with World(Place(market_chain, router.endpoint, tmp_path), tmp_path) as world:
-        yield world
 
 
 class Person:

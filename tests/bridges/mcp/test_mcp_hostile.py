@@ -17,10 +17,9 @@ from mcp_types import ElicitResult
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from mesh.signer.protocol import SignerError
+from mesh.testing import Market
 from tests.bridges.mcp.hostile import CALLS, HIDDEN_TOOLS, STORIES, URIS, Attempt, Story, table
 from tests.bridges.mcp.world import INJECTION, PRICE, World, content, ended
-from tests.support.market import Place
-from tests.support.routers import EmbeddedRouter
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -36,11 +35,10 @@ PAGE = Path(__file__).parents[3] / "docs" / "reference" / "door-attacks.md"
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def world(market_chain: MarketChain, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[World]:
     folder = tmp_path_factory.mktemp("hostile")
-    with EmbeddedRouter() as router:
-        async with World(Place(market_chain, router.endpoint, folder), folder) as world:
-            world.write_policy(hour="60 XRT")
-            await world.owner.use_policy()
-            yield world
+    async with Market(market_chain) as market, World(market, folder) as world:
+        world.write_policy(hour="60 XRT")
+        await world.owner.use_policy()
+        yield world
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")

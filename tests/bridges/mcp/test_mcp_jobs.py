@@ -2,26 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from tests.bridges.mcp.world import PRICE, World, content, ended
-from tests.support.market import Place
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from pathlib import Path
-
-    from mesh.testing import MarketChain
-    from tests.support.routers import EmbeddedRouter
-
-
-@pytest.fixture
-async def world(market_chain: MarketChain, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[World]:
-    async with World(Place(market_chain, router.endpoint, tmp_path), tmp_path) as world:
-        yield world
 
 
 @pytest.mark.parametrize("version", [LATEST_MODERN_VERSION, LATEST_HANDSHAKE_VERSION])

@@ -6,29 +6,15 @@ import asyncio
 import os
 import signal
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from tests.bridges.mcp.world import PRICE, World, content, ended
-from tests.support.market import Place
 from tests.support.waiting import until_found
 
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from pathlib import Path
-
-    from mesh.testing import MarketChain
-    from tests.support.routers import EmbeddedRouter
-
 SLOW = [{"topic": "/count", "value": {"count": 3, "mode": "fine"}}]
-
-
-@pytest.fixture
-async def world(market_chain: MarketChain, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[World]:
-    async with World(Place(market_chain, router.endpoint, tmp_path), tmp_path) as world:
-        yield world
 
 
 @pytest.mark.parametrize("state", ["asked", "waiting", "running"])
