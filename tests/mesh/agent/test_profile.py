@@ -10,29 +10,29 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from mesh import Agent, ConfigurationError
+from mesh import Agent, ConfigurationError, Settings
 from mesh.agent._profile import INTERVAL
 from mesh.agent.handlers import Job, JobFailed
-from mesh.network import Endpoints, Network
 from mesh.watching.robots import Robot, RobotDirectory
 from schemas import Empty, ProfileKey, Signer, cid_of_bytes
 from schemas.profiles import LARGEST_PICTURE, Handover, Profile
-from tests.mesh.agent.test_own_model import DRIVE, Move, driving
-from tests.support.market import MODEL, Place, offering
-from tests.support.objectives import objective
+from tests.mesh.agent.test_own_model import DRIVE, Move, driving, file, saved
+from tests.support.market import MODEL, offering
 from tests.support.raising import raises_with
 from tests.support.waiting import until, until_answered, until_found, until_heard
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import zenoh
 
+    from mesh.testing import Market
+
+__all__ = ["file"]
+
 PNG = b"\x89PNG\r\n\x1a\n and more"
-LIFT = {"name": "Lift 1", "about": "Lifts 1.2 t.", "place": "Hall 3"}
-
-
-def robot_at(at: Place, model: Any = MODEL, **settings: Any) -> Agent:
-    account, chain = at.market.accounts["robot"], at.chains["robot"]
-    return Agent(model, settings=at.settings("robot", **settings), account=account, chain=chain)
+DRIVING = [("/drive", Move(1.0)), ("/stop", Empty())]
+LIFT: dict[str, Any] = {"name": "Lift 1", "about": "Lifts 1.2 t.", "place": "Hall 3"}
 
 
 async def profile_of(robot: Agent, asker: Agent) -> Profile:
@@ -43,10 +43,12 @@ async def profile_of(robot: Agent, asker: Agent) -> Profile:
     return found
 
 
-async def test_a_robot_that_ends_while_its_profile_changes_ends(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_robot_that_ends_while_its_profile_changes_ends(
+    market: Market, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`asyncio.wait_for` before Python 3.12 loses a cancellation that comes together with what it waits for."""
     monkeypatch.setattr("mesh.agent._profile.INTERVAL", 0.0)
-    async with robot_at(place) as robot:
+    async with market.robot(offering(Agent(MODEL))) as robot:
         profile = robot.runtime.profile
         watching = asyncio.create_task(profile.run())
         await until(lambda: len(profile._changed._waiters) == 1)
@@ -56,10 +58,9 @@ async def test_a_robot_that_ends_while_its_profile_changes_ends(place: Place, mo
         assert watching.cancelled()
 
 
-async def test_a_robot_says_what_its_settings_and_its_model_say(place: Place) -> None:
-    picture = place.save(PNG, "lift.png")
-    robot = driving(robot_at(place, place.save(DRIVE.encode(), "model.json"), picture=str(picture), **LIFT))
-    async with robot, place.agent("person") as person:
+async def test_a_robot_says_what_its_settings_and_its_model_say(market: Market, file: Path) -> None:
+    picture, person = saved(file.with_name("lift.png"), PNG), await market.person()
+    async with market.robot(driving(Agent(file, settings=Settings(picture=str(picture), **LIFT)))) as robot:
         said = await profile_of(robot, person)
         assert {name: getattr(said, name) for name in LIFT} == LIFT
         assert (said.agent, said.model, said.price) == (robot.address, DRIVE.cid, "5 XRT")
@@ -73,14 +74,16 @@ async def test_a_robot_says_what_its_settings_and_its_model_say(place: Place) ->
         assert await person.robots(MODEL) == []
 
 
-async def test_a_robot_says_what_it_reads_just_now(place: Place) -> None:
-    async with offering(place.agent("robot")) as robot, place.agent("person") as person:
+async def test_a_robot_says_what_it_reads_just_now(market: Market) -> None:
+    person = await market.person()
+    async with market.robot(offering(Agent(MODEL))) as robot:
         for volts in (11.5, 12.5):
             robot.publish("/battery", volts)
         for topic, value in (("/state", "\x1b[2Jdocked" + "x" * 100), ("/pose", {"x": 1}), ("/picture", b"x" * 9000)):
             robot.publish(topic, value)
         robot.publish("/one/too/many", 1)
-        (seen,) = [one for one in await person.robots() if one.address == robot.address]
+        await profile_of(robot, person)
+        (seen,) = await person.robots()
         assert seen.readings == {
             "/battery": "12.5",
             "/state": "\ufffd[2Jdocked" + "x" * 70,
@@ -89,10 +92,10 @@ async def test_a_robot_says_what_it_reads_just_now(place: Place) -> None:
         }
 
 
-async def test_an_agent_that_only_orders_is_no_robot(place: Place) -> None:
-    async with offering(place.agent("robot")) as robot, place.agent("person", name="Ann") as person:
-        await profile_of(robot, person)
-        assert [one.address for one in await person.robots()] == [robot.address]
+async def test_an_agent_that_only_orders_is_no_robot(market: Market) -> None:
+    async with market.robot(offering(Agent(MODEL))) as robot, market.robot(Agent(settings=Settings(name="Ann"))) as ann:
+        await profile_of(robot, ann)
+        assert [one.address for one in await ann.robots()] == [robot.address]
 
 
 @pytest.mark.parametrize(
@@ -105,16 +108,19 @@ async def test_an_agent_that_only_orders_is_no_robot(place: Place) -> None:
         ({"picture": "large"}, "picture-unusable"),
     ],
 )
-async def test_what_nobody_could_show_ends_the_start(place: Place, settings: dict[str, str], code: str) -> None:
+async def test_what_nobody_could_show_ends_the_start(
+    market: Market, tmp_path: Path, settings: dict[str, Any], code: str
+) -> None:
     files = {"text": b"a text", "large": PNG + bytes(LARGEST_PICTURE)}
-    named = {key: str(place.save(files[text], text)) if text in files else text for key, text in settings.items()}
+    named = {key: str(saved(tmp_path / text, files[text])) if text in files else text for key, text in settings.items()}
     with raises_with(ConfigurationError, code=code):
-        await offering(robot_at(place, **named)).__aenter__()
+        async with market.robot(offering(Agent(MODEL, settings=Settings(**named)))):
+            pass
 
 
-async def test_a_job_changes_the_state_and_the_queue(place: Place) -> None:
+async def test_a_job_changes_the_state_and_the_queue(market: Market, file: Path) -> None:
     """Both jobs are paid or refunded in the end, and counted for those who ask."""
-    go_on, robot = asyncio.Event(), robot_at(place, place.save(DRIVE.encode(), "model.json"), name="Lift")
+    go_on, robot, person = asyncio.Event(), offering(Agent(file)), await market.person()
 
     @robot.on("/drive")
     async def drive(job: Job, move: Move) -> None: ...
@@ -130,17 +136,10 @@ async def test_a_job_changes_the_state_and_the_queue(place: Place) -> None:
     def hear(sample: zenoh.Sample) -> None:
         put.append(Profile.decode(sample.payload.to_bytes()).state)
 
-    async with place.at_work(offering(robot)) as person:
+    async with market.robot(robot):
         subscriber = person.network.session.declare_subscriber(str(ProfileKey(robot.address)), hear)
         await until_heard(robot.network.session, str(ProfileKey(robot.address)))
-        counted = await person.chain.liabilities.outcomes(blocks=50_000, most=500)
-        before = counted.get(robot.address, (0, 0))
-        contracts = [
-            await person.demand(
-                place.save(objective(("/drive", {"speed": speed}), ("/stop", Empty()))), cost=cost, model=DRIVE.cid
-            )
-            for speed, cost in ((1.0, 1), (1.5, 2))
-        ]
+        contracts = [await market.demand(robot, DRIVING, by=person, cost=cost) for cost in (1, 2)]
         directory = RobotDirectory(person.network.session, person.channel)
 
         async def is_busy() -> bool:
@@ -160,24 +159,18 @@ async def test_a_job_changes_the_state_and_the_queue(place: Place) -> None:
         await until_found(is_idle, what="an idle robot")
         await until(lambda: put[-1] == "idle", what="the word that it is idle")
         subscriber.undeclare()  # type: ignore[no-untyped-call]
-        paid, refunded = (await person.chain.liabilities.outcomes(blocks=50_000, most=500))[robot.address]
-        assert (paid, refunded) == (before[0] + 1, before[1] + 1)
+        assert (await person.chain.liabilities.outcomes(blocks=50_000, most=500))[robot.address] == (1, 1)
         (seen,) = await directory.count(person.chain, await directory.present())
-        assert (seen.paid, seen.refunded) == (paid, refunded)
+        assert (seen.paid, seen.refunded) == (1, 1)
         last = await person.chain.liabilities.outcomes(blocks=50_000, most=1)
         assert last == {robot.address: (0, 1)}
 
 
-async def test_a_robot_that_does_several_jobs_at_once_says_when_its_first_place_is_free(place: Place) -> None:
+async def test_a_robot_that_does_several_jobs_at_once_says_when_its_first_place_is_free(
+    market: Market, file: Path
+) -> None:
     """Two jobs of 2 s are half done, and one waits: it takes the first place that is free, the next job the second."""
-    go_on, model = asyncio.Event(), place.save(DRIVE.encode(), "model.json")
-    robot = Agent(
-        model,
-        settings=place.settings("robot"),
-        account=place.market.accounts["robot"],
-        chain=place.chains["robot"],
-        parallel=2,
-    )
+    go_on, robot = asyncio.Event(), offering(Agent(file, parallel=2))
 
     @robot.on("/drive")
     async def drive(job: Job, move: Move) -> None: ...
@@ -186,12 +179,11 @@ async def test_a_robot_that_does_several_jobs_at_once_says_when_its_first_place_
     async def stop(job: Job, nothing: Empty) -> None:
         await go_on.wait()
 
-    source = place.save(objective(("/drive", {"speed": 1.0}), ("/stop", Empty())))
     waits = [(0, 0), (0, 1), (1, 1), (2, 3)]
-    async with place.at_work(offering(robot)) as person:
+    async with market.robot(robot):
         contracts = []
         for cost, expected in enumerate(waits, 1):
-            contracts.append(await person.demand(source, cost=cost, model=DRIVE.cid))
+            contracts.append(await market.demand(robot, DRIVING, cost=cost))
 
             async def is_so(expected: tuple[int, int] = expected) -> bool:
                 return await robot.runtime.profile.queue() == expected
@@ -202,8 +194,9 @@ async def test_a_robot_that_does_several_jobs_at_once_says_when_its_first_place_
             assert (await contract.outcome()).success
 
 
-async def test_a_robot_that_is_stopped_or_closed_says_so(place: Place) -> None:
-    async with offering(place.agent("robot")) as robot, place.agent("person") as person:
+async def test_a_robot_that_is_stopped_or_closed_says_so(market: Market) -> None:
+    person = await market.person()
+    async with market.robot(offering(Agent(MODEL))) as robot:
         await robot.control(paused=True, stop="it smokes")
         assert (await profile_of(robot, person)).state == "stopped"
         await robot.control(release=True)
@@ -212,32 +205,31 @@ async def test_a_robot_that_is_stopped_or_closed_says_so(place: Place) -> None:
         assert (await profile_of(robot, person)).state == "idle"
 
 
-async def test_a_change_is_put_once_a_second_at_most(place: Place) -> None:
+async def test_a_change_is_put_once_a_second_at_most(market: Market) -> None:
     heard: list[tuple[float, Profile]] = []
 
     def hear(sample: zenoh.Sample) -> None:
         heard.append((time.monotonic(), Profile.decode(sample.payload.to_bytes())))
 
-    robot = offering(place.agent("robot"))
-    key = str(ProfileKey(place.address("robot")))
-    async with Network(Endpoints(connect=(place.endpoint,))) as network:
-        subscriber = network.session.declare_subscriber(key, hear)
-        async with robot:
-            await until_heard(robot.network.session, key)
-            for number in range(50):
-                await robot.control(paused=bool(number % 2))
-                await asyncio.sleep(0.02)
-            await until(lambda: bool(heard) and heard[-1][1].state == "closed", what="the last state")
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    person, account = await market.person(), market.chain.new_account()
+    key = str(ProfileKey(account.address))
+    subscriber = person.network.session.declare_subscriber(key, hear)
+    async with market.robot(offering(Agent(MODEL, account=account))) as robot:
+        await until_heard(robot.network.session, key)
+        for number in range(50):
+            await robot.control(paused=bool(number % 2))
+            await asyncio.sleep(0.02)
+        await until(lambda: bool(heard) and heard[-1][1].state == "closed", what="the last state")
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
     assert all(profile.is_signed for _, profile in heard)
     assert all(later - earlier > INTERVAL / 2 for (earlier, _), (later, _) in pairwise(heard))
     assert len(heard) <= 4
 
 
-async def test_an_agent_without_an_account_lists_robots_without_records(place: Place) -> None:
-    async with offering(robot_at(place, name="Lift")) as robot, place.agent("person") as person:
-        await profile_of(robot, person)
-        async with Agent(MODEL, settings=place.settings("watcher")) as watcher:
+async def test_an_agent_without_an_account_lists_robots_without_records(market: Market) -> None:
+    async with market.robot(offering(Agent(MODEL, settings=Settings(name="Lift")))) as robot:
+        await profile_of(robot, await market.person())
+        async with Agent(MODEL, settings=market.settings("watcher")) as watcher:
             (seen,) = await watcher.robots()
     assert isinstance(seen, Robot)
     assert (str(seen), seen.paid, seen.refunded) == ("Lift", None, None)
@@ -262,22 +254,22 @@ def test_only_keys_that_have_signed_it_are_earlier_ones_of_a_robot() -> None:
     assert Profile(agent=now.address, handovers=(forged, again), time=3).predecessors == (second.address,)
 
 
-async def test_the_record_of_an_earlier_key_counts_for_one_robot_only(place: Place) -> None:
+async def test_the_record_of_an_earlier_key_counts_for_one_robot_only(market: Market) -> None:
     class Counted:
         class liabilities:  # noqa: N801
             @staticmethod
             async def outcomes(**limits: int) -> dict[str, tuple[int, int]]:
                 return {"old": (3, 1), "new": (2, 0)}
 
-    async with place.agent("person") as person:
-        directory = RobotDirectory(person.network.session, person.channel)
-        moved, stranger = robot_seen("new", "old"), robot_seen("stranger", "old")
-        (counted,) = await directory.count(Counted(), [moved])  # type: ignore[arg-type]
-        assert (counted.paid, counted.refunded) == (5, 1)
-        both = await directory.count(Counted(), [moved, stranger])  # type: ignore[arg-type]
-        assert [(one.paid, one.refunded) for one in both] == [(2, 0), (0, 0)]
-        still = await directory.count(Counted(), [moved, robot_seen("old")])  # type: ignore[arg-type]
-        assert [(one.paid, one.refunded) for one in still] == [(2, 0), (3, 1)]
+    person = await market.person()
+    directory = RobotDirectory(person.network.session, person.channel)
+    moved, stranger = robot_seen("new", "old"), robot_seen("stranger", "old")
+    (counted,) = await directory.count(Counted(), [moved])  # type: ignore[arg-type]
+    assert (counted.paid, counted.refunded) == (5, 1)
+    both = await directory.count(Counted(), [moved, stranger])  # type: ignore[arg-type]
+    assert [(one.paid, one.refunded) for one in both] == [(2, 0), (0, 0)]
+    still = await directory.count(Counted(), [moved, robot_seen("old")])  # type: ignore[arg-type]
+    assert [(one.paid, one.refunded) for one in still] == [(2, 0), (3, 1)]
 
 
 def robot_seen(address: str, *formerly: str) -> Robot:

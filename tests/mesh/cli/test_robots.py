@@ -24,7 +24,6 @@ from schemas import ProfileKey
 from schemas.address import shortened
 from schemas.model import ModelDescription, ModelTopic, ValueSchema
 from tests.mesh.agent.test_own_model import DRIVE, driving
-from tests.mesh.agent.test_profile import robot_at
 from tests.support.commands import coroutine
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
@@ -46,7 +45,7 @@ async def lift(place: Place) -> AsyncIterator[tuple[Agent, Settings]]:
     """A robot with a name that is present, and the settings of a reader without a node."""
     model = place.save(DRIVE.encode(), "model.json")
     async with (
-        offering(driving(robot_at(place, model, name="Lift 1", place="Hall 3"))) as robot,
+        offering(driving(place.agent("robot", model, name="Lift 1", place="Hall 3"))) as robot,
         Network(Endpoints(connect=(place.endpoint,))) as network,
     ):
         await until_answered(network.session, str(ProfileKey(robot.address)))
