@@ -112,9 +112,10 @@ async def test_what_nobody_could_show_ends_the_start(
     market: Market, tmp_path: Path, settings: dict[str, Any], code: str
 ) -> None:
     files = {"text": b"a text", "large": PNG + bytes(LARGEST_PICTURE)}
-    named = {key: str(saved(tmp_path / text, files[text])) if text in files else text for key, text in settings.items()}
+    if content := files.get(settings.get("picture", "")):
+        settings = {"picture": str(saved(tmp_path / "picture", content))}
     with raises_with(ConfigurationError, code=code):
-        async with market.robot(offering(Agent(MODEL, settings=Settings(**named)))):
+        async with market.robot(offering(Agent(MODEL, settings=Settings(**settings)))):
             pass
 
 
