@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from bridges.ipfs.service import IpfsBridge
@@ -11,36 +10,34 @@ from mesh.base.background import Background
 from mesh.network import Endpoints, Network
 from schemas import parse_address
 from tests.bridges.ipfs.replays import OldDaemon
-from tests.support.market import MODEL, Place
-from tests.support.objectives import objective
+from tests.support.market import MODEL
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from mesh.agent.contracts import Progress
+    from mesh.testing import Market
 
 
-async def test_the_maker_of_a_demand_that_is_not_passed_on_is_told(place: Place) -> None:
+async def test_the_maker_of_a_demand_that_is_not_passed_on_is_told(market: Market) -> None:
+    person = await market.person()
     heard: list[Progress] = []
-    async with OldDaemon() as daemon:
-        settings = replace(place.settings("bridge"), ipfs_http_provider=daemon.api)
-        async with (
-            place.agent("person") as person,
-            Network(Endpoints(connect=(place.endpoint,))) as network,
-            IpfsBridge(network, settings) as bridge,
-            Background() as tasks,
-        ):
-            tasks.start(bridge.run(), "bridge of the test")
-            (channel,) = bridge.channels
-            await until(lambda: channel.status().carries, seconds=60)
-            wanted = place.save(objective(("/go", "x")))
-            demands = [
-                asyncio.create_task(person.demand(wanted, model=MODEL, cost=cost, on_progress=heard.append))
-                for cost in ((1 << 32) - 1, 1 << 32)
-            ]
-            await until(lambda: any(said.kind == "declined" for said in heard), seconds=60)
-            for demand in demands:
-                demand.cancel()
-            await asyncio.wait(demands)
+    async with (
+        OldDaemon() as daemon,
+        Network(Endpoints(connect=(market.endpoint,))) as network,
+        IpfsBridge(network, market.settings("bridge", ipfs_http_provider=daemon.api)) as bridge,
+        Background() as tasks,
+    ):
+        tasks.start(bridge.run(), "bridge of the test")
+        (channel,) = bridge.channels
+        await until(lambda: channel.status().carries, seconds=60)
+        demands = [
+            asyncio.create_task(person.demand([("/go", "x")], model=MODEL, cost=cost, on_progress=heard.append))
+            for cost in ((1 << 32) - 1, 1 << 32)
+        ]
+        await until(lambda: any(said.kind == "declined" for said in heard), seconds=60)
+        for demand in demands:
+            demand.cancel()
+        await asyncio.wait(demands)
         (said,) = [said for said in heard if said.kind == "declined"]
         assert (said.agent, said.code) == (parse_address(channel.address), "too-large")
         assert "IPFS" in said.detail
