@@ -5,22 +5,23 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from mesh import JobFailed, Phase, Progress
+from mesh import Agent, JobFailed, Phase, Progress
 from mesh.agent import jobs
 from mesh.agent.contracts import _report_presence
-from mesh.network import Endpoints, Network
+from mesh.testing import assert_paid
 from schemas import EventKey, PlaybackPosition, ProgressKey
-from tests.mesh.agent.trades import job, working
+from tests.mesh.agent.trades import JOB, job, working
 from tests.support.log_events import logged_facts
-from tests.support.market import Place, in_phase, offering
+from tests.support.market import MODEL, in_phase, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     import pytest
 
-    from mesh.agent.agent import Agent
     from mesh.agent.handlers import Job
+    from mesh.testing import Market
+    from tests.support.market import Place
 
 
 def kinds(heard: list[Progress]) -> list[str]:
@@ -76,36 +77,33 @@ async def test_a_person_sees_why_a_job_failed(place: Place) -> None:
         assert (said["refunded"].code, said["refunded"].detail) == ("job-failed", "the lamp is broken")
 
 
-async def test_an_offer_with_other_terms_says_which(place: Place) -> None:
-    heard: list[Progress] = []
-    robot = working(place.agent("robot"))
-    async with robot, place.provider(), place.agent("person") as person:
-        cid = await person.add(job(place))
+async def test_an_offer_with_other_terms_says_which(market: Market) -> None:
+    person, heard = await market.person(), list[Progress]()
+    cid = person.parts.store.put_bytes(objective(*JOB))
+    async with market.robot(working(Agent(MODEL))) as robot:
         await robot.offer(objective=cid, cost=7)
-        demand = asyncio.create_task(person.demand(cid, cost=5, on_progress=heard.append))
+        demand = asyncio.create_task(person.demand(cid, model=MODEL, cost=5, on_progress=heard.append))
         other = Progress(kind="offer", agent=robot.address, code="other-cost", detail="7")
         await until(lambda: other in heard)
         await demand
         assert heard.count(other) == 1
 
 
-async def test_the_position_of_a_playback_is_published_while_it_changes(place: Place) -> None:
+async def test_the_position_of_a_playback_is_published_while_it_changes(market: Market) -> None:
     said: list[PlaybackPosition] = []
-    robot = offering(place.agent("robot"))
+    robot, person = offering(Agent(MODEL)), await market.person()
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
         await asyncio.sleep(jobs.PUBLISH_INTERVAL)
 
-    async with place.at_work(robot) as person:
+    def hear(sample: Any) -> None:
+        said.append(PlaybackPosition.decode(sample.payload.to_bytes()))
+
+    async with market.robot(robot):
         selector = f"aira/agent/{robot.address.lower()}/liability/*/progress"
-
-        def hear(sample: Any) -> None:
-            said.append(PlaybackPosition.decode(sample.payload.to_bytes()))
-
-        with person.parts.network.session.declare_subscriber(selector, hear):
-            contract = await person.demand(place.save(objective(*[("/go", "on")] * 4)))
-            assert (await contract.outcome()).success
+        with person.network.session.declare_subscriber(selector, hear):
+            assert_paid(await market.order(robot, JOB * 4))
             await until(lambda: said and said[-1].position == 4)
     assert {playback.total for playback in said} == {4}
     positions = [playback.position for playback in said]
@@ -113,28 +111,33 @@ async def test_the_position_of_a_playback_is_published_while_it_changes(place: P
     assert len(set(positions)) >= 3
 
 
-async def test_what_others_say_of_a_job_is_not_reported(place: Place) -> None:
-    """On the keys of another agent or another liability, or unreadable."""
-    heard: list[Progress] = []
-    robot: Agent = offering(place.agent("robot"))
-    done = asyncio.Event()
+def until_set(done: asyncio.Event) -> Agent:
+    """A robot whose jobs end when that is set."""
+    robot = offering(Agent(MODEL))
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
         await done.wait()
 
-    async with place.at_work(robot) as person, Network(Endpoints(connect=(place.endpoint,))) as network:
-        contract = await person.demand(job(place))
+    return robot
+
+
+async def test_what_others_say_of_a_job_is_not_reported(market: Market) -> None:
+    """On the keys of another agent or another liability, or unreadable."""
+    heard, done = list[Progress](), asyncio.Event()
+    person, other = await market.person(), await market.person()
+    async with market.robot(until_set(done)) as robot:
+        contract = await market.demand(robot, JOB, by=person)
         outcome = asyncio.create_task(contract.outcome(on_progress=heard.append))
-        own = str(ProgressKey(robot.address, contract.address))
+        own, session = str(ProgressKey(robot.address, contract.address)), other.network.session
         playback = PlaybackPosition(position=1, total=3)
 
         def is_heard() -> bool:
-            network.session.put(str(ProgressKey(person.address, contract.address)), b'{"position":9,"total":9}')
-            network.session.put(str(ProgressKey(robot.address, person.address)), b'{"position":9,"total":9}')
-            network.session.put(own, b"nonsense")
-            network.session.put(str(EventKey(robot.address, contract.address, "complete")), b"nonsense")
-            network.session.put(own, playback.encode())
+            session.put(str(ProgressKey(person.address, contract.address)), b'{"position":9,"total":9}')
+            session.put(str(ProgressKey(robot.address, person.address)), b'{"position":9,"total":9}')
+            session.put(own, b"nonsense")
+            session.put(str(EventKey(robot.address, contract.address, "complete")), b"nonsense")
+            session.put(own, playback.encode())
             return any(progress.total == 3 for progress in heard)
 
         await until(is_heard)
@@ -144,28 +147,16 @@ async def test_what_others_say_of_a_job_is_not_reported(place: Place) -> None:
         await outcome
 
 
-async def test_a_person_sees_that_the_robot_is_gone(place: Place) -> None:
-    heard: list[Progress] = []
-    done = asyncio.Event()
-
-    def robot() -> Agent:
-        robot = offering(place.agent("robot"))
-
-        @robot.on("/go")
-        async def go(job: Job, message: Any) -> None:
-            await done.wait()
-
-        return robot
-
-    async with place.provider(), place.agent("person") as person:
-        async with robot():
-            contract = await person.demand(job(place))
-        outcome = asyncio.create_task(contract.outcome(on_progress=heard.append))
-        await until(lambda: "gone" in kinds(heard), seconds=30)
-        async with robot():
-            await until(lambda: "back" in kinds(heard), seconds=30)
-            done.set()
-            assert (await outcome).success
+async def test_a_person_sees_that_the_robot_is_gone(market: Market) -> None:
+    heard, done = list[Progress](), asyncio.Event()
+    async with market.robot(until_set(done)) as robot:
+        contract = await market.demand(robot, JOB)
+    outcome = asyncio.create_task(contract.outcome(on_progress=heard.append))
+    await until(lambda: "gone" in kinds(heard), seconds=30)
+    async with market.robot(robot):
+        await until(lambda: "back" in kinds(heard), seconds=30)
+        done.set()
+        assert_paid(await outcome)
 
 
 async def test_an_agent_that_was_never_present_is_not_said_to_be_gone(place: Place) -> None:
@@ -178,21 +169,22 @@ async def test_an_agent_that_was_never_present_is_not_said_to_be_gone(place: Pla
     assert [one.code for one in heard] == ["unseen"]
 
 
-async def test_a_callback_that_fails_ends_nothing(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_callback_that_fails_ends_nothing(market: Market, caplog: pytest.LogCaptureFixture) -> None:
     def fail(progress: Progress) -> None:
         raise RuntimeError("broken")
 
-    async with place.at_work(working(place.agent("robot"))) as person:
-        contract = await person.demand(job(place), on_progress=fail)
-        assert (await contract.outcome(on_progress=fail)).success
+    person = await market.person()
+    async with market.robot(working(Agent(MODEL))):
+        contract = await person.demand(JOB, model=MODEL, on_progress=fail)
+        assert_paid(await contract.outcome(on_progress=fail))
     assert {facts["kind"] for facts in logged_facts(caplog, "progress-not-reported")} >= {"contract", "paid"}
 
 
-async def test_who_comes_late_is_told_the_present_phase(place: Place) -> None:
+async def test_who_comes_late_is_told_the_present_phase(market: Market) -> None:
     """The job has been ready, and then played for a while, before anybody listens."""
-    robot, heard = offering(place.agent("robot")), dict[str, list[Progress]](ready=[], playing=[])
-    async with place.at_work(robot) as person:
-        contract = await person.demand(place.save(objective(("/go", "on"))))
+    heard = dict[str, list[Progress]](ready=[], playing=[])
+    async with market.robot(offering(Agent(MODEL))) as robot:
+        contract = await market.demand(robot, JOB)
         await in_phase(robot, contract, Phase.READY)
         waiting = [asyncio.create_task(contract.outcome(on_progress=heard["ready"].append))]
         await until(lambda: kinds(heard["ready"]) == ["ready"])
