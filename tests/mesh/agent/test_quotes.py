@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from tests.support.market import Place
 
 
-def priced(price: int | str, *, only: str = "") -> Agent:
-    """A robot that does every job for a price; or declines each, with the code `only`."""
-    robot = Agent(MODEL)
+def priced(robot: Agent, price: int | str, *, only: str = "") -> Agent:
+    """The same robot, which does every job for a price; or declines each, with the code `only`."""
 
     @robot.on_quote
     async def quote(request: QuoteRequest) -> int | str:
@@ -44,7 +43,11 @@ def priced(price: int | str, *, only: str = "") -> Agent:
 @asynccontextmanager
 async def two_robots(market: Market) -> AsyncIterator[tuple[Agent, Agent, Agent]]:
     """A dear robot, a cheap one, and a person."""
-    async with market.robot(priced(9)) as dear, market.robot(priced(4)) as cheap, asyncio.timeout(60):
+    async with (
+        market.robot(priced(Agent(MODEL), 9)) as dear,
+        market.robot(priced(Agent(MODEL), 4)) as cheap,
+        asyncio.timeout(60),
+    ):
         yield dear, cheap, await market.person()
 
 
@@ -110,7 +113,7 @@ async def test_a_price_may_depend_on_what_the_objective_plays(market: Market) ->
 
 
 async def test_a_robot_declines_with_its_reason(market: Market) -> None:
-    async with market.robot(priced(1, only="closed-today")):
+    async with market.robot(priced(Agent(MODEL), 1, only="closed-today")):
         (quote,) = await (await market.person()).quotes(MODEL, JOB)
         assert (quote.code, quote.detail, quote.cost) == ("closed-today", "not today", 0)
         with pytest.raises(RemoteError, match="closed-today"):
@@ -130,7 +133,7 @@ async def test_the_next_robot_is_asked_if_the_cheapest_declines_after_all(market
     async def decline(demand: Any) -> None:
         raise Declined("busy-now", "another one was faster")
 
-    async with market.robot(second), market.robot(priced(7)) as robot:
+    async with market.robot(second), market.robot(priced(Agent(MODEL), 7)) as robot:
         assert (await market.demand(MODEL, JOB, robot="cheapest", max_cost=10)).robot == robot.address
         with pytest.raises(DemandDeclined, match="another one was faster"):
             await market.demand(second, JOB, cost=2)
