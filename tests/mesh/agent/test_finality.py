@@ -21,10 +21,10 @@ from schemas import ZERO_ADDRESS, Demand, Offer
 from tests.mesh.agent.trades import job
 from tests.support.market import ForeignChain, Place, in_phase, offering
 from tests.support.nodes import Anvil
-from tests.support.waiting import until, until_found
+from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
     from mesh.agent.agent import Agent
@@ -64,6 +64,12 @@ class Settling:
         """Mine until what happened in a block counts with the next one."""
         await self.mine(block + self.late - 1 - await self.node.block_number())
 
+    async def mine_until(self, condition: Callable[[], object]) -> None:
+        """Mine block after block, as chains do: a node is asked for its final block at times only, with a new block."""
+        async with asyncio.timeout(30):
+            while not condition():
+                await self.mine(1)
+
     async def dated(self, contract: Contract) -> Dated:
         """When it was created, and has ended."""
         found = await self.place.chains["person"].liabilities.history()
@@ -99,12 +105,11 @@ async def test_a_robot_begins_and_a_customer_hears_of_the_end_when_the_blocks_co
         await market.mine_until_one_before((await market.dated(contract)).created.block_number)
         await in_phase(robot, contract, Phase.INCOMING)
         assert market.played == []
-        await market.mine(1)
-        await until(lambda: market.played == [contract.address], what="the robot begins")
+        await market.mine_until(lambda: market.played == [contract.address])
         ended = await market.ended_in(contract)
         await market.mine_until_one_before(ended)
         assert not outcome.done()
-        await market.mine(1)
+        await market.mine_until(outcome.done)
         assert (await outcome).success
 
 
@@ -118,8 +123,7 @@ async def test_a_restarted_robot_still_waits_for_the_block(market: Settling) -> 
             await market.mine_until_one_before((await market.dated(contract)).created.block_number)
             await in_phase(robot, contract, Phase.INCOMING)
             assert market.played == []
-            await market.mine(market.late + 1)
-            await until(lambda: market.played == [contract.address], what="the robot begins")
+            await market.mine_until(lambda: market.played == [contract.address])
 
 
 async def test_an_end_that_is_taken_back_before_it_counts_is_not_told(market: Settling) -> None:
@@ -137,7 +141,7 @@ async def test_an_end_that_is_taken_back_before_it_counts_is_not_told(market: Se
         async with place.provider(seconds=60):
             await market.mine_until_one_before(await market.ended_in(contract))
             assert not outcome.done()
-            await market.mine(1)
+            await market.mine_until(outcome.done)
             assert (await outcome).success
 
 
@@ -153,8 +157,7 @@ async def test_a_provider_is_done_with_orders_when_the_block_of_their_contract_c
         created = (await market.dated(contract)).created.block_number
         await market.mine_until_one_before(created)
         assert OrderStage.CONFIRMED not in stages()
-        await market.mine(1)
-        await until(lambda: stages() == {OrderStage.CONFIRMED}, what="the provider is done with them")
+        await market.mine_until(lambda: stages() == {OrderStage.CONFIRMED})
 
 
 async def test_an_end_counts_only_as_far_as_the_agent_has_read_the_chain() -> None:
