@@ -26,6 +26,7 @@ async def changes(signer: SignerClient, job_id: str) -> AsyncIterator[Job]:
 
     Waits while the signer is away. Raises the `AiraError` of a job that there is none of.
     """
+    before: Job | None = None
     revision, backoff = -1, Backoff(RETRY)
     while True:
         try:
@@ -33,11 +34,13 @@ async def changes(signer: SignerClient, job_id: str) -> AsyncIterator[Job]:
         except AiraError as error:
             if error.code in UNKNOWN:
                 raise
+            revision = -1  # after a restart it may be the same for something else
             await backoff.wait()
             continue
         backoff.reset()
-        if job.revision != revision:
-            revision = job.revision
+        revision = job.revision
+        if job != before:
+            before = job
             yield job
         if job.is_over:
             return
