@@ -78,7 +78,7 @@ LIABILITY_GETTERS: Final = (
 
 
 RECORD_FIELDS: Final = structs.fields(Liability)
-"""The fields of the record; those that a contract tells have the names of its functions in JSON."""
+"""The fields of the record. In JSON, those that are read from a contract have the names of its functions."""
 
 
 class OverQuota(ValueError):

@@ -360,7 +360,7 @@ class Rotation:
     async def _stake_ahead(self, channel: Channel, chain: Chain, new: Account, timeout: float | None) -> None:
         """If the new key has the means, stake for it as soon as its provider is at work, before the old stake leaves.
 
-        Not sooner: the turn of a provider who is not at work keeps the others waiting.
+        Not sooner: while a provider that is not at work has the turn, the others wait.
         """
         lighthouse = await self._lighthouse(chain)
         if self._journal.old not in lighthouse.stakes:
