@@ -17,12 +17,11 @@ from schemas import (
     Offer,
     OrderFeedback,
     Result,
-    Withdrawal,
     address_bytes,
     decode,
     encode,
 )
-from schemas.keys import market_key, market_kind
+from schemas.keys import KINDS, market_key, market_kind
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -116,8 +115,8 @@ class RelayValidator:
         not have.
         """
         message = decode(payload)
-        if isinstance(message, Withdrawal):
-            raise InvalidMessage("kind", "the legacy network has no withdrawals")
+        if not KINDS[message.kind].is_legacy:
+            raise InvalidMessage("kind", f"the legacy network has no message of the kind {message.kind}")
         canonical = encode(message)
         own_key = market_key(self.rules.lighthouse, message.kind, message.key_model)
         digest = signer = ""

@@ -45,8 +45,6 @@ MAX_EVENT: Final = 40_000
 MAX_SHORT_TEXT: Final = 1_000
 MARGIN: Final = "    | "
 """Before each line of a traceback. It may quote untrusted text, which must not pass for an event."""
-FIELDS: Final = frozenset(LogEvent.__struct_fields__)
-"""Names that a fact can't have."""
 _URL: Final = re.compile(r"\b(?:https?|wss?)://[^\s'\"<>]+")
 _USER: Final = re.compile(r"//[^/?#]*@")
 _KEY: Final = re.compile(r"/(?!Qm)[\w-]{16,}")
@@ -83,11 +81,13 @@ def event_of(record: logging.LogRecord, *, default: LogSource = context.UNKNOWN_
 
 
 def json_line(event: LogEvent) -> str:
-    """The event as one JSON object in ASCII. Facts are members of it; empty fields are left out."""
-    fields: dict[str, Any] = {name: getattr(event, name) for name in event.__struct_fields__}
-    fields |= {name: value for name, value in event.facts.items() if name not in FIELDS}
-    del fields["facts"]
-    return json.dumps({name: value for name, value in fields.items() if value not in ("", 0)})
+    """The event as one JSON object in ASCII. Facts are members of it, unless a field of that name has a value.
+
+    What is empty is left out.
+    """
+    fields: dict[str, Any] = {name: getattr(event, name) for name in event.__struct_fields__ if name != "facts"}
+    shown = {name: value for name, value in fields.items() if value not in ("", 0)}
+    return json.dumps(shown | {name: value for name, value in event.facts.items() if value and name not in shown})
 
 
 def human_line(event: LogEvent) -> str:

@@ -13,10 +13,10 @@ import pytest
 from bridges.ipfs._channel import BRIDGE_MARK
 from bridges.ipfs._messages import legacy_json
 from mesh.network import message_key
-from schemas import OrderFeedback, TransactionFeedback, encode
+from schemas import OrderFeedback, Permit, TransactionFeedback, Withdrawal, encode
 from tests.bridges.ipfs.bridges import Mesh, bridging, on_mesh, until_seen
 from tests.support.ipfs import Kubo
-from tests.support.orders import OTHER_MODEL, STRANGER, demand, offer, result
+from tests.support.orders import CONTRACT, LIGHTHOUSE, OTHER_MODEL, PERSON, STRANGER, TOKEN, demand, offer, result
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -115,6 +115,21 @@ async def test_results_and_both_feedbacks_are_relayed(
     mesh.channel.put(f"aira/{topic}/feedback", encode(_feedback(2)))
     await until(lambda: len(bob.heard) == 5, seconds=SECONDS)
     assert bob.heard[3:] == [legacy_json(TransactionFeedback(tx="12" * 32)), legacy_json(_feedback(2))]
+
+
+async def test_kinds_that_the_legacy_network_does_not_have_are_refused_from_it(
+    bridge: ChannelBridge, mesh: Mesh, bob: LegacyClient, topic: str
+) -> None:
+    withdrawal = Withdrawal(order="ab" * 32, lighthouse=LIGHTHOUSE, deadline=2**30)
+    terms = {"owner": PERSON.address, "spender": CONTRACT, "token": TOKEN, "domain": "11" * 32}
+    permit = Permit(**terms, value=1, nonce=0, deadline=2**40)
+    order = demand()
+    for message in (withdrawal, permit):
+        await bob.publish(topic, encode(PERSON.sign(message)))
+    await bob.publish(topic, legacy_json(order))
+    await until(lambda: mesh.heard, seconds=SECONDS)
+    assert mesh.payloads == [encode(order)]
+    assert bridge.status().to_mesh.invalid == {"kind": 2}
 
 
 async def test_invalid_messages_are_counted_by_reason(

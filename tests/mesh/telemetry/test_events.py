@@ -14,7 +14,7 @@ import pytest
 from mesh.base.log_context import LogSource, liability_context, log_event, source_context, with_liability_context
 from mesh.telemetry.logs import MAX_EVENT, MAX_MESSAGE, event_of, human_line, json_line, without_secrets
 from schemas.status import LogEvent
-from tests.support.orders import ROBOT, STRANGER
+from tests.support.orders import LIGHTHOUSE, ROBOT, STRANGER
 
 LIABILITY = "0x8A7B7Bf07722e6c80579326C4F162692ccD71F39"
 ARM = LogSource("agent", ROBOT.address, "market.eth")
@@ -81,6 +81,14 @@ def test_facts_are_members_of_the_json_object_and_never_replace_a_field() -> Non
     fields = json.loads(json_line(event_of(event)))
     assert (fields["event"], fields["order"], fields["gas"]) == ("order-rejected", "ab" * 32, "7")
     assert (fields["level"], fields["message"]) == ("info", "rejected")
+
+
+def test_a_fact_named_like_a_field_without_a_value_is_in_the_json_object() -> None:
+    event = record("not answered")
+    vars(event).update(log_event("content-serve-failed", error="the disk is full", lighthouse=LIGHTHOUSE, trace=""))
+    fields = json.loads(json_line(event_of(event)))
+    assert (fields["error"], fields["lighthouse"]) == ("the disk is full", LIGHTHOUSE)
+    assert "trace" not in fields
 
 
 @pytest.mark.parametrize("write", [human_line, json_line])
