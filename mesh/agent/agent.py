@@ -66,6 +66,7 @@ from schemas import (
     Demand,
     Offer,
     Result,
+    SignedMessage,
     Verified,
     cid_of_file,
     parse_address,
@@ -828,7 +829,7 @@ class Agent(Program):
         """End the job of the liability at `address` now; returns the recording's CID. Raises `WrongPhase`."""
         return await self.runtime.executor.finish(address, success=success)
 
-    def send(self, message: Demand | Offer | Result) -> str:
+    def send(self, message: SignedMessage) -> str:
         """Sign a message with the agent's account and put it on the market once; returns its key. It is not resent.
 
         Raises `UnsafeValidator` for an order with a validator that was not checked on the chain before, as `demand` and

@@ -36,7 +36,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from mesh.base.flood import BoundedDict
 from mesh.base.retry import Backoff, RetryPolicy
-from mesh.market.book import BOOK, LIMIT, UNLIMITED, Look, Match, OrderBook, OrderRecord, OrderStage, order_id
+from mesh.market.book import BOOK, UNLIMITED, Look, Match, OrderBook, OrderRecord, OrderStage, order_id
+from mesh.settings.groups import OPEN_ORDERS_LIMIT
 from schemas import Result
 from schemas.messages import lasting_hash
 from schemas.signing import Refusal
@@ -74,7 +75,7 @@ class Orders:
         *,
         depth: int,
         withdrawn: Container[bytes] = (),
-        limit: int = LIMIT,
+        limit: int = OPEN_ORDERS_LIMIT,
         deadline_limit: int = UNLIMITED,
         unfunded: int = UNFUNDED,
         retry: RetryPolicy = UNFUNDED_RETRY,

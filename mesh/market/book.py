@@ -13,6 +13,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 from mesh.base.flood import KnownSenders
+from mesh.settings.groups import OPEN_ORDERS_LIMIT
 from schemas import Demand, Verified, address_bytes
 from schemas.messages import equal_terms
 from schemas.signing import Refusal
@@ -225,8 +226,6 @@ class _Share:
         return self._ages.first(None) if or_oldest else None
 
 
-LIMIT: Final = 16_384
-"""Open orders that a book holds by default: with up to 2 KB each, a provider stays below 200 MB."""
 UNLIMITED: Final = 2**256
 
 
@@ -266,7 +265,7 @@ class OrderBook:
         self,
         lighthouse: str,
         *,
-        limit: int = LIMIT,
+        limit: int = OPEN_ORDERS_LIMIT,
         deadline_limit: int = UNLIMITED,
         records: dict[bytes, OrderRecord] | None = None,
     ) -> None:

@@ -25,7 +25,6 @@ from mesh.market._earnings import A_DAY, Earnings, EarningsLedger, FreeContracts
 from mesh.market._orders import Orders
 from mesh.market._services import OrderBookService, PairService, ProviderStatus, permit_fee
 from mesh.market._settlement import OPEN_LIABILITIES, Settlement, SettlementParts
-from mesh.market.book import LIMIT, Match
 from mesh.market.store import MarketStore
 from mesh.market.transactions import RETRY, UNDER_WAY, NoStake, TransactionQueue, least_cost
 from mesh.market.withdrawals import Withdrawals
@@ -33,7 +32,7 @@ from mesh.network.channel import Channel
 from mesh.network.services import Services
 from mesh.role.composition import state_folder
 from mesh.role.following import ChainHead
-from mesh.settings.groups import DEADLINE_LIMIT
+from mesh.settings.groups import DEADLINE_LIMIT, OPEN_ORDERS_LIMIT
 from mesh.telemetry.logs import LogService
 from schemas import Demand, Offer, Permit, Result, Withdrawal
 
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
     from mesh.base.flood import KnownSenders
     from mesh.base.retry import RetryPolicy
     from mesh.chain import Chain
-    from mesh.market.book import Order, OrderBook
+    from mesh.market.book import Match, Order, OrderBook
     from mesh.network import Network, Subscription
     from mesh.settings import Settings
     from mesh.settings.groups import StorageSettings
@@ -173,7 +172,7 @@ class ProviderOptions:
     fail, `unmined_limit` the most of them that wait to be mined, `open_liabilities` the most records in memory.
     """
 
-    limit: int = LIMIT
+    limit: int = OPEN_ORDERS_LIMIT
     retry: RetryPolicy = RETRY
     unmined_limit: int = UNDER_WAY
     open_liabilities: int = OPEN_LIABILITIES
@@ -304,8 +303,8 @@ class Provider(Role):
                 drops=self.drops,
             )
         )
-        subscriptions = (self._demands, self._offers, self._withdrawn, self._permits, self.results)
-        self.status = ProviderStatus(self._session, parts, subscriptions=subscriptions)
+        self._subscriptions = (self._demands, self._offers, self._withdrawn, self._permits, self.results)
+        self.status = ProviderStatus(self._session, parts, subscriptions=self._subscriptions)
         services = await stack.enter_async_context(Services(self._session, self.address, drops=self.drops))
         self._services, self._pairs = services, PairService(parts, self.settlement)
         with source_context(self._source):
@@ -359,7 +358,7 @@ class Provider(Role):
 
     def _forget(self, verified: Verified[Any], *, after: float = 0.0) -> None:
         """Let the next copy of a message through: it is not handled, or its effect was not confirmed."""
-        for subscription in (self._demands, self._offers, self._withdrawn, self._permits, self.results):
+        for subscription in self._subscriptions:
             if subscription.kind == verified.message.kind:
                 subscription.forget(verified, after=after)
 

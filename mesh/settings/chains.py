@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final, Literal
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-DAY: Final = 86_400
-"""Seconds."""
+LONGEST_ORDER: Final = 86_400
+"""Seconds after which an order ends at the latest."""
 ETHEREUM_SECONDS: Final = 12.0
 """Between two blocks of Ethereum, which the contracts of some other chains count."""
 
@@ -54,7 +54,7 @@ class ChainProfile:
     @property
     def deadline_limit(self) -> int:
         """The blocks of a day, as contracts count them."""
-        return self.blocks_in(DAY)
+        return self.blocks_in(LONGEST_ORDER)
 
     def blocks_in(self, seconds: float) -> int:
         """How many blocks, as contracts count them, take so long."""

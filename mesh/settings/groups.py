@@ -41,6 +41,8 @@ def option(default: T, meaning: str) -> T:
 
 DEADLINE_LIMIT: Final = ANY.deadline_limit
 """Blocks, about a day where one takes 12 seconds."""
+OPEN_ORDERS_LIMIT: Final = 16_384
+"""Orders in a provider's book. With up to 2 KB each, a provider stays below 200 MB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +200,7 @@ class MarketSettings:
     erc20_token: str = option(
         "", "the token that pays for work: its address, its ENS name, or its symbol if it is known on the chain (USDC)"
     )
-    open_orders_limit: PositiveInt = option(16_384, "most open orders that a provider keeps, 2 KB each")
+    open_orders_limit: PositiveInt = option(OPEN_ORDERS_LIMIT, "most open orders that a provider keeps, 2 KB each")
     unmined_limit: PositiveInt = option(
         16, "most transactions of a provider that wait to be mined; some nodes keep no more of one account"
     )

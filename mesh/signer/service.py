@@ -59,6 +59,7 @@ from mesh.network import Pump, ServiceFailed
 from mesh.recording import GENEROUS, Played, described_line, json_messages, messages_in, open_objective, pack
 from mesh.role.database import LedgerUnusable
 from mesh.role.program import RESEND
+from mesh.settings.chains import LONGEST_ORDER
 from mesh.signer import protocol
 from mesh.signer._answers import (
     LARGEST_VALUE,
@@ -1087,7 +1088,7 @@ class Signer(Lifecycle):
     async def _seconds_until(self, block: int) -> float:
         block_time = await self.agent.chain.node.contract_blocks.seconds(MEASURED_BLOCKS)
         left = block - self.agent.parts.chain_head.contract_block
-        return max(0.0, min(left * (block_time or 1.0), 86_400.0))
+        return max(0.0, min(left * (block_time or 1.0), LONGEST_ORDER))
 
 
 def request_digest(asked: protocol.OrderJob) -> str:
