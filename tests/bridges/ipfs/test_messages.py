@@ -12,8 +12,31 @@ from msgspec.structs import replace
 from bridges.ipfs._messages import RelayValidator, legacy_json
 from mesh.errors import ChainError, InputError
 from mesh.network import MarketRules, message_key
-from schemas import InvalidMessage, OrderFeedback, TransactionFeedback, decode, encode, message_hash, resolve_names
-from tests.support.orders import LIGHTHOUSE, MARKET, OTHER_MODEL, PERSON, STRANGER, TOKEN, demand, offer, result
+from schemas import (
+    InvalidMessage,
+    OrderFeedback,
+    Permit,
+    TransactionFeedback,
+    Withdrawal,
+    decode,
+    encode,
+    message_hash,
+    resolve_names,
+)
+from schemas.keys import KINDS
+from schemas.messages import MESSAGE_TYPES
+from tests.support.orders import (
+    CONTRACT,
+    LIGHTHOUSE,
+    MARKET,
+    OTHER_MODEL,
+    PERSON,
+    STRANGER,
+    TOKEN,
+    demand,
+    offer,
+    result,
+)
 
 if TYPE_CHECKING:
     from schemas import Message
@@ -48,6 +71,20 @@ async def test_a_valid_message_is_the_same_in_both_encodings(message: Message) -
     assert from_ipfs == from_mesh
     assert (from_ipfs.payload, from_ipfs.legacy) == (encode(message), legacy_json(message))
     assert from_ipfs.key == message_key(MARKET, message)  # type: ignore[arg-type]
+
+
+async def test_of_all_kinds_only_those_of_the_legacy_network_are_relayed() -> None:
+    withdrawal = Withdrawal(order="ab" * 32, lighthouse=LIGHTHOUSE, deadline=2**30)
+    addresses = {"owner": PERSON.address, "spender": CONTRACT, "token": TOKEN}
+    permit = Permit(**addresses, value=1, nonce=0, deadline=2**40, domain="11" * 32)
+    signed = (PERSON.sign(withdrawal), PERSON.sign(permit), demand(), offer(), result())
+    messages = (*signed, FEEDBACK, TransactionFeedback(tx="ab" * 32))
+    assert {type(message) for message in messages} == set(MESSAGE_TYPES)
+    for message in messages:
+        if KINDS[message.kind].is_legacy:
+            await validating().validate(encode(message))
+        else:
+            assert await reason(validating(), encode(message)) == "kind"
 
 
 async def test_feedback_has_one_key_of_each_kind() -> None:
