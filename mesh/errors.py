@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 from functools import lru_cache
 from pathlib import Path, PurePath
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from schemas.errors import AiraError, InputError, InvalidAddress, InvalidCid, InvalidKey, InvalidMessage
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 LONGEST_PUBLIC: Final = 500
 """Characters of a text that leaves the process."""
@@ -60,6 +63,13 @@ def _top_folders() -> frozenset[str]:
         return frozenset(usual | {entry.name for entry in Path("/").iterdir()})
     except OSError:
         return frozenset(usual)
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The known name that looks most like `name`; None if none is similar, as a wrong suggestion is worse than none."""
+    import difflib  # here, as an edge agent must stay small and rarely needs it
+
+    return next(iter(difflib.get_close_matches(name, known, n=1)), None)
 
 
 class ConfigurationError(AiraError, code="configuration-error"):
@@ -120,5 +130,6 @@ __all__ = [
     "NetworkUnavailable",
     "PortUnavailable",
     "RemoteError",
+    "nearest",
     "public_text",
 ]

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 from bridges.ipfs._messages import RelayMessage
 from mesh.base.database import DISK_ERRORS, SyncedDatabase
-from mesh.base.file_locks import try_lock
 from mesh.base.flood import BoundedDict
-from mesh.base.private_files import make_private_folder, open_private
+from mesh.base.private_files import make_private_folder, open_private, try_lock
 from mesh.base.retry import RetryPolicy
 from mesh.errors import AiraError, ConfigurationError
 from schemas.status import DirectionStatus

@@ -13,8 +13,8 @@ from bridges.ipfs._content import URGENT, ContentBridge, ContentParts, ContentSo
 from bridges.ipfs._messages import RelayValidator
 from bridges.ipfs._relay import RelayJournal, Side
 from bridges.ipfs.daemon import Daemon
-from mesh.base.blocklist import blocklist_at
 from mesh.base.flood import Drops
+from mesh.base.fresh_file import blocklist_at
 from mesh.base.lifecycle import Role
 from mesh.base.log_context import log_event
 from mesh.base.outage_log import OutageLog

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from mesh.base.extras import entry_points
 from mesh.base.log_context import log_event
-from mesh.base.plugins import entry_points
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from bridges.web._access import WebError
 from mesh.agent.hiring import asked_offer
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.errors import public_text
-from mesh.watching.quotes import QUOTE_TIMEOUT, asked_quotes
+from mesh.watching.robots import QUOTE_TIMEOUT, asked_quotes
 from schemas import InvalidAddress, InvalidMessage, parse_address
 
 if TYPE_CHECKING:

@@ -59,8 +59,7 @@ from mesh.role.models import Models, description_in
 from mesh.role.program import RESEND, OpenRole, Program
 from mesh.role.status import WatcherStatus
 from mesh.settings import load
-from mesh.watching.quotes import QUOTE_TIMEOUT, asked_quotes
-from mesh.watching.robots import RobotDirectory, labelled, robot_address
+from mesh.watching.robots import QUOTE_TIMEOUT, RobotDirectory, asked_quotes, labelled, robot_address
 from schemas import (
     ZERO_ADDRESS,
     Demand,

@@ -1,6 +1,8 @@
 """State on the disk is readable by its own user only, whatever the umask: files 600, folders 700.
 
-State that an older version or another program left more open is tightened when it is opened.
+State that an older version or another program left more open is tightened when it is opened. A process that locks a
+file holds the lock until it closes the file, or ends, by whatever. Locks are those of `flock`, which Windows does not
+have: `fcntl` is imported where a file is locked.
 """
 
 from __future__ import annotations
@@ -9,9 +11,8 @@ import errno
 import os
 import stat
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
 
-from mesh.base.file_locks import try_lock
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ SHORTEST_TOKEN: Final = 16
 LARGEST_SECRET: Final = 16_384
 """Bytes of a secret in a file."""
 _DATABASE_SUFFIXES: Final = ("", "-wal", "-shm")
+Locked: TypeAlias = int | BinaryIO
+"""An open file, or its descriptor."""
 
 
 def make_private_folder(folder: Path) -> None:
@@ -57,6 +60,48 @@ def open_private(path: Path | str, flags: int) -> int:
     if status.st_mode & _OTHERS and status.st_uid == os.geteuid() and stat.S_ISREG(status.st_mode):
         os.fchmod(descriptor, stat.S_IMODE(status.st_mode) & ~_OTHERS)
     return descriptor
+
+
+def lock(file: Locked) -> None:
+    """Lock a file for this opening of it alone; waits while another one has it."""
+    import fcntl
+
+    fcntl.flock(file, fcntl.LOCK_EX)
+
+
+def lock_shared(file: Locked) -> None:
+    """Lock a file together with others that share it; waits while one has it alone. Gives up a lock for it alone."""
+    import fcntl
+
+    fcntl.flock(file, fcntl.LOCK_SH)
+
+
+def try_lock(file: Locked) -> bool:
+    """Lock a file for this opening of it alone, unless another one has it; whether that succeeded."""
+    import fcntl
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def is_locked(path: Path, *, ours_is_shared: bool = False) -> bool:
+    """Whether this process or another has the file at `path` locked, so that it could not be locked as well."""
+    import fcntl
+
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if ours_is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
 
 
 @contextmanager

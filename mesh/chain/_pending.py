@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 from mesh.base.database import SyncedDatabase, transactions_not_kept
-from mesh.base.file_locks import is_locked, lock, try_lock
 from mesh.base.flood import BoundedDict
+from mesh.base.private_files import is_locked, lock, try_lock
 from mesh.chain._accounts import SignedTransaction
 from mesh.errors import ConfigurationError
 from mesh.telemetry.metrics import MetricFamily, by_label, counter

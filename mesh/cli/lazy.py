@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 import click
 
 from mesh.base.extras import PackageMissing
-from mesh.base.suggestions import nearest
-from mesh.errors import AiraError, ConfigurationError, InputError
+from mesh.errors import AiraError, ConfigurationError, InputError, nearest
 from mesh.role.running import INTERRUPTED, fail
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from mesh.base.plugins import EntryPoint
+    from mesh.base.extras import EntryPoint
 
 ENTRY_POINTS: Final = "aira.commands"
 HELP_WIDTH: Final = 100
@@ -55,7 +54,7 @@ class LazyGroup(click.Group):
         """The installed commands of this group. Reading them takes a few ms, so this happens only when needed."""
         if self._prefix is None:
             return {}
-        from mesh.base.plugins import entry_points
+        from mesh.base.extras import entry_points
 
         found = {
             name.removeprefix(self._prefix): entry

@@ -11,13 +11,13 @@ from typing import Final, NamedTuple
 
 import click
 
-from mesh.base.shadowing import PACKAGES
 from mesh.cli.model import description_from
 from mesh.cli.options import PATH, with_json
 from mesh.cli.output import interruptible, print_result
 from mesh.errors import InputError
 
-TEMPLATES: Final = Path(__file__).parents[1] / "dev" / "templates"
+PACKAGES: Final = Path(__file__).parents[2]
+TEMPLATES: Final = PACKAGES / "mesh" / "dev" / "templates"
 SUFFIX: Final = ".template"
 RUNS: Final = "aira up --run $module.py"
 
@@ -130,7 +130,7 @@ def _module(name: str) -> str:
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", module):
         hint = "use up to 40 small letters, digits and hyphens, beginning with a letter"
         raise InputError(f"{name} can't be the name of a project", hint=hint, code="invalid-project-name")
-    taken = {*sys.stdlib_module_names, *sys.builtin_module_names, *(path.stem for path in Path(PACKAGES).iterdir())}
+    taken = {*sys.stdlib_module_names, *sys.builtin_module_names, *(path.stem for path in PACKAGES.iterdir())}
     if module in taken or module in ("zenoh", "twin", "test", "pytest", "click", "rich", "msgspec"):
         hint = "choose another name"
         raise InputError(f"Python has a module {module} already", hint=hint, code="invalid-project-name")

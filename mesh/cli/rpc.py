@@ -8,11 +8,10 @@ import click
 import msgspec
 
 from mesh.amounts import ETH
-from mesh.base.suggestions import nearest
 from mesh.cli.options import with_json, with_settings, with_timeout
 from mesh.cli.output import print_facts, print_json, print_line, print_table, printable
 from mesh.cli.status import describe_status
-from mesh.errors import InputError
+from mesh.errors import InputError, nearest
 from mesh.settings import NetworkSettings
 from schemas import InvalidRecord, Record, parse_address
 from schemas.decoding import InvalidData, decode_json

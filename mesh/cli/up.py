@@ -157,8 +157,7 @@ async def serve_market(
     anvil: Path | None = None,
     state: Path | None = None,
 ) -> None:
-    from mesh.dev.development import serve_chain
-    from mesh.dev.watched import run_watched
+    from mesh.dev.development import run_watched, serve_chain
     from mesh.market.provider import Provider, ProviderOptions, ProviderProcess, provider_file
     from mesh.network import Endpoints, Network
     from mesh.network.endpoints import with_free_ports

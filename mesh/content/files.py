@@ -8,8 +8,7 @@ import secrets
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, TypeAlias, cast
 
-from mesh.base.file_locks import lock, try_lock
-from mesh.base.private_files import open_private
+from mesh.base.private_files import lock, open_private, try_lock
 from mesh.content._errors import StoreFull
 
 if TYPE_CHECKING:

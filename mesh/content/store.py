@@ -33,14 +33,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Self, cast
 
 from mesh.base.database import SyncedDatabase
-from mesh.base.file_locks import is_locked, lock_shared, try_lock
 from mesh.base.log_context import log_event
 from mesh.base.private_files import (
     PRIVATE_FILE,
     PRIVATE_FOLDER,
+    is_locked,
+    lock_shared,
     make_private_folder,
     open_private,
     sync_directory,
+    try_lock,
 )
 from mesh.content._blocks import (
     BlockRef,

@@ -6,8 +6,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from mesh.base.extras import PackageMissing, needs_extra
-from mesh.base.plugins import entry_points
+from mesh.base.extras import PackageMissing, entry_points, needs_extra
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from mesh.base.blocklist import Blocklist, blocklist_at
 from mesh.base.flood import Drops, FairQueue
-from mesh.base.fresh_file import CHECK_INTERVAL
+from mesh.base.fresh_file import CHECK_INTERVAL, Blocklist, blocklist_at
 from mesh.base.lifecycle import Role
 from mesh.base.log_context import LogSource, source_context
 from mesh.base.outage_log import OutageLog

@@ -21,8 +21,7 @@ from mesh.base.background import Background, call_in_loop
 from mesh.base.flood import Drops, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
-from mesh.base.suggestions import nearest
-from mesh.errors import AiraError, RemoteError, public_text
+from mesh.errors import AiraError, RemoteError, nearest, public_text
 from schemas import InvalidRecord, Record, RpcKey
 from schemas.rpc import SERVICES, SPENDING
 

@@ -26,9 +26,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 import zenoh
 
 from mesh.base.background import call_in_loop
-from mesh.base.blocklist import Blocklist
 from mesh.base.flood import HEAVIEST, REPORT_INTERVAL
-from mesh.base.fresh_file import CHECK_INTERVAL
+from mesh.base.fresh_file import CHECK_INTERVAL, Blocklist
 from mesh.base.log_context import log_event
 from mesh.errors import ClosedError
 from mesh.network import sending

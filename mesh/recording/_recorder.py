@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Literal, Self, TypeAlias, get_args
 
 from mesh.base.clock import SYSTEM_CLOCK
-from mesh.base.file_locks import try_lock
 from mesh.base.log_context import log_event
-from mesh.base.private_files import make_missing_folders, open_private, sync_directory
+from mesh.base.private_files import make_missing_folders, open_private, sync_directory, try_lock
 from mesh.errors import ClosedError
 from mesh.recording._json_schemas import JsonSchemas
 from mesh.recording._mcap_writer import McapWriter, check_message

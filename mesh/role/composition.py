@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from mesh.base.blocklist import blocklist_at
+from mesh.base.fresh_file import blocklist_at
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff
 from mesh.content import Exchange, Store

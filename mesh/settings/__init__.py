@@ -1,10 +1,10 @@
 """Settings: the options in groups, and how they are loaded."""
 
-from mesh.settings._loading import NOT_OPTIONS, load
 from mesh.settings.groups import (
     DEFAULTS,
     LONGEST,
     MEANING,
+    NOT_OPTIONS,
     OPTIONS,
     AccountSettings,
     ChainSettings,
@@ -20,5 +20,6 @@ from mesh.settings.groups import (
     StorageSettings,
     TelemetrySettings,
     ValidatorSettings,
+    load,
     options_of,
 )

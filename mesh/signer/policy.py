@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from mesh.amounts import XRT, InvalidAmount, Unit
 from mesh.base.hours import Hours
-from mesh.base.suggestions import nearest
-from mesh.errors import ConfigurationError, InputError
+from mesh.errors import ConfigurationError, InputError, nearest
 from schemas import parse_address
 from schemas.allowed import MOST_VALUES, AllowedTopics, TomlFault, ValueFault
 from schemas.cid import is_cid

@@ -1,4 +1,5 @@
-"""The robots that are present on a lighthouse's channel: their profiles, their names, and their addresses by name.
+"""The robots that are present on a lighthouse's channel: their profiles, their names, their addresses by name, and
+their quotes: what they want for a job, and when they would do it. Quotes bind nobody, and cost nothing.
 
 A name is its owner's word, and anybody may choose any. So a name stands beside the address, and resolves to one only
 while no other robot that is present has it.
@@ -6,19 +7,22 @@ while no other robot that is present has it.
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections import Counter
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.errors import InputError
-from mesh.watching.market import TIMEOUT, signed_answers
+from mesh.watching.market import TIMEOUT, query_all, signed_answers
 from mesh.watching.presence import BATCH, PATIENCE, present
-from schemas import ProfileKey, parse_address
+from schemas import InvalidRecord, ProfileKey, RpcKey, parse_address
 from schemas.address import shortened
 from schemas.profiles import LARGEST_PROFILE, Profile, ProfileState
+from schemas.rpc import Quote, QuoteRequest
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
@@ -27,6 +31,7 @@ if TYPE_CHECKING:
 
     from mesh.chain import Chain
     from mesh.network import Channel
+    from schemas.signing import Signer
 
 KEPT: Final = 60.0
 """Seconds for which the profile of a robot is not asked for again, …"""
@@ -225,3 +230,48 @@ async def robot_address(session: zenoh.Session, channel: Channel, named: str, *,
     if named[:2].lower() == "0x":
         return parse_address(named)
     return (await RobotDirectory(session, channel).named(named, model=model)).address
+
+
+QUOTE_TIMEOUT: Final = 2.0
+"""Seconds that robots have to answer by default."""
+ASKED: Final = 64
+"""Robots that are asked at once, at most."""
+
+
+async def asked_quotes(
+    session: zenoh.Session,
+    channel: Channel,
+    *,
+    asker: Signer,
+    robots: Collection[str],
+    model: str,
+    objective: str,
+    token: str = "",
+    timeout: float = QUOTE_TIMEOUT,
+) -> list[Quote]:
+    """The quotes of these `robots` (addresses) that arrive in `timeout` seconds: the cheapest first, refusals last.
+
+    Costs are compared within a token only: those in `token` (an address) come first, then each other token's.
+    """
+    request = QuoteRequest(
+        model=model,
+        objective=objective,
+        lighthouse=channel.lighthouse,
+        asker=asker.address,
+        nonce=secrets.token_hex(16),
+        time=int(time.time()),
+    ).signed_by(asker)
+    keys = {str(RpcKey(robot, "quote")): robot for robot in [*robots][:ASKED]}
+    found: dict[str, Quote] = {}
+    for reply in await query_all(session, keys, payload=request.encode(), timeout=timeout):
+        if reply.ok is None:
+            continue
+        with suppress(InvalidRecord):
+            quote = Quote.decode(reply.ok.payload.to_bytes())
+            is_asked = keys.get(str(reply.ok.key_expr)) == quote.agent and quote.request == request.identity
+            if is_asked and quote.agent not in found and quote.is_signed:
+                found[quote.agent] = quote
+    return sorted(
+        found.values(),
+        key=lambda one: (bool(one.code), one.token != token, one.token, one.cost, one.start, one.agent),
+    )

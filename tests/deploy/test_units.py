@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from mesh.cli import main
 from mesh.settings import OPTIONS
-from mesh.settings._loading import PREFIX
+from mesh.settings.groups import PREFIX
 from tests.support.peers import require
 
 if TYPE_CHECKING:

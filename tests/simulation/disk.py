@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
-from mesh.base.file_locks import is_locked
+from mesh.base.private_files import is_locked
 from tests.simulation.threads import scheduler
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from mesh.base.blocklist import Blocklist, blocklist_at
-from mesh.base.fresh_file import CHECK_INTERVAL
+from mesh.base.fresh_file import CHECK_INTERVAL, Blocklist, blocklist_at
 from mesh.errors import ConfigurationError
 from mesh.network import MarketRules, MessageValidator, message_key
 from schemas import Demand, Signer, encode

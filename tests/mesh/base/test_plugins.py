@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.base.plugins import entry_points
+from mesh.base.extras import entry_points
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -40,7 +40,7 @@ def test_an_entry_point_is_loaded_and_names_its_package(tmp_path: Path, monkeypa
 
 def test_reading_them_does_not_import_importlib_metadata() -> None:
     program = (
-        "import sys; from mesh.base.plugins import entry_points; entry_points('aira.dialects')['frames'].load();"
+        "import sys; from mesh.base.extras import entry_points; entry_points('aira.dialects')['frames'].load();"
         "sys.exit('importlib.metadata' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mesh.base.terminal import accept_all_characters
+from mesh.__main__ import accept_all_characters
 from tests.support.commands import AIRA, environment
 
 BLINK = Path(__file__).parents[3] / "examples" / "blink" / "blink.mcap"
@@ -20,7 +20,7 @@ ENCODINGS = ("latin-1", "koi8-r", "ascii", "cp1251", "utf-8")
 HELP = """
 import click
 from mesh.cli import main
-from mesh.base.terminal import accept_all_characters
+from mesh.__main__ import accept_all_characters
 
 def show(command, context):
     click.echo(command.get_help(context))

@@ -153,8 +153,8 @@ def test_a_command_of_the_core_can_not_be_replaced(root: click.Group) -> None:
 def test_small_commands_read_no_entry_points(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     program = (
-        "import sys; from mesh.cli import main\n"
-        f"main(['cid', {str(tmp_path / 'file')!r}], standalone_mode=False)\n"
-        "print('mesh.base.plugins' in sys.modules)"
+        "import mesh.base.extras as extras; from mesh.cli import main\n"
+        "extras.entry_points = None\n"
+        f"main(['cid', {str(tmp_path / 'file')!r}], standalone_mode=False)"
     )
-    assert run(sys.executable, "-c", program).stdout.splitlines()[-1] == "False"
+    assert run(sys.executable, "-c", program).returncode == 0

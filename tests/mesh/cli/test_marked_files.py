@@ -9,7 +9,7 @@ import pytest
 
 from bridges.ipfs.service import authorization_of
 from bridges.web.cli import token_in
-from mesh.base.blocklist import Blocklist
+from mesh.base.fresh_file import Blocklist
 from mesh.chain import Account
 from mesh.chain._accounts import KeyfileError
 from mesh.errors import ConfigurationError

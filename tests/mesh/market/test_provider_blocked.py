@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from mesh.base.blocklist import Blocklist
+from mesh.base.fresh_file import Blocklist
 from mesh.market import order_id
 from schemas import verify_message
 from tests.support.waiting import until, until_found
