@@ -1,18 +1,22 @@
 from mesh.agent.agent import Agent as Agent, ModelUnfit as ModelUnfit
 from mesh.agent._answers import Answer as Answer, Unanswered as Unanswered
-from mesh.agent.contracts import Contract as Contract, Outcome as Outcome, Progress as Progress
-from mesh.agent.errors import (
-    Declined as Declined,
-    DemandDeclined as DemandDeclined,
+from mesh.agent.contracts import (
+    Contract as Contract,
     LiabilityReverted as LiabilityReverted,
-    OrderClosed as OrderClosed,
-    OrderExpired as OrderExpired,
-    OtherRobot as OtherRobot,
+    Outcome as Outcome,
+    Progress as Progress,
 )
-from mesh.agent.handlers import Job as Job, JobFailed as JobFailed
+from mesh.agent.handlers import Declined as Declined, Job as Job, JobFailed as JobFailed
+from mesh.agent.hiring import DemandDeclined as DemandDeclined
 from mesh.agent.ledger import Phase as Phase, WrongPhase as WrongPhase
 from mesh.agent.objectives import ObjectiveNotFetched as ObjectiveNotFetched, ObjectiveUnfit as ObjectiveUnfit
-from mesh.agent.orders import OrderState as OrderState, TooManyOffers as TooManyOffers
+from mesh.agent.orders import (
+    OrderClosed as OrderClosed,
+    OrderExpired as OrderExpired,
+    OrderState as OrderState,
+    OtherRobot as OtherRobot,
+    TooManyOffers as TooManyOffers,
+)
 from mesh.agent.trade import Order as Order
 from mesh.agent.validators import AnnouncedValidator as AnnouncedValidator, ValidatorSilent as ValidatorSilent
 from mesh.amounts import XRT as XRT

@@ -19,8 +19,8 @@ from mesh.base.background import Background
 from mesh.base.extras import needs_extra
 from mesh.cli.options import ADDRESS, FILE, with_settings
 from mesh.cli.output import announce
+from mesh.role.program import WatcherStatus
 from mesh.role.running import open_when_ready, run_until_stopped
-from mesh.role.status import WatcherStatus
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings
 from mesh.telemetry.serving import Telemetry
 from schemas import parse_address

@@ -10,7 +10,7 @@ import msgspec
 
 from mesh.base.log_context import log_event
 from mesh.errors import InvalidMessage
-from mesh.market.withdrawals import Withdrawals
+from mesh.market.store import Withdrawals
 from schemas import (
     Demand,
     Message,

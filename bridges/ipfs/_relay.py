@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from mesh.market.withdrawals import Withdrawals
+    from mesh.market.store import Withdrawals
     from schemas import PresenceKey
 
 DEDUPLICATION_WINDOW: Final = 600.0

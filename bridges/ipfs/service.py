@@ -21,8 +21,7 @@ from mesh.base.outage_log import OutageLog
 from mesh.base.retry import REMOTE, Backoff, RetryPolicy
 from mesh.content import Exchange
 from mesh.errors import ChainError, ConfigurationError
-from mesh.market.store import MarketStore
-from mesh.market.withdrawals import Withdrawals
+from mesh.market.store import MarketStore, Withdrawals
 from mesh.network import MarketRules
 from mesh.role.composition import open_store
 from mesh.telemetry.metrics import drop_family

@@ -28,7 +28,7 @@ from mesh.base.http_server import HttpServer
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.errors import AiraError, public_text
-from mesh.role.status import WatcherStatus
+from mesh.role.program import WatcherStatus
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.orders import deadline_in, lifetime_of, withdrawal_of
 from mesh.base.background import Background
+from mesh.base.database import LedgerUnusable
 from mesh.base.flood import FairQueue
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.content import ContentUnavailable
 from mesh.errors import AiraError, RemoteError
 from mesh.recording import ABOUT, Played, RecordingAbout, open_objective
-from mesh.role.database import LedgerUnusable
 from mesh.watching.market import LARGEST, LIMITS
 from schemas import Demand, Result, Verified, message_hash
 from schemas.payloads import plain_value

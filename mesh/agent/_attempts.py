@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec.structs import replace
 
-from mesh.agent.contracts import Progress, fail_future, followed_job, report, request_stop
-from mesh.agent.errors import ENDED, OrderClosed, OrderExpired
+from mesh.agent.contracts import ENDED, Progress, fail_future, followed_job, report, request_stop
 from mesh.agent.jobs import STOPPED
+from mesh.agent.orders import OrderClosed, OrderExpired
 from mesh.base.log_context import liability_context, log_event
 from mesh.errors import AiraError, InputError
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
 
-from mesh.agent.errors import Declined
+from mesh.agent.handlers import Declined
 from mesh.agent.orders import ROBOT_STOPPED, robot_stopped
 from mesh.amounts import InvalidAmount
 from mesh.base.hours import Hours

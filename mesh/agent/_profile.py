@@ -20,10 +20,10 @@ import msgspec
 
 from mesh.agent.ledger import Phase
 from mesh.agent.orders import ROBOT_STOPPED
+from mesh.base.database import LedgerUnusable
 from mesh.base.flood import Rate
 from mesh.errors import ChainError, ConfigurationError
 from mesh.network.services import answering
-from mesh.role.database import LedgerUnusable
 from mesh.role.handover import handovers_to
 from schemas import ProfileKey
 from schemas.cid import is_cid

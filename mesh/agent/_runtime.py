@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import deque
 from contextlib import suppress
 from functools import partial
@@ -17,17 +18,15 @@ import zenoh
 from msgspec.structs import replace
 
 from mesh.agent._notifications import Notifier, OwnerWatch
-from mesh.agent._outbox import result_identity
 from mesh.agent._owner_rules import OwnerRules, accepted_values
 from mesh.agent._profile import OwnProfile
-from mesh.agent._quotes import Quoting
 from mesh.agent._services import offer_services
-from mesh.agent._status import AgentStatus
+from mesh.agent.components import AgentComponents
 from mesh.agent.contracts import ContractReports, Outcome
-from mesh.agent.demands import Acceptance, DemandDispatcher
+from mesh.agent.demands import Acceptance, DemandDispatcher, Quoting
 from mesh.agent.handlers import call
 from mesh.agent.jobs import Executor, check_stop, reason_in, stop_devices
-from mesh.agent.ledger import TO_BE_DONE, UNFINISHED, Phase, advance
+from mesh.agent.ledger import TO_BE_DONE, UNFINISHED, Phase, advance, result_identity
 from mesh.agent.objectives import Objectives
 from mesh.agent.trade import Trader
 from mesh.agent.validators import ValidatorDirectory
@@ -51,8 +50,10 @@ from mesh.errors import AiraError, ChainError, ConfigurationError
 from mesh.network.services import answering, declared
 from mesh.role.following import follow_chain
 from mesh.role.local_stop import ANSWER_SECONDS, LocalAnswer, LocalRequest, listening, stop_folder
+from mesh.role.program import RoleStatus
 from mesh.role.refunds import DueRefunds
 from mesh.telemetry.logs import LogService
+from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge
 from schemas import (
     ZERO_ADDRESS,
     Demand,
@@ -67,12 +68,12 @@ from schemas import (
 from schemas.cid import is_cid
 from schemas.keys import EthEventKey, EventKey, LiabilityEvent, ProgressKey, market_selector
 from schemas.rpc import ApprovalEvent, TransferEvent
+from schemas.status import ALIVE, OFF, StoreUse, Work
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Sequence
     from contextlib import AbstractAsyncContextManager, AbstractContextManager, AsyncExitStack
 
-    from mesh.agent.components import AgentComponents
     from mesh.agent.handlers import Handler, Handlers
     from mesh.agent.ledger import JobRecord
     from mesh.chain import ChainEvent
@@ -83,7 +84,6 @@ if TYPE_CHECKING:
     from schemas.model import ModelDescription
     from schemas.records import ControlRobot, DeviceStop, RobotControl
     from schemas.verdicts import ValidatorReport
-
 
 log = logging.getLogger(__name__)
 
@@ -696,3 +696,55 @@ class AgentRuntime(Lifecycle):
                 tell("job-failed", facts | {"reason": reason.text, "code": reason.code, "result": liability.result})
             case Phase.FINALIZED:
                 tell("job-paid" if liability.is_success else "job-refunded", facts | {"result": liability.result})
+
+
+class AgentStatus(RoleStatus[AgentComponents]):
+    """The metrics, the health and the service `status` of an agent with an account."""
+
+    role = "agent"
+
+    def __init__(self, parts: AgentComponents, executor: Executor, *, model: str = "") -> None:
+        super().__init__(parts)
+        self._executor = executor
+        self._model = model
+
+    def health(self) -> dict[str, str]:
+        """The state of each part; the parts are the nodes of the legacy stack. The signer's key is in memory."""
+        executor = ALIVE if self._executor.is_running else "has not begun"
+        shared = super().health()
+        return {
+            "executor": executor if self.parts.settings.enable_executor else OFF,
+            "channel": shared["channel"],
+            "signer": ALIVE,
+            "listener": shared["listener"],
+        }
+
+    async def _own_status(self, store: StoreUse) -> dict[str, Any]:
+        ledger, waiting = self.parts.ledger, sum((await self._waiting()).values())
+        return {"model": self._model, "work": Work(jobs=await ledger.jobs_by_phase(), outbox=waiting, store=store)}
+
+    async def _own_families(self) -> tuple[MetricFamily, ...]:
+        now, phases = time.time(), await self.parts.ledger.phases()
+        counts = {phase.value: 0.0 for phase in Phase} | {phase: float(count) for phase, count, _ in phases}
+        ages = {phase.value: 0.0 for phase in UNFINISHED}
+        ages |= {phase: max(0.0, now - since) for phase, _, since in phases if phase in ages}
+        age = "Seconds since the first of the jobs in a phase entered it; 0 without one"
+        kinds = {"demand": 0, "offer": 0, "withdrawal": 0, "result": 0} | await self._waiting()
+        unsettled = "Messages that are sent again until their effect is on the chain"
+        recorded, traffic = self._executor.recordings.recorders.statistics(), self.parts.exchange.statistics()
+        lies = sum(traffic.corrupt_blocks.values())
+        return (
+            by_label("aira_jobs", "gauge", "Jobs in the ledger, by phase", "phase", counts),
+            by_label("aira_job_standing_seconds", "gauge", age, "phase", ages),
+            by_label("aira_outbox_messages", "gauge", unsettled, "kind", kinds),
+            counter("aira_recorded_messages_total", "Messages written to recordings", recorded.recorded),
+            counter("aira_recording_lost_messages_total", "Messages that could not be recorded", recorded.lost),
+            gauge("aira_recording_lag_seconds", "Seconds that a message has waited to be written", recorded.lag),
+            counter("aira_content_fetched_bytes_total", "Bytes of content fetched from others", traffic.fetched_bytes),
+            counter("aira_content_served_blocks_total", "Blocks of content served to others", traffic.served),
+            counter("aira_content_lies_total", "Blocks of content that did not match their CID", lies),
+        )
+
+    async def _waiting(self) -> dict[str, int]:
+        """The messages in the outbox, by kind."""
+        return await self.parts.ledger.waiting_by_kind(head=self.parts.chain_head.contract_block)

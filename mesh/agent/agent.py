@@ -17,7 +17,6 @@ from mesh.agent._attempts import Attempts, check_attempts
 from mesh.agent.components import working
 from mesh.agent.contracts import nothing
 from mesh.agent.demands import HANDLED
-from mesh.agent.errors import DemandDeclined, OrderClosed
 from mesh.agent.handlers import (
     ANY_TOPIC,
     DemandHandler,
@@ -42,10 +41,11 @@ from mesh.agent.handlers import (
     invalid_topic,
     repeat,
 )
+from mesh.agent.hiring import DemandDeclined
 from mesh.agent.jobs import check_stop
 from mesh.agent.ledger import WrongPhase
 from mesh.agent.objectives import ObjectiveUnfit
-from mesh.agent.orders import HANDLED_FOR, OrderState
+from mesh.agent.orders import HANDLED_FOR, OrderClosed, OrderState
 from mesh.agent.statement import period, read_statement
 from mesh.agent.validators import ValidatorSilent, check_named
 from mesh.amounts import XRT
@@ -56,8 +56,7 @@ from mesh.network.readings import LARGEST_READING
 from mesh.recording import encode_described, pack_values
 from mesh.role.composition import watching
 from mesh.role.models import Models, description_in
-from mesh.role.program import RESEND, OpenRole, Program
-from mesh.role.status import WatcherStatus
+from mesh.role.program import RESEND, OpenRole, Program, WatcherStatus
 from mesh.settings import load
 from mesh.watching.robots import QUOTE_TIMEOUT, RobotDirectory, asked_quotes, labelled, robot_address
 from schemas import (
@@ -83,8 +82,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Coroutine, Iterator, Mapping
     from contextlib import AsyncExitStack
 
-    from mesh.agent._runtime import AgentRuntime
-    from mesh.agent._status import AgentStatus
+    from mesh.agent._runtime import AgentRuntime, AgentStatus
     from mesh.agent.components import AgentComponents
     from mesh.agent.contracts import Contract, OnProgress
     from mesh.agent.handlers import Job, TopicHandlers

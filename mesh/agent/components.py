@@ -6,8 +6,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from mesh.agent._outbox import Outbox
-from mesh.agent.ledger import Ledger
+from mesh.agent.ledger import Ledger, Outbox
 from mesh.base.private_files import make_private_folder
 from mesh.errors import ConfigurationError
 from mesh.role.composition import RoleParts, open_parts, opened_chain

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, Type
 
 import msgspec
 
-from mesh.agent.errors import LiabilityReverted
 from mesh.agent.jobs import Reason, check_stop, read_reason
 from mesh.agent.validators import accepted_of
 from mesh.base.background import Background, call_in_loop
@@ -29,7 +28,7 @@ from mesh.base.flood import BoundedDict, FairQueue, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import liability_context, log_event
 from mesh.content import ContentUnavailable
-from mesh.errors import AiraError
+from mesh.errors import AiraError, ClosedError
 from mesh.network import Pump, ServiceFailed, call
 from mesh.network.services import declared
 from mesh.watching.market import JobEvent, query_all, read_event, signed_answers
@@ -62,6 +61,9 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
+
+ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: demands stay open until their deadline")
+"""The error of those who wait for something when the agent ends."""
 
 DROPPED: Final = {"reject": "rejections", "decline": "declines", "report": "reports"}
 """How those that were dropped are counted."""
@@ -607,6 +609,18 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True, repr_omit_defaults=True
     """The contract's address."""
     earlier: tuple[Outcome, ...] = ()
     """How the attempts before it failed, the first one first, if it was ordered with `retry`."""
+
+
+class LiabilityReverted(AiraError, code="liability-reverted"):
+    """A reorganisation reverted the contract `liability`, and it was not created again by its orders' deadline."""
+
+    def __init__(self, liability: str, deadline: int) -> None:
+        super().__init__(
+            f"a reorganisation reverted the contract {liability}, and it was not created again by block {deadline}",
+            hint="it pays nobody; post a new order, unless another contract was created from its orders",
+        )
+        self.liability = liability
+        self.deadline = deadline
 
 
 class JobAttempts(Protocol):

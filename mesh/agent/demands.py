@@ -2,7 +2,8 @@
 
 Anybody can sign demands, with any number of keys. What a handler does with one may be expensive (fetching the
 objective, offering), so few are handled at once, and those that pay nothing never take all places. What an agent does
-not work for it declines: it says so, signed, and why.
+not work for it declines: it says so, signed, and why. `Acceptance` answers demands for this robot alone, `Quoting` what
+a job would cost: what its handler says, or by default its owner's price, or that of its model's description.
 """
 
 from __future__ import annotations
@@ -15,39 +16,39 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from msgspec.structs import replace
 
 from mesh.agent._owner_rules import FOR_NOW
-from mesh.agent.errors import Declined
-from mesh.agent.handlers import call
+from mesh.agent.handlers import Declined, call, call_handler
 from mesh.agent.objectives import Buyer, ObjectiveNotFetched, ObjectiveUnfit
-from mesh.agent.orders import ALONE, DEMAND_TAKEN, EQUAL_DECLINED, HANDLED_FOR, TooManyOffers
+from mesh.agent.orders import ALONE, DEMAND_TAKEN, EQUAL_DECLINED, FEWEST_BLOCKS, HANDLED_FOR, TooManyOffers
+from mesh.base.database import LedgerUnusable
 from mesh.base.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.content import ContentTooLarge, ContentUnavailable
 from mesh.errors import AiraError, ContentError, InvalidMessage, public_text
-from mesh.role.database import LedgerUnusable
 from schemas import DeclineKey, Offer, Verified, message_hash
 from schemas.cid import is_cid
-from schemas.rpc import Accepted, SendOffer
+from schemas.rpc import Accepted, Quote, SendOffer
 from schemas.signing import LONGEST_DETAIL, Decline
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from mesh.agent._owner_rules import OwnerRules
+    from mesh.agent._profile import OwnProfile
     from mesh.agent.components import AgentComponents
-    from mesh.agent.handlers import Handler
+    from mesh.agent.handlers import Handler, QuoteHandler
     from mesh.agent.objectives import Objectives
     from mesh.agent.trade import Trader
     from mesh.base.flood import Drops
     from mesh.network import Channel, Subscription
     from schemas import Demand, Signer
-    from schemas.rpc import AcceptDemand
-
+    from schemas.model import ModelDescription
+    from schemas.rpc import AcceptDemand, QuoteRequest
 
 log = logging.getLogger(__name__)
 
 PER_MAKER: Final = Rate(per_second=1.0, burst=32)
 """Declines of one maker's demands."""
-TOTAL: Final = Rate(per_second=10.0, burst=200)
+DECLINES: Final = Rate(per_second=10.0, burst=200)
 """Declines in all: each is signed, logged and published."""
 
 
@@ -98,7 +99,7 @@ class DeclinePublisher:
         self._channel = channel
         self._signer = signer
         self._drops = drops
-        self._limiter = RateLimiter(per_sender=PER_MAKER, total=TOTAL)
+        self._limiter = RateLimiter(per_sender=PER_MAKER, total=DECLINES)
 
     def decline(self, demand: Verified[Demand], grounds: Grounds) -> None:
         """Say to the maker of a demand why this agent does not work for it."""
@@ -325,7 +326,7 @@ class Acceptance:
         self._objectives = objectives
         self._handlers = handlers
         self._model = model
-        self._limiter = RateLimiter(per_sender=PER_MAKER, total=TOTAL)
+        self._limiter = RateLimiter(per_sender=PER_MAKER, total=DECLINES)
         self._logged = RateLimiter(per_sender=LOGGED)
         self._places = asyncio.Semaphore(FREE_HANDLED)
 
@@ -390,3 +391,82 @@ class Acceptance:
         offer = answered.offer.signed
         assert isinstance(offer, Offer)
         return offer
+
+
+PER_ASKER: Final = Rate(per_second=1.0, burst=32)
+"""Quotes for one asker …"""
+QUOTES: Final = Rate(per_second=10.0, burst=200)
+"""… and for all."""
+
+
+class Quoting:
+    """The service `quote` of a robot: a quote binds nobody. What its owner's `rules` exclude is declined."""
+
+    def __init__(
+        self,
+        parts: AgentComponents,
+        profile: OwnProfile,
+        rules: OwnerRules,
+        objectives: Objectives,
+        handlers: Sequence[QuoteHandler],
+        description: ModelDescription | None,
+        *,
+        model: str,
+    ) -> None:
+        self._parts = parts
+        self._profile = profile
+        self._rules = rules
+        self._objectives = objectives
+        self._handlers = handlers
+        self._seconds = float((None if description is None else description.seconds) or 0)
+        self._model = model
+        self._limiter = RateLimiter(per_sender=PER_ASKER, total=QUOTES)
+
+    async def quote(self, request: QuoteRequest) -> Quote:
+        """The signed reply. Raises `InvalidMessage` for a request that is not signed, or for another market."""
+        if not request.is_signed:
+            raise InvalidMessage("signature", "the request is not signed by its asker")
+        if request.lighthouse != self._parts.channel.lighthouse:
+            raise InvalidMessage("lighthouse", f"made for {request.lighthouse}, not for this market")
+        agent, identity = self._parts.signer.address, request.identity
+        try:
+            quote = await self._quote(request)
+        except AiraError as error:
+            grounds = grounds_of(error)
+            code, detail = ("failed", "its handler failed") if grounds is None else grounds
+            if grounds is None:
+                log.warning("no quote: %s", error, extra=log_event("quote-failed", code=error.code))
+            detail = public_text(detail, longest=LONGEST_DETAIL)
+            quote = Quote(agent=agent, request=identity, code=code, detail=detail)
+        return quote.signed_by(self._parts.signer)
+
+    async def _quote(self, request: QuoteRequest) -> Quote:
+        parts = self._parts
+        if not self._limiter.allow(request.asker):
+            raise Declined("busy", "too many ask")
+        if (closed := self._rules.closed()) is not None:
+            raise closed
+        if is_cid(self._model) and request.model != self._model:
+            raise Declined("other-model", f"it works for the model {self._model}")
+        price: int | str | None = self._rules.price or None
+        HANDLED_FOR.set(buyer := Buyer(request.asker, pays=False))
+        if (excluded := await self._objectives.refusal(request.objective, buyer)) is not None:
+            raise excluded
+        for handler in self._handlers:
+            price = await call_handler(handler, request)
+        if price is None:
+            raise Declined("no-price", "it names no price; its answer to a demand says whether that is enough")
+        amounts = partial(parts.chain.tokens.amounts, price, default=parts.settings.erc20_token)
+        paid_in, _, (cost,) = await parts.chain.retrying(amounts, outages=parts.outages)
+        if (refused := await self._rules.refusal(request.asker, cost=cost, token=paid_in)) is not None:
+            raise refused
+        _, wait = await self._profile.queue()
+        return Quote(
+            agent=parts.signer.address,
+            request=request.identity,
+            cost=cost,
+            token=paid_in,
+            start=float(wait),
+            seconds=self._seconds,
+            until=parts.chain_head.contract_block + FEWEST_BLOCKS,
+        )

@@ -28,7 +28,7 @@ import msgspec
 
 from mesh.base.background import call_in_loop, in_daemon_thread
 from mesh.base.log_context import log_event
-from mesh.errors import AiraError, ClosedError, ConfigurationError
+from mesh.errors import AiraError, ClosedError, ConfigurationError, InputError
 from mesh.network import sending
 from mesh.recording import encode_described
 from schemas import Demand, Liability, Offer, Result, Verified
@@ -37,6 +37,7 @@ from schemas.cid import is_cid
 from schemas.errors import InvalidKey, InvalidPayload
 from schemas.keys import LiabilityTopicKey, topic_chunks
 from schemas.payloads import Empty, PayloadType, SentDefinitions, String, decode_value, payload_type, plain_value
+from schemas.signing import LONGEST_DETAIL, is_word
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -180,6 +181,21 @@ class JobMessages:
 
 STOPPING: Final = ContextVar("stopping", default="")
 """The job that the running code, a handler of `Agent.on_stop`, brings to a safe state."""
+
+
+class Declined(AiraError, code="declined"):
+    """Raise it in a demand's handler: the agent does not work for this demand, and its maker gets a `Decline`.
+
+    `reason` is a word for programs (`too-cheap`: lower-case letters, digits, hyphens), `detail` a line for people, cut
+    after `LONGEST_DETAIL` characters. Raises `InputError` for another word.
+    """
+
+    def __init__(self, reason: str, detail: str = "") -> None:
+        if not is_word(reason):
+            raise InputError(f"{reason!r} is not a valid code", hint="use lower-case letters, digits and hyphens")
+        super().__init__(f"declined ({reason}): {detail}" if detail else f"declined ({reason})")
+        self.reason = reason
+        self.detail = detail[:LONGEST_DETAIL]
 
 
 class JobFailed(AiraError, code="job-failed"):

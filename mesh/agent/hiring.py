@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
 
-from mesh.agent.errors import DemandDeclined
 from mesh.agent.orders import DEMAND_TAKEN
 from mesh.base.log_context import log_event
-from mesh.errors import AiraError, RemoteError
+from mesh.errors import AiraError, RemoteError, public_text
 from mesh.network.services import call
 from schemas import message_hash, verify_message
 from schemas.messages import equal_terms
@@ -23,7 +22,7 @@ from schemas.rpc import AcceptDemand, Accepted, OrderPair, SendDemand, SendOffer
 from schemas.signing import Decline, Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     import zenoh
 
@@ -38,6 +37,23 @@ ACCEPT_TIMEOUT: Final = 30.0
 """Seconds that a robot has to decide: it may fetch the objective first."""
 PROVIDERS: Final = 32
 """Providers that get a pair, at most."""
+
+
+class DemandDeclined(RemoteError, code="demand-declined"):
+    """The robot that a demand is for, or all that are present, do not work for it: `declines` has the word of each.
+
+    `order` is the demand's hash.
+    """
+
+    def __init__(self, order: str, declines: Sequence[Decline]) -> None:
+        said = "; ".join(f"{one.agent}: {public_text(one.detail) or one.code} ({one.code})" for one in declines[:3])
+        more = f"; and {len(declines) - 3} more" if len(declines) > 3 else ""
+        super().__init__(
+            f"declined by {said}{more}",
+            hint="offer other terms, or ask another robot; `aira robots` shows who is present",
+        )
+        self.order = order
+        self.declines = tuple(declines)
 
 
 async def asked_offer(session: zenoh.Session, request: AcceptDemand) -> Accepted:

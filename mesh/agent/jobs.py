@@ -32,10 +32,10 @@ import zenoh
 from msgspec.structs import replace
 
 import mesh
-from mesh.agent._outbox import outgoing
 from mesh.agent.handlers import STOPPING, Job, call
-from mesh.agent.ledger import STARTABLE, TO_BE_DONE, Phase, Stop, WrongPhase, advance
+from mesh.agent.ledger import STARTABLE, TO_BE_DONE, Outgoing, Phase, Stop, WrongPhase, advance
 from mesh.base.background import Background, in_daemon_thread
+from mesh.base.database import LedgerUnusable
 from mesh.base.extras import needs_extra
 from mesh.base.log_context import liability_context, log_event, with_liability_context
 from mesh.base.private_files import make_private_folder, sync_directory
@@ -55,7 +55,6 @@ from mesh.recording import (
     play,
 )
 from mesh.recording.ros import legacy_topic
-from mesh.role.database import LedgerUnusable
 from mesh.role.local_stop import Hold, stop_folder
 from schemas import Result
 from schemas.errors import InvalidPayload, InvalidRecord
@@ -670,7 +669,7 @@ class Executor:
         if not is_pinned:  # it was released if a reorganisation reverted the job
             await asyncio.to_thread(self._store.pin, result, address)
         signed = self._signer.sign(Result(liability=address, result=result, success=success))
-        await self._ledger.complete(address, success=success, result=result, note=note, outgoing=outgoing(signed))
+        await self._ledger.complete(address, success=success, result=result, note=note, outgoing=Outgoing.of(signed))
 
     @with_liability_context
     async def start(self, address: str) -> None:

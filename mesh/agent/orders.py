@@ -32,7 +32,7 @@ from mesh.agent.contracts import (
     report,
     stated,
 )
-from mesh.agent.errors import Declined, OrderClosed, OrderExpired
+from mesh.agent.handlers import Declined
 from mesh.base.flood import BoundedDict
 from mesh.errors import AiraError, InputError
 from schemas import ZERO_ADDRESS, Demand, Offer, Withdrawal, message_hash
@@ -72,6 +72,49 @@ class OrderState(StrEnum):
 def withdrawal_of(order: Demand | Offer) -> Withdrawal:
     """The withdrawal of an order, to be signed by its maker."""
     return Withdrawal(order=message_hash(order).hex(), lighthouse=order.lighthouse, deadline=order.deadline)
+
+
+class OrderClosed(AiraError, code="order-closed"):
+    """The order is not open any more: `state` is `withdrawn`, or `matched`, with the contract's address `liability`."""
+
+    def __init__(self, order: str, state: str, *, liability: str = "") -> None:
+        became = f"became the contract {liability}" if liability else f"was {state}"
+        super().__init__(
+            f"the order {order[:16]}… {became}",
+            hint="" if liability else "it may still become a contract until its deadline; see `aira order list`",
+        )
+        self.order = order
+        self.state = state
+        self.liability = liability
+
+
+class OrderExpired(AiraError, code="order-expired"):
+    """No offer matched the order before its deadline, the block `deadline`. `order` is its hash."""
+
+    def __init__(self, order: str, deadline: int) -> None:
+        super().__init__(
+            f"no counterpart matched the order {order[:16]}… before block {deadline}",
+            hint="offer more, or give the order a longer lifetime",
+        )
+        self.order = order
+        self.deadline = deadline
+
+
+class OtherRobot(AiraError, code="other-robot"):
+    """A demand for `robot` (address) alone became the contract `liability` with another one, `promisor`.
+
+    A provider has broken its word, or somebody read the pair on its way to it.
+    """
+
+    def __init__(self, order: str, *, robot: str, promisor: str, liability: str) -> None:
+        super().__init__(
+            f"the order {order[:16]}… for {robot} became the contract {liability} with {promisor}",
+            hint="who sent its transaction is the provider that broke its word; `aira liability show` has more",
+        )
+        self.order = order
+        self.robot = robot
+        self.promisor = promisor
+        self.liability = liability
 
 
 @dataclass(eq=False)

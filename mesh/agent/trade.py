@@ -17,6 +17,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.agent.contracts import (
+    ENDED,
     Contract,
     Progress,
     WatchedContracts,
@@ -26,8 +27,8 @@ from mesh.agent.contracts import (
     report,
     seen_offers,
 )
-from mesh.agent.errors import ENDED, Declined, DemandDeclined, OtherRobot
-from mesh.agent.hiring import Hiring
+from mesh.agent.handlers import Declined
+from mesh.agent.hiring import DemandDeclined, Hiring
 from mesh.agent.orders import (
     ALONE,
     EQUAL_DECLINED,
@@ -36,6 +37,7 @@ from mesh.agent.orders import (
     AnsweredDemands,
     OpenOffers,
     OrderState,
+    OtherRobot,
     TermsWriter,
     TradedOrder,
     demand_taken,
@@ -43,13 +45,13 @@ from mesh.agent.orders import (
     withdrawal_of,
 )
 from mesh.base.background import Background
+from mesh.base.database import LedgerUnusable
 from mesh.base.flood import SENDERS, KnownSenders, Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.chain import Allowances, OrderAlreadyUsed, permit_fee
 from mesh.errors import AiraError, ChainError
 from mesh.network import PresentAgents
-from mesh.role.database import LedgerUnusable
 from schemas import Demand, Offer, Withdrawal, decode
 from schemas.messages import equal_terms, lasting_hash
 from schemas.signing import Decline, Refusal, Rejection

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from mesh.agent.errors import Declined
+from mesh.agent.handlers import Declined
 from mesh.amounts import XRT
 from mesh.base.flood import BoundedDict
 from mesh.errors import RemoteError

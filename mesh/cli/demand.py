@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from mesh.agent.errors import OrderExpired
+from mesh.agent.orders import OrderExpired
 from mesh.amounts import XRT
 from mesh.base.background import Background, in_daemon_thread
 from mesh.chain import permit_fee as permit_fee_of

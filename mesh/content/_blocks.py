@@ -12,14 +12,14 @@ import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from mesh.content._errors import ContentCorrupt
 from mesh.content.files import read_or_nothing
+from mesh.errors import ContentError
 from schemas.cid import parse_cid
 from schemas.errors import InputError
 from schemas.unixfs import MAX_BLOCK_SIZE, parse_block
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from schemas.unixfs import UnixfsNode
@@ -36,6 +36,23 @@ _SPARE_BLOCKS: Final = 1024
 _SMALLEST_CHUNK: Final = 1024
 _FRAMING: Final = 256
 """Bytes that a block may have besides the file's own, for the node and for each link. IPFS writes about 60 a link."""
+
+
+class ContentCorrupt(ContentError, code="content-corrupt"):
+    """Bytes do not have the hash that their CID says, or are not a file.
+
+    `reason` is machine-readable: `wrong-hash` or, for blocks with the right hash, `not-a-file`, `wrong-size`,
+    `empty-part`, `oversized-block`, `too-deep`, `too-many-blocks`, `not-indexed`. `holders` are the Zenoh ids of the
+    sessions that sent them (empty if they came from our disk, or from elsewhere).
+    """
+
+    def __init__(self, cid: str, why: str, *, reason: str = "wrong-hash", holders: Iterable[str] = ()) -> None:
+        self.holders = tuple(holders)
+        senders = f" (sent by {', '.join(self.holders)})" if self.holders else ""
+        super().__init__(f"{cid} is corrupt: {why}{senders}", hint="fetch it again from another holder")
+        self.cid = cid
+        self.why = why
+        self.reason = reason
 
 
 @dataclass(frozen=True, slots=True)

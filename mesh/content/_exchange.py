@@ -24,8 +24,8 @@ from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import Drops
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff, RetryPolicy
-from mesh.content._blocks import is_block
-from mesh.content._errors import ContentCorrupt, ContentUnavailable
+from mesh.content._blocks import ContentCorrupt, is_block
+from mesh.content.store import ContentUnavailable
 from mesh.errors import AiraError, ClosedError, ContentError, InvalidKey
 from schemas.keys import CidKey, cid_selector, parse_key, requested_cid
 from schemas.unixfs import MAX_BLOCK_SIZE

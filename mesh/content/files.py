@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, TypeAlias, cast
 
 from mesh.base.private_files import lock, open_private, try_lock
-from mesh.content._errors import StoreFull
+from mesh.errors import AiraError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -26,6 +26,18 @@ PART_PREFIX: Final = ".part-"
 _WRITE_BEHIND: Final = 8 << 20
 """Bytes written before the kernel is asked to start writing them to the disk."""
 _DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+
+
+class StoreFull(AiraError, code="store-full"):
+    """The store has no space for a file: its disk is full.
+
+    Or its quota is reached (`quota-reached`), even after evicting all that may be evicted.
+    """
+
+    def __init__(self, path: Path, *, why: str = "", hint: str = "", code: str = "") -> None:
+        hint = hint or "free some space, or move the store to another disk"
+        super().__init__(why or f"the disk of {path} is full", hint=hint, code=code)
+        self.path = path
 
 
 class Readable(Protocol):

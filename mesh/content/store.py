@@ -48,16 +48,17 @@ from mesh.content._blocks import (
     BlockRef,
     BlockSpan,
     CheckedFile,
+    ContentCorrupt,
     children_of,
     is_block,
     matches_tree,
     most_blocks,
     parse_node,
 )
-from mesh.content._errors import ContentCorrupt, ContentTooLarge, ContentUnavailable, StoreFull
 from mesh.content.files import (
     PART_PREFIX,
     PUT_PREFIX,
+    StoreFull,
     TemporaryFile,
     directory_lock,
     read_or_nothing,
@@ -87,6 +88,30 @@ CREATE TABLE IF NOT EXISTS block (
 ) WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS block_by_file ON block (file);
 """
+
+
+class ContentUnavailable(ContentError, code="content-unavailable"):
+    """None of the sources asked has the file, or one of its blocks."""
+
+    def __init__(self, cid: str, why: str) -> None:
+        super().__init__(
+            f"{cid} is not available: {why}", hint="check the CID, and that a machine with the file is on the network"
+        )
+        self.cid = cid
+        self.why = why
+
+
+class ContentTooLarge(ContentError, code="content-too-large"):
+    """A file is larger than the caller, or the store, allows. Sizes are in bytes."""
+
+    def __init__(self, cid: str, *, size: int, limit: int) -> None:
+        super().__init__(
+            f"{cid or 'the file'} is at least {size} bytes, more than the {limit} allowed",
+            hint="raise the limit, or use a smaller file",
+        )
+        self.cid = cid
+        self.size = size
+        self.limit = limit
 
 
 class IndexedFile(NamedTuple):

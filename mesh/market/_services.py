@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from mesh.base.flood import Drops
     from mesh.market._settlement import Settlement, SettlementParts
     from mesh.market.book import Order, OrderBook
-    from mesh.market.withdrawals import Withdrawals
+    from mesh.market.store import Withdrawals
     from mesh.network import Subscription
     from schemas import Permit, Withdrawal
     from schemas.rpc import Nothing, OrderPair, PermitFeeRequest

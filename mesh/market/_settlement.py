@@ -40,8 +40,8 @@ from mesh.chain import (
 )
 from mesh.errors import AiraError, ChainError, InputError, public_text
 from mesh.market.book import RETRIED, Added, Match, OrderStage, order_id
+from mesh.market.store import withdrawn_id
 from mesh.market.transactions import Stakes
-from mesh.market.withdrawals import withdrawn_id
 from mesh.role.following import follow_chain
 from mesh.role.refunds import DueRefunds
 from schemas import ZERO_ADDRESS, CreatedKey, Demand, Offer, RejectKey, Result, address_bytes
@@ -58,9 +58,8 @@ if TYPE_CHECKING:
     from mesh.market._earnings import EarningsLedger, FreeContracts
     from mesh.market._orders import Orders
     from mesh.market.book import Order
-    from mesh.market.store import MarketStore
+    from mesh.market.store import MarketStore, Withdrawals
     from mesh.market.transactions import TransactionQueue
-    from mesh.market.withdrawals import Withdrawals
     from mesh.network import Channel
     from mesh.role.following import ChainHead, Created
     from schemas import Liability, Permit, Verified, Withdrawal

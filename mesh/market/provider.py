@@ -24,9 +24,8 @@ from mesh.market._earnings import A_DAY, Earnings, EarningsLedger, FreeContracts
 from mesh.market._orders import Orders
 from mesh.market._services import OrderBookService, PairService, ProviderStatus, permit_fee
 from mesh.market._settlement import OPEN_LIABILITIES, Settlement, SettlementParts
-from mesh.market.store import MarketStore
+from mesh.market.store import MarketStore, Withdrawals
 from mesh.market.transactions import RETRY, UNDER_WAY, NoStake, TransactionQueue, least_cost
-from mesh.market.withdrawals import Withdrawals
 from mesh.network.channel import Channel
 from mesh.network.services import Services
 from mesh.role.composition import state_folder

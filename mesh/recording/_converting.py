@@ -35,7 +35,7 @@ import msgspec
 from mesh.base.private_files import atomic_file
 from mesh.errors import InputError, InvalidKey
 from mesh.recording._json_schemas import JsonSchemas, encode_described
-from mesh.recording._mcap_writer import MAX_TIME, McapWriter
+from mesh.recording._mcap import MAX_TIME, McapWriter
 from mesh.recording._recovery import copy_attachments
 from mesh.recording._source import GENEROUS, CorruptRecording, Limits, NotARecording
 from mesh.recording.objective import Played, open_source

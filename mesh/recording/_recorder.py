@@ -26,7 +26,7 @@ from mesh.base.log_context import log_event
 from mesh.base.private_files import make_missing_folders, open_private, sync_directory, try_lock
 from mesh.errors import ClosedError
 from mesh.recording._json_schemas import JsonSchemas
-from mesh.recording._mcap_writer import McapWriter, check_message
+from mesh.recording._mcap import McapWriter, check_message
 from mesh.recording._recovery import RECOVERED, copy_content, last_time, readable_part
 from mesh.recording._source import NotARecording, RecordingFailed, Unrecordable, recording_exists
 from schemas.payloads import EMPTY, PayloadType
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from mesh.base.clock import Clock
-    from mesh.recording._mcap_writer import WriterChannel
+    from mesh.recording._mcap import WriterChannel
     from mesh.recording._source import RecordingSource
 
 

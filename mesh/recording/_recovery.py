@@ -13,16 +13,16 @@ from mcap.opcode import Opcode
 from mesh.base.private_files import atomic_file
 from mesh.recording._bag_reader import MAGIC as BAG_MAGIC
 from mesh.recording._bag_reader import BagOp, BagReader, bag_records, read_index
-from mesh.recording._mcap_reader import (
+from mesh.recording._mcap import (
     MAGIC,
     McapReader,
     McapRecordHeader,
+    McapWriter,
     check_range_crc,
     mcap_records,
     read_record,
     read_summary,
 )
-from mesh.recording._mcap_writer import McapWriter
 from mesh.recording._source import (
     CorruptRecording,
     Cursor,

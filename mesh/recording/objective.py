@@ -14,9 +14,9 @@ import msgspec
 from msgspec import Struct
 
 from mesh.errors import InvalidKey
-from mesh.recording import _bag_reader, _mcap_reader
+from mesh.recording import _bag_reader, _mcap
 from mesh.recording._bag_reader import open_bag
-from mesh.recording._mcap_reader import open_mcap
+from mesh.recording._mcap import open_mcap
 from mesh.recording._source import Limits, NotARecording, RecordingError, about
 from mesh.recording._sqlite_reader import SQLITE_MAGIC, ZSTD_MAGIC, open_sqlite
 from mesh.recording.ros import ros_value
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 _DEFAULT: Final = Limits()
-_FORMATS: Final = {_mcap_reader.MAGIC: open_mcap, _bag_reader.MAGIC: open_bag, SQLITE_MAGIC: open_sqlite}
+_FORMATS: Final = {_mcap.MAGIC: open_mcap, _bag_reader.MAGIC: open_bag, SQLITE_MAGIC: open_sqlite}
 
 
 class Topic(Struct, frozen=True):

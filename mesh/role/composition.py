@@ -12,13 +12,13 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from mesh.base.database import RoleLedger
 from mesh.base.fresh_file import blocklist_at
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff
 from mesh.content import Exchange, Store
 from mesh.errors import NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network, Services
-from mesh.role.database import RoleLedger
 from mesh.role.handover import adopt_content, check_not_retired
 
 if TYPE_CHECKING:

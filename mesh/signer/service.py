@@ -31,12 +31,13 @@ import msgspec
 from aiohttp import web
 
 from mesh.agent.agent import Agent
-from mesh.agent.errors import DemandDeclined, LiabilityReverted, OrderClosed, OrderExpired, OtherRobot
+from mesh.agent.contracts import LiabilityReverted
+from mesh.agent.hiring import DemandDeclined
 from mesh.agent.jobs import STOPPED
-from mesh.agent.orders import MEASURED_BLOCKS, OrderState
+from mesh.agent.orders import MEASURED_BLOCKS, OrderClosed, OrderExpired, OrderState, OtherRobot
 from mesh.amounts import ETH
 from mesh.base.background import Background
-from mesh.base.database import DISK_ERRORS
+from mesh.base.database import DISK_ERRORS, LedgerUnusable
 from mesh.base.door import DoorLimits
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.http_server import HttpServer
@@ -57,7 +58,6 @@ from mesh.errors import (
 )
 from mesh.network import Pump, ServiceFailed
 from mesh.recording import GENEROUS, Played, described_line, json_messages, messages_in, open_objective, pack
-from mesh.role.database import LedgerUnusable
 from mesh.role.program import RESEND
 from mesh.settings.chains import LONGEST_ORDER
 from mesh.signer import protocol

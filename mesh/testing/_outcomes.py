@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from mesh.agent.contracts import Outcome
-from mesh.agent.errors import Declined, DemandDeclined
+from mesh.agent.handlers import Declined
+from mesh.agent.hiring import DemandDeclined
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from mesh.role.database import RoleLedger
+from mesh.base.database import RoleLedger
 from schemas import Liability, Result, decode, encode
 
 if TYPE_CHECKING:

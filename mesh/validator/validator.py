@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from mesh.base.retry import RetryPolicy
     from mesh.chain import Account, Chain
     from mesh.settings import Settings
-    from mesh.validator._runtime import ValidatorRuntime
     from mesh.validator.policies import CheckFunction
+    from mesh.validator.runtime import ValidatorRuntime
 
     F = TypeVar("F", bound=CheckFunction)
 
@@ -101,8 +101,7 @@ class Validator(Program):
         return register
 
     async def _open_role(self, stack: AsyncExitStack, account: Account | None) -> OpenRole:
-        from mesh.validator._runtime import ValidatorRuntime
-        from mesh.validator.components import judging  # these load the chain
+        from mesh.validator.runtime import ValidatorRuntime, judging  # loads the chain
 
         assert account is not None
         make = partial(

@@ -11,11 +11,11 @@ BOOK, SETTLEMENT = "mesh.market.book:OrderBook", "mesh.market._settlement:Settle
 RESULTS = "mesh.market._settlement:Results"
 QUEUE, SENDER = "mesh.market.transactions:TransactionQueue", "mesh.chain.transactions:TransactionSender"
 STORE, CONFIRMATION = "mesh.chain._pending:TransactionStore", "mesh.chain.transactions:Confirmation"
-TRADER, OUTBOX = "mesh.agent.trade:Trader", "mesh.agent._outbox:Outbox"
+TRADER, OUTBOX = "mesh.agent.trade:Trader", "mesh.agent.ledger:Outbox"
 LEDGER, LISTENER = "mesh.agent.ledger:Ledger", "mesh.agent._runtime:AgentRuntime"
 RUN, CONTENT = "mesh.agent.jobs:JobRun", "mesh.content.store:Store"
 EXECUTOR = "mesh.agent.jobs:Executor"
-CASES, JUDGE = "mesh.validator._cases:Cases", "mesh.validator._cases:CaseJudge"
+CASES, JUDGE = "mesh.validator.runtime:Cases", "mesh.validator.runtime:CaseJudge"
 VERDICTS = "mesh.validator.ledger:VerdictLedger"
 
 POINTS: Final = {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain import NoContracts, NotALiability
 from mesh.errors import AiraError
-from mesh.recording._mcap_writer import McapWriter
+from mesh.recording._mcap import McapWriter
 from mesh.role.running import cause_of
 from schemas import EMPTY, cid_of_file
 from tests.simulation.chance import FaultDraw

@@ -129,7 +129,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the ledger is not synced",
-        "mesh.role.database:RoleLedger._run_together",
+        "mesh.base.database:RoleLedger._run_together",
         "if sync:",
         "if False:",
         CRASHES,
@@ -174,7 +174,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the outbox sends everything once",
-        "mesh.agent._outbox:Outbox.send_due",
+        "mesh.agent.ledger:Outbox.send_due",
         "one.backoff.next_delay() or 0.0",
         "1e9",
         "drop",
@@ -218,7 +218,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "an order that waits for its allowance keeps its agent busy",
-        "mesh.agent._outbox:Outbox._wait",
+        "mesh.agent.ledger:Outbox._wait",
         "asyncio.timeout(remaining)",
         "asyncio.timeout(0 if self._held else remaining)",
         f"{REORGANISATIONS},revoke,late,unreachable",
@@ -331,7 +331,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "a demand for one robot is shown to all",
-        "mesh.agent._outbox:Outbox.send_due",
+        "mesh.agent.ledger:Outbox.send_due",
         "if not one.robot:",
         "if True:",
         "pair",
@@ -409,7 +409,7 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "the provider forgets withdrawals when it is restarted",
-        "mesh.market.withdrawals:Withdrawals.__enter__",
+        "mesh.market.store:Withdrawals.__enter__",
         "for identity, signer, payload, lasting in rows:",
         "for identity, signer, payload, lasting in ():",
         "crash_every,repeat_every,partition_every,withdraw",

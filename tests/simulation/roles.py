@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.agent import CHOICES, Agent
-from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
+from mesh.agent.contracts import LiabilityReverted
 from mesh.agent.handlers import JobFailed
 from mesh.agent.jobs import STOPPED
 from mesh.agent.ledger import Phase
-from mesh.agent.orders import OrderState
+from mesh.agent.orders import OrderClosed, OrderExpired, OrderState
 from mesh.chain import XRT, Chain
 from mesh.errors import AiraError
 from mesh.market.provider import Provider, ProviderOptions, provider_file

@@ -12,7 +12,7 @@ from mcap_ros1.decoder import DecoderFactory as Ros1Decoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from mesh.recording._mcap_reader import MAGIC
+from mesh.recording._mcap import MAGIC
 from peers.catalog import PEERS
 
 if TYPE_CHECKING:

@@ -435,7 +435,7 @@ class AccountChecks:
 
     async def check_validator(self) -> CheckResult:
         """Whether the account may judge for the contract of the settings. Raises `ChainError` if not."""
-        from mesh.validator.components import court_of
+        from mesh.validator.runtime import court_of
 
         contract = self._context.settings.validator_contract
         if not contract:

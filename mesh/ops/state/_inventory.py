@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 import msgspec
 
 from mesh.agent.ledger import UNFINISHED, Ledger
-from mesh.base.database import check_format
+from mesh.base.database import LedgerUnusable, check_format
 from mesh.content import Store
 from mesh.content.store import is_in_use
 from mesh.ops.state._archive import (
@@ -33,7 +33,6 @@ from mesh.ops.state._archive import (
     read_archive,
     transactions_in,
 )
-from mesh.role.database import LedgerUnusable
 from mesh.validator.ledger import VerdictLedger
 from schemas import Demand, Offer, decode
 

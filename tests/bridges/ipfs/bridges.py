@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.market.withdrawals import Withdrawals
+    from mesh.market.store import Withdrawals
     from schemas import Signer
 
 

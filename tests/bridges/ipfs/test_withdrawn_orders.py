@@ -9,8 +9,7 @@ import pytest
 from bridges.ipfs._messages import legacy_json
 from mesh.market import OrderBook
 from mesh.market._services import OrderBookService
-from mesh.market.store import MarketStore
-from mesh.market.withdrawals import Withdrawals
+from mesh.market.store import MarketStore, Withdrawals
 from schemas import encode, verify_message
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
 from tests.support import orders

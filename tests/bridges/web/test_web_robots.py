@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from bridges.web import _robots
 from mesh import Agent, Demand, Verified
-from mesh.agent.errors import Declined
+from mesh.agent.handlers import Declined
 from mesh.chain import Account
 from mesh.role.handover import keep_handover
 from mesh.testing import MarketChain

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent._owner_rules import accepted_values
-from mesh.agent.errors import DemandDeclined
+from mesh.agent.hiring import DemandDeclined
 from mesh.errors import ConfigurationError
 from mesh.testing import assert_paid
 from tests.mesh.signer.signers import Driver

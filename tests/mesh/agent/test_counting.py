@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mesh.agent._outbox import outgoing
-from mesh.agent.ledger import Ledger, Phase
+from mesh.agent.ledger import Ledger, Outgoing, Phase
 from tests.mesh.agent.samples import liability
 from tests.support.orders import demand
 
@@ -26,7 +25,7 @@ async def test_jobs_are_counted_by_phase_and_those_set_aside_are_none(tmp_path: 
 
 async def test_messages_wait_until_they_are_settled(tmp_path: Path) -> None:
     async with Ledger(tmp_path / "ledger.sqlite") as ledger:
-        orders = [outgoing(demand()) for _ in range(2)]
+        orders = [Outgoing.of(demand()) for _ in range(2)]
         for order in orders:
             await ledger.post(order)
         assert sum((await ledger.waiting_by_kind(head=0)).values()) == 2

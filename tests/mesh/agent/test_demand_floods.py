@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent.orders import TooManyOffers
+from mesh.base.database import LedgerUnusable
 from mesh.chain import NodeUnreachable, RequestRefused, TransactionTimeout
 from mesh.network import Channel, Endpoints, Network
-from mesh.role.database import LedgerUnusable
 from schemas import Demand, Signer, cid_of_bytes
 from tests.support import orders
 from tests.support.market import MODEL, Place, offering

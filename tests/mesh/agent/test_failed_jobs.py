@@ -16,7 +16,7 @@ import pytest
 from mesh import Agent, Settings
 from mesh.agent.handlers import JobFailed
 from mesh.agent.ledger import Phase
-from mesh.role.database import LedgerUnusable
+from mesh.base.database import LedgerUnusable
 from mesh.role.running import cause_of
 from mesh.testing import Market, assert_paid, assert_refunded
 from schemas import Empty, cid_of_bytes

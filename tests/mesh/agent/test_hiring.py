@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent.errors import Declined, DemandDeclined, OtherRobot
+from mesh.agent.handlers import Declined
+from mesh.agent.hiring import DemandDeclined
+from mesh.agent.orders import OtherRobot
 from mesh.errors import InputError, RemoteError
 from mesh.network import Channel, Endpoints, Network, ServiceFailed, Services
 from schemas import Demand, Offer

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from mesh.agent._outbox import outgoing
-from mesh.agent.ledger import Ledger, Phase
+from mesh.agent.ledger import Ledger, Outgoing, Phase
 from tests.mesh.agent.ledgers import RESULT, ledger, path
 from tests.mesh.agent.samples import liability, message
 from tests.support.orders import PERSON, ROBOT, STRANGER, demand, offer, withdrawal
@@ -192,7 +191,7 @@ async def test_the_history_of_the_chain_is_kept_with_the_cursor(ledger: Ledger) 
 
 
 async def test_a_spent_order_returns_when_its_contract_is_reverted(ledger: Ledger) -> None:
-    one, other = outgoing(demand(deadline=50)), outgoing(demand())
+    one, other = Outgoing.of(demand(deadline=50)), Outgoing.of(demand())
     for order in (one, other):
         await ledger.post(order)
     await ledger.spend(one.identity, "0xA")
@@ -208,7 +207,7 @@ async def test_a_spent_order_returns_when_its_contract_is_reverted(ledger: Ledge
 
 
 async def test_only_the_latest_spent_orders_are_kept(path: Path) -> None:
-    orders = [outgoing(demand()) for _ in range(4)]
+    orders = [Outgoing.of(demand()) for _ in range(4)]
     async with Ledger(path, spent_kept=2) as ledger:
         for number, order in enumerate(orders):
             await ledger.post(order)
@@ -223,7 +222,7 @@ async def test_an_order_that_is_not_in_the_outbox_is_not_spent(ledger: Ledger) -
 
 async def test_a_withdrawn_order_is_replaced_by_its_withdrawal_until_its_deadline(path: Path) -> None:
     signed = demand(deadline=50)
-    one, other, withdrawn = outgoing(signed), outgoing(offer(deadline=60)), outgoing(withdrawal(signed))
+    one, other, withdrawn = Outgoing.of(signed), Outgoing.of(offer(deadline=60)), Outgoing.of(withdrawal(signed))
     async with Ledger(path) as ledger:
         for order in (one, other):
             await ledger.post(order)
@@ -238,7 +237,7 @@ async def test_a_withdrawn_order_is_replaced_by_its_withdrawal_until_its_deadlin
 
 async def test_a_withdrawn_order_that_becomes_a_contract_stays_withdrawn_after_a_reorganisation(ledger: Ledger) -> None:
     signed = demand()
-    order, withdrawn = outgoing(signed), outgoing(withdrawal(signed))
+    order, withdrawn = Outgoing.of(signed), Outgoing.of(withdrawal(signed))
     await ledger.post(order)
     await ledger.withdraw({order.identity: withdrawn})
     await ledger.spend(order.identity, "0xA")
@@ -251,18 +250,18 @@ async def test_a_withdrawn_order_that_becomes_a_contract_stays_withdrawn_after_a
 
 async def test_the_contract_of_a_withdrawn_order_is_listed_like_others(ledger: Ledger) -> None:
     signed, kept = demand(), demand()
-    for order in (outgoing(signed), outgoing(kept)):
+    for order in (Outgoing.of(signed), Outgoing.of(kept)):
         await ledger.post(order)
-    await ledger.withdraw({outgoing(signed).identity: outgoing(withdrawal(signed))})
+    await ledger.withdraw({Outgoing.of(signed).identity: Outgoing.of(withdrawal(signed))})
     assert await ledger.contracts("demand") == []
-    for order, address in ((outgoing(kept), "0x" + "1" * 40), (outgoing(signed), "0x" + "2" * 40)):
+    for order, address in ((Outgoing.of(kept), "0x" + "1" * 40), (Outgoing.of(signed), "0x" + "2" * 40)):
         await ledger.spend(order.identity, address)
     assert {address for _, address in await ledger.contracts("demand")} == {"0x" + "1" * 40, "0x" + "2" * 40}
 
 
 async def test_an_order_withdrawn_on_the_chain_can_not_become_a_contract(ledger: Ledger) -> None:
     signed = demand()
-    order, withdrawn = outgoing(signed), outgoing(withdrawal(signed))
+    order, withdrawn = Outgoing.of(signed), Outgoing.of(withdrawal(signed))
     await ledger.post(order)
     await ledger.withdraw({order.identity: withdrawn})
     await ledger.use_up(order.identity, "0x" + "a" * 64)
@@ -271,7 +270,7 @@ async def test_an_order_withdrawn_on_the_chain_can_not_become_a_contract(ledger:
 
 
 async def test_an_order_is_replaced_at_its_place_in_one_step(ledger: Ledger) -> None:
-    old, new = outgoing(demand()), outgoing(demand())
+    old, new = Outgoing.of(demand()), Outgoing.of(demand())
     await ledger.post(old)
     await ledger.replace(old.identity, new)
     assert await ledger.outbox(head=0) == [new]
@@ -282,11 +281,11 @@ async def test_an_expired_order_is_known_while_a_reorganisation_may_bring_its_co
     path: Path, *, is_withdrawn: bool
 ) -> None:
     signed = demand(deadline=50)
-    order = outgoing(signed)
+    order = Outgoing.of(signed)
     async with Ledger(path, reorg_depth=12) as ledger:
         await ledger.post(order)
         if is_withdrawn:
-            await ledger.withdraw({order.identity: outgoing(withdrawal(signed))})
+            await ledger.withdraw({order.identity: Outgoing.of(withdrawal(signed))})
         await ledger.spend(order.identity, "the contract")
         await ledger.unspend("the contract")
         assert await ledger.outbox(head=61) == []

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent.ledger import Ledger, Phase
-from mesh.base.database import VERSION
+from mesh.base.database import VERSION, LedgerUnusable
 from mesh.errors import ClosedError, ConfigurationError
-from mesh.role.database import LedgerUnusable
 from tests.mesh.agent.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.agent.samples import liability, message
 from tests.support.disks import file_size_limit, synced

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent._runtime import AgentRuntime
-from mesh.agent.errors import OrderClosed
-from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, OrderState, lifetime_of
+from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, OrderClosed, OrderState, lifetime_of
+from mesh.base.database import LedgerUnusable
 from mesh.chain import BlockHeader, InsufficientTokens
 from mesh.chain._node import ContractBlocks, Heads
 from mesh.chain.answers import Count, Word
-from mesh.role.database import LedgerUnusable
 from schemas import Demand, Offer, Withdrawal, cid_of_bytes, decode, message_hash
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, unsettled, waiting, working
 from tests.support.log_events import logged_facts

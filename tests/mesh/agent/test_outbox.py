@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent._outbox import Outbox, outgoing, outgoing_identity
-from mesh.agent.ledger import Ledger
+from mesh.agent.ledger import Ledger, Outbox, Outgoing, outgoing_identity
 from mesh.base.background import Background
 from mesh.base.retry import RetryPolicy
 from mesh.network import Channel, Endpoints, Network
@@ -127,7 +126,7 @@ async def test_waiting_messages_survive_a_restart(
 ) -> None:
     ours = result()
     async with opened(router, tmp_path) as post:
-        await post.ledger.post(outgoing(ours))  # and then, before it was sent, a crash
+        await post.ledger.post(Outgoing.of(ours))  # and then, before it was sent, a crash
     async with opened(router, tmp_path) as post:
         await listened_to(post)
         await post.outbox.send_all()
@@ -285,6 +284,6 @@ def test_results_are_identified_by_liability_and_orders_by_hash() -> None:
 
 def test_an_entry_has_the_kind_payload_and_deadline_of_its_message() -> None:
     order = demand(deadline=77)
-    assert (outgoing(order).kind, outgoing(order).deadline) == ("demand", 77)
-    assert (outgoing(result()).kind, outgoing(result()).deadline) == ("result", None)
-    assert decode(outgoing(order).payload) == order
+    assert (Outgoing.of(order).kind, Outgoing.of(order).deadline) == ("demand", 77)
+    assert (Outgoing.of(result()).kind, Outgoing.of(result()).deadline) == ("result", None)
+    assert decode(Outgoing.of(order).payload) == order

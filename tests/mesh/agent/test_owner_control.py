@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import Agent, Settings
-from mesh.agent.errors import DemandDeclined
+from mesh.agent.hiring import DemandDeclined
 from mesh.amounts import InvalidAmount
 from mesh.errors import AiraError
 from mesh.network import call

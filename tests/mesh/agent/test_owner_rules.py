@@ -11,7 +11,7 @@ import pytest
 
 from mesh import Agent, AiraError, ConfigurationError, Empty, Progress, Settings
 from mesh.agent.contracts import Contract
-from mesh.agent.errors import DemandDeclined
+from mesh.agent.hiring import DemandDeclined
 from mesh.amounts import InvalidAmount
 from mesh.base.hours import Hours
 from mesh.testing import assert_paid

@@ -10,7 +10,8 @@ import msgspec
 import pytest
 
 from mesh import Agent
-from mesh.agent.errors import Declined, DemandDeclined
+from mesh.agent.handlers import Declined
+from mesh.agent.hiring import DemandDeclined
 from mesh.errors import RemoteError
 from mesh.network import Endpoints, Network, Services
 from mesh.testing import assert_paid

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from mesh.agent._outbox import outgoing
-from mesh.agent.ledger import Phase
+from mesh.agent.ledger import Outgoing, Phase
 from mesh.chain.liabilities import Liabilities
 from mesh.recording import open_objective
 from schemas import String, cid_of_file
@@ -96,7 +95,7 @@ async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finaliz
     async with place.agent("robot", enable_executor=False) as robot:
         ledger = robot.parts.ledger
         await ledger.add_job(ours)
-        await ledger.complete(ours.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
+        await ledger.complete(ours.address, success=True, result=signed.result, note="", outgoing=Outgoing.of(signed))
         refuse_to_finalize(robot.parts.directory / "ledger.sqlite")
         with pytest.raises(sqlite3.IntegrityError, match="crash"):
             await robot.runtime.finalized(ours.address, success=True, result=signed.result)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import Agent
-from mesh.agent.errors import DemandDeclined
+from mesh.agent.hiring import DemandDeclined
 from mesh.agent.ledger import Phase
 from mesh.errors import ClosedError, InputError
 from mesh.network import ServiceFailed, call

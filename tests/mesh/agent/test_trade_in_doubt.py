@@ -9,8 +9,8 @@ import pytest
 from msgspec.structs import replace
 
 from mesh.agent.agent import Agent
-from mesh.agent.errors import LiabilityReverted, OrderExpired
-from mesh.agent.orders import REPEATED, OrderState
+from mesh.agent.contracts import LiabilityReverted
+from mesh.agent.orders import REPEATED, OrderExpired, OrderState
 from mesh.chain import Chain, Timing
 from mesh.chain._validators import Validators
 from mesh.chain.liabilities import Liabilities

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import AiraError
-from mesh.agent._outbox import outgoing
-from mesh.agent.errors import Declined
+from mesh.agent.handlers import Declined
+from mesh.agent.ledger import Outgoing
 from mesh.agent.orders import EQUAL_DECLINED, OrderState
 from mesh.chain import Account, Timing
 from schemas import Demand, Offer, Withdrawal, decode
@@ -281,7 +281,7 @@ async def test_the_offers_of_a_robot_that_was_killed_are_withdrawn_at_its_start(
     """The ledger is left with an open offer, as by a kill."""
     signer = place.market.accounts["robot"].signer
     terms = {"lighthouse": place.market.deployment.lighthouse, "cost": 0, "deadline": 10**9}
-    offer = outgoing(orders.offer(signer=signer, **terms))
+    offer = Outgoing.of(orders.offer(signer=signer, **terms))
     async with place.agent("robot") as robot:
         await robot.parts.ledger.post(offer)
     async with place.agent("robot") as helper:  # without handlers: perhaps beside the robot

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import Declined, JobFailed, Progress
-from mesh.agent.errors import OrderExpired
 from mesh.agent.objectives import ObjectiveUnfit
+from mesh.agent.orders import OrderExpired
 from mesh.amounts import XRT
 from mesh.chain import Chain, Node
 from mesh.cli import demand as commands

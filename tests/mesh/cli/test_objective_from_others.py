@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from mesh.content import Exchange, Store
-from mesh.content._errors import ContentUnavailable
+from mesh.content.store import ContentUnavailable
 from mesh.errors import NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network
 from mesh.recording import open_objective

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from mesh.chain.errors import NodeUnreachable
 from mesh.cli import main
 from mesh.content import Store
-from mesh.content._errors import ContentUnavailable
+from mesh.content.store import ContentUnavailable
 from mesh.errors import AiraError, InvalidKey, NetworkUnavailable
 from mesh.recording import Recorder, RecordingAbout
 from mesh.recording._source import NotARecording

@@ -12,7 +12,7 @@ import zenoh
 from mesh.base.flood import Drops, Rate
 from mesh.market import OrderBook
 from mesh.market._services import THREADS, OrderBookService
-from mesh.market.withdrawals import Withdrawals
+from mesh.market.store import Withdrawals
 from mesh.network import Channel, Endpoints, Network, message_key
 from schemas import Demand, Withdrawal, decode, market_selector, verify_message
 from schemas.keys import withdrawal_selector

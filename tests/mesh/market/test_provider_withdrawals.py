@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mesh.chain._node import REORG_DEPTH
 from mesh.market import order_id
-from mesh.market.withdrawals import withdrawn_id
+from mesh.market.store import withdrawn_id
 from schemas import Withdrawal, verify_message
 from schemas.signing import Refusal
 from tests.mesh.market.held_node import HeldNode

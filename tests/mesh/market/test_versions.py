@@ -10,8 +10,7 @@ import pytest
 from mesh.chain import Timing
 from mesh.market import order_id
 from mesh.market._orders import OrderVersions
-from mesh.market.store import MarketStore
-from mesh.market.withdrawals import withdrawn_id
+from mesh.market.store import MarketStore, withdrawn_id
 from schemas import Demand, Withdrawal, verify_message
 from schemas.signing import Refusal
 from tests.mesh.market.held_node import HeldNode

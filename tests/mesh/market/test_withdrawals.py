@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from mesh.base.flood import Rate
 from mesh.market import order_id
-from mesh.market.store import MarketStore
-from mesh.market.withdrawals import Withdrawals, withdrawn_id
+from mesh.market.store import MarketStore, Withdrawals, withdrawn_id
 from schemas import Signer, Withdrawal, verify_message
 from tests.support.log_events import logged_facts
 from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand

@@ -15,7 +15,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, Writer
 
 from mesh.recording import Attachment, Unrecordable
-from mesh.recording._mcap_writer import MAX_CHANNELS, McapWriter, WriterChannel
+from mesh.recording._mcap import MAX_CHANNELS, McapWriter, WriterChannel
 from schemas.payloads import RAW, PayloadType
 from tests.mesh.recording.files import T0
 

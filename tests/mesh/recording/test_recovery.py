@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from mesh.recording import CorruptRecording, NotARecording, open_objective, recover
 from mesh.recording._bag_reader import BagOp, bag_records
-from mesh.recording._mcap_reader import mcap_records
+from mesh.recording._mcap import mcap_records
 from mesh.recording._recovery import readable_part
 from tests.mesh.recording.test_damaged import write_bag
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent.errors import OrderExpired
+from mesh.agent.orders import OrderExpired
 from mesh.chain import DeploymentPlan, Node, Reverted
 from mesh.chain._node import RUN_NUMBER
 from mesh.dev import EmbeddedChain

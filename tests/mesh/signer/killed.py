@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
-from mesh.agent._outbox import Outbox
+from mesh.agent.ledger import Outbox
 from mesh.chain import Account, Chain
 from mesh.settings import load
 from mesh.signer._budget import Budget

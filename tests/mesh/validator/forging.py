@@ -11,7 +11,7 @@ import msgspec
 from mcap.writer import Writer
 
 from mesh.recording import ABOUT, CLOCK_RECORD, CLOSED, RECOVERED, open_objective
-from mesh.recording._mcap_writer import McapWriter
+from mesh.recording._mcap import McapWriter
 from schemas import cid_of_file
 from tests.mesh.validator.lamps import ROBOT, FinishedJob, signed_by
 

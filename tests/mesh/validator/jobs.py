@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from mesh.recording import Recorder, RecordingAbout, open_objective
-from mesh.recording._mcap_writer import McapWriter
+from mesh.recording._mcap import McapWriter
 from mesh.validator.verification import Claim, JobFiles, Verdict, verify
 from schemas import Result, Signer, String, cid_of_file, encode
 from schemas.payloads import STRING

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mesh.validator import _cases
+from mesh.validator import runtime
 from schemas import Result, cid_of_bytes
 from tests.mesh.validator.courts import Court, announcements_of, liar, open_cases, until_ended
 from tests.support.waiting import until, until_found
@@ -34,7 +34,7 @@ async def test_results_for_other_liabilities_cost_nothing(place: Place) -> None:
 
 
 async def test_one_promisor_s_open_cases_are_limited(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_cases, "OPEN_OF_PROMISOR", 1)
+    monkeypatch.setattr(runtime, "OPEN_OF_PROMISOR", 1)
     async with Court(place) as court:
         validator, robot = await court.validator(), await liar(court, account=court.account(4))
         async with court.at_work(validator, robot) as person:

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from mesh.recording import Unrecordable
-from mesh.recording._mcap_writer import McapWriter
+from mesh.recording._mcap import McapWriter
 from mesh.validator.judging import Case, examine, judge
 from mesh.validator.policies import POLICIES, own_policy, policy_of
 from mesh.validator.verification import JobFiles

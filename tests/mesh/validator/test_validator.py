@@ -10,7 +10,7 @@ import pytest
 
 from mesh import ConfigurationError
 from mesh.chain import XRT
-from mesh.validator._runtime import REFRESH, Announcements
+from mesh.validator.runtime import REFRESH, Announcements
 from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
 from tests.support.log_events import logged_facts
 from tests.support.objectives import objective

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pytest
 import zstandard
 
-from mesh.agent._outbox import outgoing
-from mesh.agent.ledger import Ledger, Phase
+from mesh.agent.ledger import Ledger, Outgoing, Phase
 from mesh.chain._pending import TransactionStore
 from mesh.content import Store
 from schemas import cid_of_bytes
@@ -64,7 +63,7 @@ async def folder(tmp_path: Path) -> Folder:
     async with Ledger(made.ledger) as ledger:
         await ledger.add_job(JOB)
         await ledger.set_phase(JOB.address, Phase.RUNNING, position=3)
-        await ledger.post(outgoing(demand(objective=cid_of_bytes(OBJECTIVE))))
+        await ledger.post(Outgoing.of(demand(objective=cid_of_bytes(OBJECTIVE))))
         await ledger.set_cursor(99)
     made.recordings.mkdir()
     (made.recordings / f"{JOB.address}.mcap.part").write_bytes(b"what it has said so far")

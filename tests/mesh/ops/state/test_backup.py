@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.agent._outbox import outgoing
-from mesh.agent.ledger import Ledger, Phase
+from mesh.agent.ledger import Ledger, Outgoing, Phase
 from mesh.content import Store, StoreFull
 from mesh.errors import ConfigurationError
 from mesh.ops.state import ContentScope, back_up, examine_archive, restore, take_inventory
@@ -122,7 +121,7 @@ async def end_the_job(folder: Folder) -> None:
     """As an executor does: the Result first, then the recording goes."""
     signed = result(liability=JOB.address)
     async with Ledger(folder.ledger) as ledger:
-        await ledger.complete(JOB.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
+        await ledger.complete(JOB.address, success=True, result=signed.result, note="", outgoing=Outgoing.of(signed))
     (folder.recordings / f"{JOB.address}.mcap.part").unlink()
 
 
@@ -173,7 +172,7 @@ async def write_without_end(ledger: Ledger) -> None:
         job = liability(f"more {number}")
         signed = result(liability=job.address)
         await ledger.add_job(job)
-        await ledger.complete(job.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
+        await ledger.complete(job.address, success=True, result=signed.result, note="", outgoing=Outgoing.of(signed))
 
 
 async def test_a_backup_replaces_an_earlier_one_only_when_it_is_complete(folder: Folder, tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from mesh.errors import ConfigurationError
 from mesh.market._orders import SentOrder
 from mesh.market.provider import provider_file
-from mesh.market.store import MarketStore
-from mesh.market.withdrawals import Withdrawals, withdrawn_id
+from mesh.market.store import MarketStore, Withdrawals, withdrawn_id
 from mesh.ops.state import back_up, examine_archive, restore, take_inventory
 from schemas import cid_of_bytes
 from schemas.signing import verify_message

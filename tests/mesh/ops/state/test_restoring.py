@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.agent.ledger import Ledger, Phase
-from mesh.base.database import VERSION
+from mesh.base.database import VERSION, LedgerUnusable
 from mesh.chain._pending import TransactionStore
 from mesh.content import Store
 from mesh.errors import ConfigurationError
 from mesh.ops.state import back_up, restore
-from mesh.role.database import LedgerUnusable
 from schemas import cid_of_bytes
 from tests.mesh.agent.ledgers import mark_as_version
 from tests.mesh.ops.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, Folder, forge, members, names_in

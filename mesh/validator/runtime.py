@@ -1,9 +1,11 @@
-"""The cases of a validator: liabilities that name it, from the promisor's Result to the end on the chain.
+"""A validator at work: it follows the chain and the market's Results, works on the cases that name it, and answers how
+it judges and how it judged.
 
-Each case has a task. It waits for the Result, has it decided (its files are fetched, its recording is judged, and the
-juror reports what it found), signs in the ledger, and sends what it signed until the chain has the end. The ledger
-keeps each step, so a restarted validator continues there. Files and time are shared fairly: one promisor's cases can't
-keep those of others waiting, whatever they consist of.
+A case is a liability that names the validator, from the promisor's Result to the end on the chain. Each has a task. It
+waits for the Result, has it decided (its files are fetched, its recording is judged, and the juror reports what it
+found), signs in the ledger, and sends what it signed until the chain has the end. The ledger keeps each step, so a
+restarted validator continues there. Files and time are shared fairly: one promisor's cases can't keep those of others
+waiting, whatever they consist of.
 
 Recordings must have been made between the liability and its Result, by the chain's clock and this machine's. If the two
 differ, the longer time counts: a wrong clock of the validator must not fail honest work.
@@ -15,39 +17,164 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from contextlib import suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from weakref import WeakValueDictionary
 
+import zenoh
+
 from mesh.amounts import XRT
-from mesh.base.background import in_daemon_thread
+from mesh.base.background import Background, in_daemon_thread
 from mesh.base.flood import BoundedDict, FairQueue, Rate, RateLimiter
+from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import liability_context, log_event
 from mesh.base.retry import Backoff, RetryPolicy
-from mesh.chain import NoContracts, NodeUnreachable, NotALiability, NotOffered, RequestRefused, Reverted
+from mesh.chain import (
+    FeeTooHigh,
+    Finalized,
+    InsufficientFunds,
+    NewLiability,
+    NoContracts,
+    NodeUnreachable,
+    NotALiability,
+    NotOffered,
+    RequestRefused,
+    Reverted,
+)
 from mesh.content import ContentCorrupt, ContentTooLarge, ContentUnavailable, StoreFull
 from mesh.errors import ChainError
+from mesh.network.services import answering
 from mesh.recording import Limits
+from mesh.role.composition import RoleParts, open_parts, opened_chain
+from mesh.role.following import follow_chain
 from mesh.role.models import Models
-from mesh.role.program import RESEND
+from mesh.role.program import RESEND, RoleStatus
+from mesh.telemetry.logs import LogService
+from mesh.telemetry.metrics import by_label, counter
 from mesh.validator.judging import Case, Judgement, judge
-from mesh.validator.ledger import signed_result
+from mesh.validator.ledger import VERDICTS, VerdictLedger, signed_result
 from mesh.validator.policies import COMPLETE
-from schemas import ReportKey, Result, decode
+from schemas import ReportKey, Result, decode, parse_address
+from schemas.keys import LIABILITY, ValidatorKey, market_selector
 from schemas.model import InvalidDescription
-from schemas.verdicts import ReportFinding, ValidatorReport
+from schemas.status import StoreUse, ValidationStatus
+from schemas.verdicts import ReportFinding, ValidatorAnnouncement, ValidatorReport
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
+    from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
-    from mesh.base.background import Background
-    from mesh.chain import BlockHeader, Chain
-    from mesh.validator.components import ValidatorComponents
+    from mesh.base.flood import Drops
+    from mesh.chain import Account, BlockHeader, Chain, ChainEvent
+    from mesh.role.following import Created
+    from mesh.settings import Settings
+    from mesh.telemetry.metrics import MetricFamily
     from mesh.validator.ledger import StoredVerdict
+    from mesh.validator.policies import Policy
     from schemas import Liability, Verified
     from schemas.model import ModelDescription
+
+log = logging.getLogger(__name__)
+
+LOOKBACK: Final = 50_400
+"""Blocks that a validator reads at most of those before its start: after so many, liabilities can be refunded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Court:
+    """As what a validator judges: its account (generation 3) and, if it has one, its contract (generation 5).
+
+    A result needs the signatures of `quorum` of the contract's `jurors`.
+    """
+
+    account: str
+    contract: str = ""
+    quorum: int = 1
+    jurors: int = 1
+
+    @property
+    def validators(self) -> tuple[str, ...]:
+        """The addresses that liabilities may name, the contract first."""
+        return (self.contract, self.account) if self.contract else (self.account,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidatorComponents(RoleParts[VerdictLedger]):
+    """The open components of a validator, and how it judges, for what least `fee` (wn)."""
+
+    policies: Sequence[Policy]
+    fee: int
+    title: str
+    court: Court
+
+
+@asynccontextmanager
+async def judging(
+    settings: Settings,
+    account: Account,
+    chain: Chain | None,
+    *,
+    policies: Sequence[Policy],
+    fee: int,
+    title: str,
+    drops: Drops,
+) -> AsyncIterator[ValidatorComponents]:
+    """The components of a validator on `chain` (open), or on the chain that the settings name.
+
+    Raises `ChainError`, and the errors of opening what it needs.
+    """
+    async with AsyncExitStack() as stack:
+        chain = await opened_chain(stack, settings, account, chain)
+        court = await court_of(chain, account.address, settings.validator_contract)
+        if not court.contract:
+            await _introduce(chain, account.address)
+
+        def ledger(folder: Path) -> VerdictLedger:
+            return VerdictLedger(folder / VERDICTS, account.signer)
+
+        shared = await open_parts(stack, settings, account, chain, ledger=ledger, drops=drops, lookback=LOOKBACK)
+        yield ValidatorComponents(**vars(shared), policies=policies, fee=fee, title=title, court=court)
+
+
+async def court_of(chain: Chain, account: str, contract: str) -> Court:
+    """As what the account may judge, with the contract (ENS name or address) that the settings name, if any.
+
+    Raises `ChainError` if it may not judge there.
+    """
+    if not contract:
+        if not await chain.tokens.eth_balance():
+            why = "%s has no ETH: it can't finalize liabilities that name the account itself"
+            log.warning(why, account, extra=log_event("validator-without-eth", account=account))
+        return Court(account=account)
+    address = await chain.names.address(contract)
+    why = ""
+    if await chain.lighthouses.exists(address):
+        why = "is a lighthouse, not a validator contract"
+    elif not await chain.node.code(address):
+        why = "has no code: it is not a validator contract"
+    if why:
+        hint = "create one with `aira validator deploy`, then pass its address with --validator-contract"
+        raise ChainError(f"{address} {why}", hint=hint, code="not-a-validator")
+    if not await chain.validators.accepts(address, account):
+        hint = "create a contract that names this account: `aira validator deploy`"
+        why = f"{account} is no juror of the validator contract {address}"
+        raise ChainError(why, hint=hint, code="not-a-juror")
+    jury = await chain.validators.jury(address)
+    if jury is None:  # another contract with `isValidator`, to which one signature is enough
+        return Court(account=account, contract=address)
+    return Court(account=account, contract=address, quorum=jury.quorum, jurors=len(jury.jurors))
+
+
+async def _introduce(chain: Chain, account: str) -> None:
+    """Make the account known: orders name only accounts that have sent a transaction."""
+    try:
+        await chain.validators.introduce()
+    except (InsufficientFunds, FeeTooHigh, RequestRefused) as error:
+        facts = log_event("validator-not-known", account=account)
+        log.warning("%s has sent no transaction yet, so nobody can name it: %s", account, error, extra=facts)
 
 
 async def created_ns(chain: Chain, block: int) -> int:
@@ -74,8 +201,6 @@ async def _header(chain: Chain, block: int | str) -> BlockHeader | None:
         return await chain.node.header(block)
     return None
 
-
-log = logging.getLogger(__name__)
 
 FETCHES: Final = 16
 """Cases whose files are fetched at once."""
@@ -452,3 +577,208 @@ class Cases:
         else:
             facts = log_event("verdict-settled", tx=settled.tx, gas=settled.gas_used)
             log.info("finalized, gas %d", settled.gas_used, extra=facts)
+
+
+ANSWERS: Final = Rate(per_second=100.0, burst=1000)
+"""Answers to queries of a kind."""
+REFRESH: Final = 600.0
+"""Seconds after which an announcement is signed again: parties ignore old ones."""
+
+
+class Announcements:
+    """The signed announcements of a validator, one for each of the addresses that it judges for.
+
+    An announcement is signed again when it is older than `refresh` seconds. `clock` is the time of day in seconds.
+    """
+
+    refresh: float = REFRESH
+    """Seconds."""
+
+    def __init__(self, parts: ValidatorComponents, *, clock: Callable[[], float] = time.time) -> None:
+        self._parts = parts
+        self._clock = clock
+        self._signed: dict[str, ValidatorAnnouncement] = {}
+        """By validator."""
+
+    def announcement(self, validator: str) -> ValidatorAnnouncement:
+        """The signed announcement for one of the addresses."""
+        now, found = int(self._clock()), self._signed.get(validator)
+        if found is None or not 0 <= now - found.made_at < self.refresh:
+            found = self._signed[validator] = self._sign(validator, now)
+        return found
+
+    def answering(self, validator: str) -> AbstractAsyncContextManager[None]:
+        """Meanwhile answer queries of `ValidatorKey` with the announcement for one of the addresses."""
+        key = str(ValidatorKey(self._parts.channel.lighthouse, validator))
+
+        async def answer(query: zenoh.Query) -> None:
+            query.reply(key, self.announcement(validator).encode(), encoding="application/json")
+
+        return answering(self._parts.network.session, key, answer, ANSWERS, self._parts.drops)
+
+    def _sign(self, validator: str, now: int) -> ValidatorAnnouncement:
+        parts, court, signer = self._parts, self._parts.court, self._parts.signer
+        is_contract = validator == court.contract
+        return ValidatorAnnouncement(
+            validator=validator,
+            juror=signer.address,
+            title=parts.title,
+            policies=tuple(policy.note for policy in parts.policies),
+            fee=parts.fee,
+            quorum=court.quorum if is_contract else 1,
+            jurors=court.jurors if is_contract else 1,
+            made_at=now,
+        ).signed_by(signer)
+
+
+def answering_reports(parts: ValidatorComponents) -> AbstractAsyncContextManager[None]:
+    """Meanwhile answer queries of `ReportKey` for a liability (`?liability=ADDRESS`) with the report in the ledger."""
+
+    async def answer(query: zenoh.Query) -> None:
+        stored = await parts.ledger.verdict(parse_address(query.parameters.get(LIABILITY) or ""))
+        if stored is None or not stored.report:
+            return
+        for party in {stored.liability.promisee, stored.liability.promisor}:
+            key = str(ReportKey(parts.channel.lighthouse, party))
+            if query.key_expr.intersects(zenoh.KeyExpr(key)):
+                query.reply(key, stored.report, encoding="application/json")
+
+    selector = market_selector(parts.channel.lighthouse, "report", "*")
+    return answering(parts.network.session, selector, answer, ANSWERS, parts.drops)
+
+
+READ_AT_ONCE: Final = 8
+"""Liabilities of earlier runs that are read at the same time."""
+
+
+class ValidatorStatus(RoleStatus[ValidatorComponents]):
+    """The metrics, the health and the service `status` of a validator."""
+
+    role = "validator"
+
+    def __init__(self, parts: ValidatorComponents, judge: CaseJudge) -> None:
+        super().__init__(parts)
+        self._judge = judge
+
+    async def _own_status(self, store: StoreUse) -> dict[str, Any]:
+        parts = self.parts
+        validation = ValidationStatus(
+            validators=parts.court.validators,
+            policies=tuple(policy.name for policy in parts.policies),
+            fee=parts.fee,
+            cases=await parts.ledger.stages(),
+            store=store,
+        )
+        return {"validation": validation}
+
+    async def _own_families(self) -> tuple[MetricFamily, ...]:
+        verdicts = {"success": 0.0, "no-success": 0.0, "none": 0.0} | dict(self._judge.verdicts)
+        stages = {stage: float(count) for stage, count in (await self.parts.ledger.stages()).items()}
+        seconds = self._judge.seconds
+        return (
+            by_label("aira_validator_cases", "gauge", "Liabilities that name the validator, by stage", "stage", stages),
+            by_label("aira_verdicts_total", "counter", "Cases that it decided or gave up", "verdict", verdicts),
+            counter("aira_judging_seconds_total", "Seconds that judging recordings took", seconds),
+        )
+
+
+class ValidatorRuntime(Lifecycle):
+    """A validator at work: `async with ValidatorRuntime(components) as runtime`, then its `tasks`."""
+
+    title = "validator"
+
+    def __init__(self, parts: ValidatorComponents, *, resend: RetryPolicy = RESEND) -> None:
+        self.parts = parts
+        self.judge = CaseJudge(parts)
+        self.status = ValidatorStatus(parts, self.judge)
+        self._resend = resend
+        self._made: tuple[int, int] = (0, 0)
+        """The last block in which a case began, and when it was made."""
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        parts = self.parts
+        self.results = await stack.enter_async_context(parts.channel.subscribe(Result))
+        self.announcements = Announcements(parts)
+        for validator in parts.court.validators:
+            await stack.enter_async_context(self.announcements.answering(validator))
+        await stack.enter_async_context(answering_reports(parts))
+        parts.services.offer("status", self.status.status)
+        parts.services.offer("logs", LogService("validator", parts.signer.address).logs)
+        parts.channel.announce("validator", parts.signer.address)
+        self.cases = Cases(parts, self.judge, await stack.enter_async_context(Background()), resend=self._resend)
+
+    def tasks(self) -> Iterator[tuple[str, Coroutine[Any, Any, object]]]:
+        """What it does until it is cancelled."""
+        yield "validator judge", self.judge.run()
+        yield "validator listener", self._follow_chain()
+        yield "validator results", self._take_results()
+        yield "validator after network loss", self._send_on_return()
+
+    async def measure(self) -> tuple[MetricFamily, ...]:
+        """The metrics of its work."""
+        return await self.status.measure([self.results])
+
+    async def _follow_chain(self) -> None:
+        """Continue with the cases of earlier runs, then read the chain. Raises `ChainWentBack`."""
+        parts = self.parts
+        await self._resume()
+        parts.channel.watch_presence(lambda _provider: self.cases.send_again(), role="provider")
+        await follow_chain(self, parts.chain, parts.chain_head, parts.outages, store=parts.ledger)
+
+    async def on_event(self, event: ChainEvent, created: Created | None, block: int) -> None:
+        """Open a case for a new liability that names this validator; close one that has ended."""
+        if created is not None and not created[0].is_finalized and self._is_named(created[0]):
+            if self._made[0] != block:
+                self._made = block, await created_ns(self.parts.chain, block)
+            await self.cases.open(created[0], since_ns=self._made[1])
+        elif isinstance(event, Finalized):
+            await self.cases.end(event.liability, success=event.success)
+
+    async def on_revert(self, event: ChainEvent) -> None:
+        """Set the case of a liability aside that is gone; work again on one whose end is."""
+        if isinstance(event, NewLiability):
+            await self.cases.set_aside(event.liability)
+        elif isinstance(event, Finalized):
+            await self.cases.reopen(event.liability)
+
+    async def on_reorganised(self, block: int) -> None:
+        """Nothing else is reverted."""
+
+    async def on_head(self, block: int) -> None:
+        """Nothing depends on the number of the block."""
+
+    async def _resume(self) -> None:
+        """Take up the cases of earlier runs, unless they ended meanwhile."""
+        unended = await self.parts.ledger.unended()
+        for start in range(0, len(unended), READ_AT_ONCE):
+            some = unended[start : start + READ_AT_ONCE]
+            records = await asyncio.gather(*(self._record(one.liability.address) for one in some))
+            for stored, record in zip(some, records, strict=True):
+                if record is None:
+                    await self.parts.ledger.set_aside(stored.liability.address)
+                elif record.is_finalized:
+                    await self.parts.ledger.end(record.address)
+                    await asyncio.to_thread(self.parts.store.release, record.address)
+                else:
+                    await self.cases.open(stored.liability, since_ns=stored.since_ns)
+
+    async def _record(self, address: str) -> Liability | None:
+        """The record of a liability; None if a reorganisation reverted it."""
+        read = partial(self.parts.chain.liabilities.get, address)
+        try:
+            return await self.parts.chain.retrying(read, outages=self.parts.outages)
+        except (NotALiability, NoContracts):
+            return None
+
+    async def _take_results(self) -> None:
+        async for result in self.results:
+            if not await self.cases.take(result):
+                self.results.forget(result, after=1.0)  # its liability may not be known yet
+
+    async def _send_on_return(self) -> None:
+        async for _ in self.parts.network.changes():
+            if self.parts.network.connected:
+                self.cases.send_again()
+
+    def _is_named(self, liability: Liability) -> bool:
+        return liability.validator in self.parts.court.validators and liability.lighthouse == self.parts.channel.address
