@@ -1,14 +1,18 @@
-"""Files that commands read and write: by name, in the store, or fetched from the mesh by CID."""
+"""Files that commands read and write: by name, in the store, or fetched from the mesh by CID; and Python programs of
+users, from which commands take an agent or a validator without starting it."""
 
 from __future__ import annotations
 
 import asyncio
 import os
+import runpy
+import sys
 from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final, NamedTuple
+from traceback import extract_tb
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn, TypeVar
 
 import click
 
@@ -16,7 +20,7 @@ from mesh.base.background import Background
 from mesh.cli.chain_client import own_address
 from mesh.cli.output import printable, progress, short_address
 from mesh.content import Exchange, Store
-from mesh.errors import ConfigurationError, InputError
+from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.recording import pack_described
 from mesh.settings import NetworkSettings
 from schemas import InvalidCid, cid_of_file, parse_cid
@@ -31,6 +35,8 @@ if TYPE_CHECKING:
     from mesh.network import Network
     from mesh.settings import Settings
     from schemas.model import ModelDescription
+
+K = TypeVar("K")
 
 STORE_SETTINGS: Final = ("data_dir", "keyfile")
 """The settings that locate the store."""
@@ -252,3 +258,68 @@ async def _say_who_is_asked(settings: Settings, network: Network, cid: str) -> N
     patience = f"gives up after {settings.fetch_timeout:g} s without an answer"
     asked = f"asking {who} through {', '.join(settings.connect)}"
     click.echo(f"aira: {cid} is not in the store; {asked}; {patience}", err=True)
+
+
+def run_program(path: Path, kind: type[Any]) -> dict[str, Any]:
+    """The names that a Python program has, which is run without starting its agent (`kind`).
+
+    Raises `InputError`, and any `AiraError` of the program.
+    """
+    with _importing_from(path.parent), _not_running(kind, path) as started:
+        try:
+            return runpy.run_path(str(path), run_name=path.stem)
+        except AiraError:
+            raise
+        except (Exception, SystemExit) as error:  # whatever the program raises
+            if started:  # `run_to_end` has reported it
+                raise
+            lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
+            where = f"{path}:{lines[-1]}" if lines else str(path)
+            why = " ".join(str(error).split())
+            raise InputError(f"can't run {where}: {type(error).__name__}: {why}", code="program-unusable") from error
+
+
+def only(names: dict[str, Any], kind: type[K], path: Path, *, hint: str) -> K | None:
+    """The one object of that kind that a program has, None if there is none. Raises `InputError` for several."""
+    found = {name: value for name, value in names.items() if isinstance(value, kind)}
+    if len(set(map(id, found.values()))) > 1:
+        raise InputError(
+            f"{path} has several objects {kind.__name__}: {', '.join(sorted(found))}",
+            hint=hint,
+            code="program-unusable",
+        )
+    return next(iter(found.values()), None)
+
+
+@contextmanager
+def _importing_from(folder: Path) -> Iterator[None]:
+    """Import modules from there, as a program does that Python runs."""
+    sys.path.insert(0, str(folder.resolve()))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder.resolve()))
+
+
+@contextmanager
+def _not_running(kind: type[Any], path: Path) -> Iterator[list[Any]]:
+    """Let `agent.run()`, with which many programs end, do nothing, and let `async with agent` fail.
+
+    Yields the list of the agents that the program would have started.
+    """
+    run, enter = kind.run, kind.__aenter__
+    started: list[Any] = []
+
+    async def refuse(agent: Any) -> NoReturn:
+        started.append(agent)
+        raise InputError(
+            f"{path} starts its {kind.__name__.lower()}",
+            hint='do that below `if __name__ == "__main__":`',
+            code="program-unusable",
+        )
+
+    kind.run, kind.__aenter__ = lambda agent: None, refuse
+    try:
+        yield started
+    finally:
+        kind.run, kind.__aenter__ = run, enter

@@ -18,9 +18,9 @@ from mesh.base.outage_log import OutageLog
 from mesh.chain import permit_fee
 from mesh.chain.errors import Reverted
 from mesh.chain.liabilities import cost_receiver
+from mesh.cli import LazyGroup
 from mesh.cli.chain_client import account_of, notice_when_slow, open_chain, open_signing_chain, own_address, units_of
 from mesh.cli.files import FETCH_SETTINGS, fetch, opened_store
-from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import (
     ADDRESS,
     with_chain_settings,
@@ -41,7 +41,7 @@ from mesh.cli.output import (
     printable,
     short_address,
 )
-from mesh.cli.verify import CONNECT_TIMEOUT, print_verdicts, reports_json, reports_on, verdict_facts
+from mesh.cli.validator import CONNECT_TIMEOUT, print_verdicts, reports_json, reports_on, verdict_facts
 from mesh.errors import AiraError, ChainError, InputError, InvalidMessage, RemoteError
 from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
 from schemas.address import ZERO_ADDRESS

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from mesh.amounts import AMOUNT, XRT, InvalidAmount
+from mesh.cli import LazyGroup
 from mesh.cli.chain_client import check_balance, notice_when_slow, open_chain, open_signing_chain
-from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import (
     with_chain_settings,
     with_first_block,

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from mesh.cli.files import FETCH_SETTINGS, description_of, require_readable, required_description, writing
+from mesh.cli.files import (
+    FETCH_SETTINGS,
+    description_of,
+    only,
+    require_readable,
+    required_description,
+    run_program,
+    writing,
+)
 from mesh.cli.objective import local_file
 from mesh.cli.options import PATH, with_json, with_settings
 from mesh.cli.output import (
@@ -22,7 +30,6 @@ from mesh.cli.output import (
     print_table,
     printable,
 )
-from mesh.cli.program import only, run_program
 from mesh.errors import InputError
 from mesh.recording import Limits, preflight
 from mesh.role.models import description_in

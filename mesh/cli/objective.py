@@ -16,6 +16,7 @@ import zenoh
 import mesh
 from mesh.base.extras import needs_extra
 from mesh.base.log_context import log_event
+from mesh.cli import LazyGroup
 from mesh.cli.files import (
     FETCH_SETTINGS,
     STORE_SETTINGS,
@@ -28,7 +29,6 @@ from mesh.cli.files import (
     require_readable,
     writing,
 )
-from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import PATH, SECONDS, with_json, with_settings
 from mesh.cli.output import (
     format_duration,

@@ -1,4 +1,6 @@
-"""`aira robots`: the robots on a lighthouse's channel, as they present themselves."""
+"""`aira robots`: the robots on a lighthouse's channel, as they present themselves; `aira quotes`: what they want for a
+job, before it is ordered.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import asyncio
 import json
 import shlex
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -13,11 +16,14 @@ import msgspec
 
 from mesh.amounts import split_amount
 from mesh.cli.chain_client import open_chain
-from mesh.cli.files import FETCH_SETTINGS, model_named, opened_store
-from mesh.cli.options import CHAIN_SETTINGS, with_json, with_settings, with_timeout
-from mesh.cli.output import format_duration, plural, print_facts, print_json, print_line, print_table
+from mesh.cli.files import FETCH_SETTINGS, model_named, objective_given, objective_of, opened_store
+from mesh.cli.options import CHAIN_SETTINGS, with_json, with_objective, with_settings, with_timeout
+from mesh.cli.output import format_duration, plural, print_facts, print_json, print_line, print_table, printable
 from mesh.errors import ChainError
+from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
+from mesh.watching.robots import labelled
 from schemas.address import is_ens_name, parse_address, shortened
+from schemas.decoding import decode_json
 from schemas.model import InvalidDescription, ValueSchema
 
 if TYPE_CHECKING:
@@ -25,11 +31,14 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from mesh.agent.agent import Messages
+    from mesh.amounts import Unit
     from mesh.chain import Chain
     from mesh.network import Channel
     from mesh.settings import Settings
     from mesh.watching import Robot
     from schemas.model import ModelDescription, ModelTopic
+    from schemas.rpc import Quote
 
 
 MODELS_READ: Final = 32
@@ -224,3 +233,47 @@ def record_of(robot: Robot) -> str:
     known = robot.paid is not None and robot.refunded is not None
     record = f"{robot.paid:,} paid, {robot.refunded:,} refunded" if known else "unknown"
     return f"{record}, formerly {', '.join(map(shortened, robot.formerly))}" if robot.formerly else record
+
+
+@click.command("quotes")
+@click.option("--model", required=True, help="model of the robots: its file, CID or ENS name")
+@with_objective
+@with_timeout()
+@with_json
+@with_settings(NetworkSettings, "lighthouse_contract", "erc20_token", AccountSettings, ChainSettings)
+async def quotes(
+    settings: Settings, model: str, objective: str | None, messages: Messages, timeout: float, as_json: bool
+) -> None:
+    """Ask the robots of a model what they want for a job, when they would begin, and how long it takes.
+
+    The cheapest is listed first, of each token that robots want to be paid in; those that want the token of the
+    settings come first. A robot that does not want the job says why. Nothing is ordered, and nobody is bound: `aira
+    demand --robot NAME|ADDRESS|cheapest|first` orders.
+    """
+    from mesh.agent.agent import Agent
+
+    named = await asyncio.to_thread(model_named, model)
+    given = await asyncio.to_thread(objective_given, objective, messages)
+    settings.keyfile_and_password()
+    async with Agent(named.name, settings=replace(settings, metrics_listen="")) as agent:
+        found = await agent.quotes(agent.model, await objective_of(agent, given), timeout=timeout)
+        units = await agent.parts.chain.tokens.units(quote.token for quote in found if quote.token)
+        names = {quote.agent: agent.parts.robots.name(quote.agent) for quote in found}
+    if as_json:
+        print_json({"quotes": [decode_json(quote.encode()) | {"name": names[quote.agent]} for quote in found]})
+    elif found:
+        offers = [(*_offered(quote, units), names[quote.agent], quote.agent) for quote in found if not quote.code]
+        if offers:
+            print_table(("cost", "begins", "takes", "name", "address"), offers)
+        for quote in (quote for quote in found if quote.code):
+            why = f"{printable(quote.detail)} ({printable(quote.code)})".lstrip()
+            print_line(f"{labelled(quote.agent, names[quote.agent])} declines: {why}")
+    else:
+        print_line("no robot of this model answers")
+
+
+def _offered(quote: Quote, units: Mapping[str, Unit]) -> tuple[str, str, str]:
+    """What a robot wants, when it would begin, and how long it takes, for people."""
+    begins = f"in {format_duration(round(quote.start * 1e9))}" if quote.start else "now"
+    cost = units[quote.token].show(quote.cost)
+    return cost, begins, format_duration(round(quote.seconds * 1e9)) if quote.seconds else "unknown"

@@ -1,13 +1,16 @@
-"""`aira status` and `aira peers`: the peers on a lighthouse's channel, and their status."""
+"""`aira status` and `aira peers`: the peers on a lighthouse's channel, and their status; `aira logs`: the log of one.
+`aira health`: requests a server's health, as a container's health check does.
+"""
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
 
 import click
 
 from mesh.amounts import ETH, XRT
-from mesh.base.flood import Drops
 from mesh.cli.options import with_json, with_settings, with_timeout
 from mesh.cli.output import (
     format_duration,
@@ -18,19 +21,24 @@ from mesh.cli.output import (
     print_line,
     print_table,
     printable,
+    wait_for_broken_pipe,
 )
+from mesh.errors import ConfigurationError, RemoteError
 from mesh.settings import NetworkSettings
-from mesh.telemetry.metrics import is_healthy
+from mesh.telemetry.metrics import Health, is_healthy, listen_address
 from schemas import parse_address
-from schemas.decoding import decode_json
-from schemas.status import ALIVE, BridgeStatus, Status
+from schemas.decoding import InvalidData, decode_json
+from schemas.keys import DeviceTopicKey, RpcKey
+from schemas.status import ALIVE, LEVELS, BridgeStatus, Status
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
+    from mesh.base.flood import Drops
     from mesh.settings import Settings
     from mesh.watching import RoleStatus
-    from schemas.status import ContentMetrics, DirectionStatus, MarketStatus, StoreUse, ValidationStatus, Work
+    from mesh.watching.presence import LogReader, LogUpdate
+    from schemas.status import ContentMetrics, DirectionStatus, LogEvent, MarketStatus, StoreUse, ValidationStatus, Work
 
 
 @click.command("status")
@@ -67,6 +75,7 @@ async def status(settings: Settings, address: str | None, timeout: float, as_jso
 
 
 async def _show_all(settings: Settings, *, timeout: float, as_json: bool) -> None:
+    from mesh.base.flood import Drops
     from mesh.role.composition import watching
     from mesh.watching import BRIDGE, PROVIDER, RobotDirectory, present, statuses
 
@@ -117,6 +126,7 @@ async def peers(settings: Settings, as_json: bool) -> None:
 
     Watchers are not listed. `aira status` shows the status of each peer.
     """
+    from mesh.base.flood import Drops
     from mesh.role.composition import watching
     from mesh.watching import BRIDGE, PROVIDER, present, statuses
 
@@ -271,3 +281,165 @@ def _counts(counts: Mapping[str, int]) -> str:
     """The total, and the count of each kind."""
     kinds = ", ".join(f"{count:,} {kind}" for kind, count in sorted(counts.items()))
     return f"{sum(counts.values()):,}" + (f" ({kinds})" if kinds else "")
+
+
+LOOPBACK_OF: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+"""The address at which to reach a server that listens on all interfaces."""
+
+
+@click.command("health")
+@click.option("--url", help="address of the server, http://HOST:PORT [the settings' metrics_listen]")
+@with_timeout(8.0)
+@with_json
+@with_settings("metrics_listen")
+def health(settings: Settings, url: str | None, timeout: float, as_json: bool) -> None:
+    """Show the state of each part of a server that runs with --metrics-listen HOST:PORT.
+
+    The exit code is 0 if all parts are alive, and 1 if one is not or the server does not answer, as container health
+    checks expect.
+    """
+    found = _fetch_health(*_server_address(url, settings), timeout=timeout)
+    if as_json:
+        print_json(found)
+    else:
+        print_facts({printable(part): printable(state) for part, state in found.parts.items()})
+    sys.exit(0 if found.ok else 1)
+
+
+def _server_address(url: str | None, settings: Settings) -> tuple[str, int]:
+    """Host and port of the server. Raises `ConfigurationError`."""
+    if url is not None:
+        try:
+            parts = urlsplit(url)
+            if parts.scheme == "http" and parts.hostname and parts.port:
+                return parts.hostname, parts.port
+        except ValueError:
+            pass
+        raise ConfigurationError(
+            f"{url!r} is not a server address", hint="give --url http://HOST:PORT", code="invalid-server-address"
+        )
+    if not settings.metrics_listen:
+        raise ConfigurationError(
+            "the address of the server is missing",
+            hint="give --url http://HOST:PORT, or the same metrics_listen as the server",
+            code="invalid-server-address",
+        )
+    host, port = listen_address(settings.metrics_listen)
+    return LOOPBACK_OF.get(host, host), port
+
+
+def _fetch_health(host: str, port: int, *, timeout: float) -> Health:
+    """The server's answer. Raises `RemoteError`."""
+    from http.client import HTTPConnection, HTTPException
+
+    connection = HTTPConnection(host, port, timeout=timeout)
+    where = f"{host}:{port}"
+    try:
+        connection.request("GET", "/health")
+        return Health.decode(connection.getresponse().read(65_536))
+    except (OSError, HTTPException, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise RemoteError(
+            f"no server answers at {where}: {why}",
+            hint="check that the server runs with --metrics-listen HOST:PORT",
+            code="health-unavailable",
+        ) from None
+    except InvalidData:
+        raise RemoteError(
+            f"the answer of the server at {where} is not a health report",
+            hint="give the right --url",
+            code="health-unavailable",
+        ) from None
+    finally:
+        connection.close()
+
+
+POLL_INTERVAL: Final = 0.5
+"""Seconds between two requests for new events."""
+
+
+@click.command("logs")
+@click.argument("address")
+@click.option("--device", help="show the log of the edge agent that serves this device")
+@click.option("--follow", "-f", is_flag=True, help="also show new events until Ctrl-C")
+@click.option(
+    "--lines", "-n", type=click.IntRange(min=0), default=100, show_default=True, help="number of past events to show"
+)
+@click.option(
+    "--level", type=click.Choice(LEVELS[:-1]), default="debug", show_default=True, help="lowest level to show"
+)
+@click.option("--liability", default="", metavar="ADDRESS", help="show only events of this liability")
+@with_timeout()
+@with_json
+@with_settings(NetworkSettings)
+async def logs(
+    settings: Settings,
+    address: str,
+    device: str | None,
+    follow: bool,
+    lines: int,
+    level: str,
+    liability: str,
+    timeout: float,
+    as_json: bool,
+) -> None:
+    """Show the latest log events of the agent, provider, validator or bridge with ADDRESS.
+
+    Each keeps its last 2,000 events of its log_level or above. --json prints one object per line, in the format that
+    log_format = "json" selects.
+    """
+    from mesh.base.background import Background
+    from mesh.network import Endpoints, Network, no_answer
+    from mesh.telemetry.logs import human_line, json_line
+    from mesh.watching.presence import LogReader
+
+    agent, line = parse_address(address), json_line if as_json else human_line
+    wanted: dict[str, Any] = {"lines": lines, "level": level, "liability": liability and parse_address(liability)}
+    # An edge agent serves its device's log on the topic `/log`.
+    key = str(RpcKey(agent, "logs") if device is None else DeviceTopicKey(agent, device, "/log"))
+    async with Network(Endpoints.from_settings(settings)) as network, Background() as tasks:
+        tasks.start(wait_for_broken_pipe(), "readers of stdout")
+        reader = LogReader(network.session, key, **wanted)
+        update = await reader.poll(timeout=timeout)
+        if not update.answered:
+            raise no_answer(agent, "logs", device=device or "")
+        _print_update(update, line)
+        while update.more:
+            update = await reader.poll(timeout=timeout)
+            _print_update(update, line)
+        if follow:
+            await _follow(reader, line, timeout=timeout)
+
+
+async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout: float) -> None:
+    """Show new events. Prints to stderr when it stops answering, and when it answers again."""
+    import asyncio
+
+    from mesh.network import ServiceFailed
+    from mesh.watching.presence import LogUpdate
+
+    reported = ""
+    while True:
+        await asyncio.sleep(POLL_INTERVAL)
+        try:
+            update = await reader.poll(timeout=timeout)
+            failure = "" if update.answered else "no answer; waiting"
+        except ServiceFailed as error:
+            update, failure = LogUpdate([]), printable(str(error))
+        if failure != reported:
+            _note(failure or "answering again")
+            reported = failure
+        _print_update(update, line)
+
+
+def _print_update(update: LogUpdate, line: Callable[[LogEvent], str]) -> None:
+    for began in update.began:
+        _note(f"restarted at {printable(began)}")
+    if update.missed:
+        _note(f"missed {plural(update.missed, 'event')}: they arrived faster than they could be read")
+    for event in update.events:
+        print_line(line(event))
+
+
+def _note(words: str) -> None:
+    click.echo(f"aira: {words}", err=True)

@@ -1,4 +1,4 @@
-"""`aira up` and `aira chain up`: a market, or a chain alone, for development."""
+"""`aira up` and `aira chain up`: a market, or a chain alone, for development; and `aira demo`: one job, end to end."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from mesh.base.extras import PackageMissing
+from mesh.base.extras import PackageMissing, needs_extra
 from mesh.cli.files import require_readable
-from mesh.cli.options import BLOCK_TIME, PATH, PORT, with_json, with_settings
+from mesh.cli.options import BLOCK_TIME, FOLDER, PATH, PORT, with_json, with_settings
 from mesh.cli.output import announce, print_json
 from mesh.dev.page import PAGE_PORT, page_server
 from mesh.errors import ConfigurationError
-from mesh.role.running import run_until_stopped
+from mesh.role.running import INTERRUPTED, run_to_end, run_until_stopped
 from mesh.settings import Settings, TelemetrySettings
 from mesh.telemetry.serving import Telemetry
 
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.dev.development import DevelopmentChain
+
+
+log = logging.getLogger(__name__)
 
 
 def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -62,7 +65,9 @@ def find_engine(*, engine: str, anvil: Path | None, state: Path | None) -> Path 
     return program
 
 
-log = logging.getLogger(__name__)
+with_page_port = click.option(
+    "--web-port", type=PORT, help=f"port of the page [{PAGE_PORT}, or a free one if it is taken]"
+)
 
 
 @click.command("up")
@@ -77,7 +82,7 @@ log = logging.getLogger(__name__)
     help="seconds between blocks; empty blocks are mined, too",
 )
 @click.option("--web/--no-web", "has_page", default=True, show_default=True, help="serve the page of the market")
-@click.option("--web-port", type=PORT, help=f"port of the page [{PAGE_PORT}, or a free one if it is taken]")
+@with_page_port
 @click.option(
     "--local-account/--no-local-account",
     default=True,
@@ -271,3 +276,32 @@ async def _show_health(url: str, telemetry: Telemetry) -> None:
         monitor = ChainMonitor(node)
         with telemetry.showing(measure=monitor.measure, health=monitor.health):
             await monitor.run()
+
+
+@click.command("demo")
+@click.option("--objective", type=PATH, help="MCAP file or ROS 1 bag to play [three blinks]")
+@click.option(
+    "--generation", type=click.Choice(["3", "5"]), default="3", help="generation of the messages and contracts [3]"
+)
+@click.option("--out", type=FOLDER, help="folder in which to keep the objective and the recording")
+@click.option("--web", is_flag=True, help="serve the page of the market, and leave it open on the finished job")
+@with_page_port
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object per line; the last one is a summary")
+def demo(
+    objective: Path | None, generation: str, out: Path | None, web: bool, web_port: int | None, as_json: bool
+) -> None:
+    """Run one whole job: a person's demand and a robot's offer match, a contract holds the cost, the robot plays the
+    objective to its device, records it and signs the result, and the contract pays. Everything is real and local:
+    Zenoh sessions, an EVM, signatures, files.
+
+    With --web the market stays open: the page shows the job, and orders more of the robot. Ctrl-C ends everything."""
+    from tempfile import TemporaryDirectory
+
+    with needs_extra("demo", "the demo"):
+        from mesh.dev.demo import Demo, JsonNarrator, TextNarrator
+
+    page = page_server(web_port) if web else None  # what is missing is said before anything is done
+    narrator = JsonNarrator() if as_json else TextNarrator()
+    with TemporaryDirectory(prefix="aira-demo-") as folder:
+        job = Demo(Path(folder), objective=objective, generation=int(generation), out=out, narrator=narrator, page=page)
+        run_to_end(job.run, interrupted=0 if web else INTERRUPTED)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mesh.cli.chain_cost import STEPS
+from mesh.cli.chain import STEPS
 from tests.contracts.gas import GENERATIONS, ROWS, Gas, exceeded, measure
 
 WITHOUT_PERMITS = {

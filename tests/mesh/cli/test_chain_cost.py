@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.amounts import InvalidAmount
-from mesh.cli.chain_cost import EACH_JOB, STEPS
+from mesh.cli.chain import EACH_JOB, STEPS
 from mesh.settings.chains import CHAINS
 from tests.mesh.cli.served_chain import ServedChain
 from tests.support.commands import invoke, refused

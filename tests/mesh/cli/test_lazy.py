@@ -10,8 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 import mesh
-from mesh.cli import COMMANDS, main
-from mesh.cli.lazy import LazyGroup
+from mesh.cli import COMMANDS, LazyGroup, main
 from tests.support.commands import run
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from mesh.chain.errors import NodeUnreachable
 from mesh.cli import demand as commands
 from mesh.cli import main, replay
 from mesh.cli.up import serve_market as serve_up
-from mesh.cli.verify import verify_job
+from mesh.cli.validator import verify_job
 from mesh.errors import AiraError, InvalidAddress
 from mesh.role.composition import load_account
 from mesh.settings import Settings

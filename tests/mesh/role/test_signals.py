@@ -133,7 +133,7 @@ main()
 
 
 @pytest.mark.parametrize(
-    "module", ["mesh.cli", "click", "schemas.errors", "mesh.cli.demo", "aiohttp", "zenoh", "mesh.dev.demo"]
+    "module", ["mesh.cli", "click", "schemas.errors", "mesh.cli.up", "aiohttp", "zenoh", "mesh.dev.demo"]
 )
 def test_an_interrupt_while_modules_are_imported_ends_the_program_quietly(module: str) -> None:
     done = run(sys.executable, "-c", LOADING.format(module=module))
