@@ -1,4 +1,4 @@
-"""The door: translates A2A to the operations of a signer, and back.
+"""The door: translates A2A to the operations of a signer, and back; and the application that serves it over HTTP.
 
 It holds no key of a person, and decides nothing: the signer behind the socket does, by the person's policy. A task is a
 job of the signer, with the same id, so it is found again after any process was killed.
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from a2a.server.request_handlers import RequestHandler
 from a2a.server.request_handlers.request_handler import validate_request_params
+from a2a.server.request_handlers.response_helpers import build_error_response
+from a2a.server.routes import create_jsonrpc_routes, create_rest_routes
 from a2a.types import (
     ListTaskPushNotificationConfigsResponse,
     ListTasksResponse,
@@ -22,8 +24,10 @@ from a2a.types import (
     TaskState,
     TaskStatusUpdateEvent,
 )
+from a2a.utils.constants import AGENT_CARD_WELL_KNOWN_PATH
 from a2a.utils.errors import (
     A2AError,
+    ContentTypeNotSupportedError,
     InternalError,
     InvalidParamsError,
     TaskNotCancelableError,
@@ -37,20 +41,28 @@ from a2a.utils.task import (
     validate_history_length,
     validate_page_size,
 )
+from google.protobuf.json_format import MessageToDict
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.responses import JSONResponse
+from starlette.routing import Route
 
-from bridges.a2a._following import UNKNOWN, changes
+from bridges.a2a._card import KEYS_PATH
 from bridges.a2a._tasks import (
     HELP,
     STATES,
+    UNKNOWN,
     Wanted,
     answer_to,
     artifact_of,
     changed,
+    changes,
     key_of,
     status_of,
     task_of,
     wanted_of,
 )
+from bridges.serving import guarded
 from mesh.errors import AiraError, InputError, public_text
 from mesh.signer.protocol import FoundQuotes, FoundRobots, Job, Jobs, SignerError, SignerUnavailable
 
@@ -71,9 +83,14 @@ if TYPE_CHECKING:
         SendMessageRequest,
         SubscribeToTaskRequest,
     )
+    from starlette.requests import Request
+    from starlette.responses import Response
 
-    from bridges.a2a._push import Pusher
-    from bridges.a2a._store import TaskStore
+    from bridges.a2a._card import Card, CardKey
+    from bridges.a2a._push import Pusher, TaskStore
+    from bridges.serving import DoorOptions
+    from mesh.base.asgi_server import AsgiApplication, Receive, Send
+    from mesh.base.asgi_server import Message as AsgiMessage
     from mesh.signer.client import SignerClient
     from mesh.signer.protocol import Recording, SignerAnswer
 
@@ -376,3 +393,32 @@ def error_of(error: AiraError) -> A2AError:
     is_theirs = isinstance(error, SignerError | InputError) and not isinstance(error, SignerUnavailable)
     kind = InvalidParamsError if is_theirs else InternalError
     return kind(f"{error.code}: {public_text(error)}", data)
+
+
+def application(door: RequestHandler, card: Card, key: CardKey, options: DoorOptions) -> AsgiApplication:
+    """The ASGI application of a door."""
+
+    async def keys(request: Request) -> Response:
+        return JSONResponse(key.published())
+
+    async def served(request: Request) -> Response:
+        return JSONResponse(MessageToDict(await card.get()), headers={"Cache-Control": "public, max-age=60"})
+
+    routes = Starlette(
+        routes=[
+            Route(AGENT_CARD_WELL_KNOWN_PATH, served, methods=["GET"]),
+            Route(KEYS_PATH, keys, methods=["GET"]),
+            *create_jsonrpc_routes(door, "/"),
+            *create_rest_routes(door, path_prefix="/rest"),
+        ]
+    )
+
+    async def typed(scope: AsgiMessage, receive: Receive, send: Send) -> None:
+        kind = Headers(scope=scope).get("content-type", "") if scope["type"] == "http" else ""
+        if scope["type"] == "http" and scope["path"] == "/" and not kind.lower().startswith("application/json"):
+            refusal = build_error_response(None, ContentTypeNotSupportedError("send application/json"))
+            await JSONResponse(refusal)(scope, receive, send)
+        else:
+            await routes(scope, receive, send)
+
+    return guarded(typed, options, public=(AGENT_CARD_WELL_KNOWN_PATH, KEYS_PATH))

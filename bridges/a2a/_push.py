@@ -1,4 +1,5 @@
-"""Push notifications: posts each change of a task to the addresses that its client has named.
+"""Push notifications: posts each change of a task to the addresses that its client has named. And the file in which the
+door keeps these, and the contexts of tasks.
 
 A client names any URL, so this is a way to make the door ask machines that only it can reach. It posts to public
 addresses only, unless its operator allows others; what it connects to is the address that was checked, and it follows
@@ -17,12 +18,12 @@ from urllib.parse import urlsplit
 
 import aiohttp
 from a2a.types import StreamResponse, TaskPushNotificationConfig
-from a2a.utils.errors import InvalidParamsError
+from a2a.utils.errors import InternalError, InvalidParamsError
 from google.protobuf.json_format import MessageToDict
 
-from bridges.a2a._following import changes
-from bridges.a2a._tasks import task_of
+from bridges.a2a._tasks import changes, task_of
 from mesh.base.background import Background
+from mesh.base.database import DISK_ERRORS, SyncedDatabase
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff, RetryPolicy
@@ -30,14 +31,84 @@ from mesh.errors import AiraError
 
 if TYPE_CHECKING:
     from contextlib import AsyncExitStack
+    from pathlib import Path
 
     from aiohttp.abc import ResolveResult
 
-    from bridges.a2a._store import TaskStore
     from mesh.signer.client import SignerClient
     from mesh.signer.protocol import Job
 
 log = logging.getLogger(__name__)
+
+MOST_CONTEXTS: Final = 20_000
+"""Tasks whose context is remembered; the context of others is their id."""
+PUSHES_OF_ONE: Final = 4
+"""Push notifications of one task …"""
+MOST_PUSHES: Final = 128
+"""… and of all tasks that are not over."""
+_SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS contexts (job TEXT PRIMARY KEY, context TEXT NOT NULL) STRICT;
+CREATE TABLE IF NOT EXISTS pushes (
+    job TEXT NOT NULL, id TEXT NOT NULL, config BLOB NOT NULL, is_over INTEGER NOT NULL DEFAULT 0,
+    PRIMARY KEY (job, id)
+) STRICT;
+"""
+
+
+class TaskStore:
+    """The file at `path`, between `open` and `close`."""
+
+    def __init__(self, path: Path) -> None:
+        self._database = SyncedDatabase(path, _SCHEMA)
+        self.open, self.close = self._database.open, self._database.close
+
+    def context(self, job: str) -> str:
+        """The context of a job's task."""
+        rows = self._database.rows("SELECT context FROM contexts WHERE job = ?", (job,))
+        return str(rows[0][0]) if rows else job
+
+    def keep_context(self, job: str, context: str) -> None:
+        """Remember the context that a client gave a task, unless it has one."""
+        oldest = "DELETE FROM contexts WHERE rowid <= (SELECT MAX(rowid) FROM contexts) - ?"
+        self._write(("INSERT OR IGNORE INTO contexts VALUES (?, ?)", [(job, context)]), (oldest, [(MOST_CONTEXTS,)]))
+
+    def pushes(self, job: str) -> list[TaskPushNotificationConfig]:
+        """Where the changes of a task are pushed."""
+        rows = self._database.rows("SELECT config FROM pushes WHERE job = ? ORDER BY id", (job,))
+        return [TaskPushNotificationConfig.FromString(row[0]) for row in rows]
+
+    def waiting(self) -> list[str]:
+        """The jobs whose changes are pushed, and that were not over when that was looked at last."""
+        return [str(row[0]) for row in self._database.rows("SELECT DISTINCT job FROM pushes WHERE NOT is_over")]
+
+    def push(self, job: str, config: TaskPushNotificationConfig) -> None:
+        """Push the changes of a task there, too. Raises `InvalidParamsError` when there are too many."""
+        others = [one for one in self.pushes(job) if one.id != config.id]
+        in_all = self._database.rows("SELECT COUNT(*) FROM pushes WHERE NOT is_over")
+        if len(others) >= PUSHES_OF_ONE or (in_all and in_all[0][0] >= MOST_PUSHES):
+            raise InvalidParamsError(f"at most {PUSHES_OF_ONE} push notifications a task, and {MOST_PUSHES} in all")
+        old = "DELETE FROM pushes WHERE is_over AND rowid <= (SELECT MAX(rowid) FROM pushes) - 1000"
+        values = (job, config.id, config.SerializeToString())
+        self._write(("INSERT OR REPLACE INTO pushes (job, id, config) VALUES (?, ?, ?)", [values]), (old, [()]))
+
+    def no_push(self, job: str, identity: str) -> None:
+        """Push there no more."""
+        self._write(("DELETE FROM pushes WHERE job = ? AND id = ?", [(job, identity)]))
+
+    def over(self, job: str) -> None:
+        """The last change of a task was pushed."""
+        self._write(("UPDATE pushes SET is_over = 1 WHERE job = ?", [(job,)]))
+
+    async def sync(self) -> None:
+        """Wait until all of this is on the disk."""
+        await self._database.sync()
+
+    def _write(self, *statements: tuple[str, list[tuple[object, ...]]]) -> None:
+        try:
+            self._database.write(*statements)
+        except DISK_ERRORS as error:
+            raise InternalError(f"the disk of this agent refuses: {type(error).__name__}") from None
+
 
 LONGEST_URL: Final = 2_000
 LONGEST_SECRET: Final = 2_000

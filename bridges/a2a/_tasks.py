@@ -1,4 +1,4 @@
-"""The jobs of a signer as tasks of A2A, and the requests in messages as operations of a signer. Pure: no I/O.
+"""The jobs of a signer as tasks of A2A, the requests in messages as operations of a signer, and how a job changes.
 
 Fields are in camelCase here, as everywhere in A2A: a signer's `job_id` is `jobId`.
 """
@@ -17,12 +17,15 @@ from a2a.utils.errors import ContentTypeNotSupportedError, InvalidParamsError
 from google.protobuf.json_format import MessageToDict, ParseDict
 from google.protobuf.struct_pb2 import Value
 
+from mesh.base.retry import Backoff, RetryPolicy
+from mesh.errors import AiraError
 from mesh.signer.protocol import DOOR
 from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import AsyncIterator, Mapping
 
+    from mesh.signer.client import SignerClient
     from mesh.signer.protocol import Job, JobState, Recording, SignerAnswer
 
 LONGEST_ID: Final = 200
@@ -192,3 +195,36 @@ def _whole(value: Any) -> Any:
     if isinstance(value, float) and value.is_integer() and abs(value) < LARGEST_WHOLE:
         return int(value)
     return value
+
+
+WAIT: Final = 25.0
+"""Seconds of one look at a job."""
+ASK_AGAIN: Final = RetryPolicy(initial=1.0, ceiling=5.0)
+"""How a signer that does not answer is asked again."""
+UNKNOWN: Final = frozenset({"invalid-request", "unknown-job"})
+"""The codes of errors for a job that there is none of."""
+
+
+async def changes(signer: SignerClient, job_id: str) -> AsyncIterator[Job]:
+    """A job as it is now, then each time it has changed; the last time when it is over.
+
+    Waits while the signer is away. Raises the `AiraError` of a job that there is none of.
+    """
+    before: Job | None = None
+    revision, backoff = -1, Backoff(ASK_AGAIN)
+    while True:
+        try:
+            job = await signer.job(job_id, revision=revision, wait_seconds=WAIT)
+        except AiraError as error:
+            if error.code in UNKNOWN:
+                raise
+            revision = -1  # after a restart it may be the same for something else
+            await backoff.wait()
+            continue
+        backoff.reset()
+        revision = job.revision
+        if job != before:
+            before = job
+            yield job
+        if job.is_over:
+            return

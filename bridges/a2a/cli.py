@@ -42,10 +42,8 @@ def command(settings: Settings, **options: Any) -> None:
 async def _serve(settings: Settings, options: dict[str, Any]) -> None:
     with needs_extra("a2a", "aira a2a"):
         from bridges.a2a._card import Card, CardKey
-        from bridges.a2a._door import A2aDoor
-        from bridges.a2a._http import application
-        from bridges.a2a._push import Pusher
-        from bridges.a2a._store import TaskStore
+        from bridges.a2a._door import A2aDoor, application
+        from bridges.a2a._push import Pusher, TaskStore
         from mesh.signer.client import SignerClient
     from schemas import parse_address
 

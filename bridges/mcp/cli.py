@@ -57,14 +57,12 @@ def command(context: click.Context, /, settings: Settings, **options: Any) -> No
 
 async def _serve(settings: Settings, options: dict[str, Any]) -> None:
     with needs_extra("mcp", "aira mcp"):
-        from bridges.mcp._door import McpDoor
+        from bridges.mcp._door import McpDoor, serve_stdio
         from mesh.signer.client import SignerClient
 
     async with SignerClient(door_socket(settings, options)) as signer:
         server = McpDoor(signer).server
         if options["http"] is None:
-            from bridges.mcp._stdio import serve_stdio
-
             if sys.stdin.isatty():
                 click.echo("aira mcp speaks MCP on stdin and stdout; --http serves an address instead", err=True)
             await serve_stdio(server)

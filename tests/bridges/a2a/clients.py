@@ -14,10 +14,8 @@ from a2a.types import Message, Role, SendMessageRequest, StreamResponse
 from google.protobuf.json_format import ParseDict
 
 from bridges.a2a._card import Card, CardKey
-from bridges.a2a._door import A2aDoor
-from bridges.a2a._http import application
-from bridges.a2a._push import Pusher
-from bridges.a2a._store import TaskStore
+from bridges.a2a._door import A2aDoor, application
+from bridges.a2a._push import Pusher, TaskStore
 from bridges.serving import DoorOptions
 from mesh.base.asgi_server import AsgiServer
 from mesh.base.door import DoorLimits

@@ -13,7 +13,7 @@ import pytest
 from mcp.shared.exceptions import MCPError
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
-from bridges.mcp._stdio import LONGEST_LINE
+from bridges.mcp._door import LONGEST_LINE
 from tests.bridges.mcp.clients import stdio_client
 from tests.support.commands import AIRA, SOON
 

@@ -7,7 +7,7 @@ import json
 import pytest
 from jsonschema import Draft202012Validator
 
-from bridges.mcp._tools import INSTRUCTIONS, TOOLS
+from bridges.mcp._door import INSTRUCTIONS, TOOLS
 from mesh.signer import protocol
 
 
@@ -45,9 +45,9 @@ def test_every_argument_is_bounded(name: str) -> None:
             for each in schema:
                 check(each)
 
-    check(dict(TOOLS[name].input_schema))
+    check(TOOLS[name].input_schema)
 
 
 def test_the_words_are_printable_ascii() -> None:
-    for words in (INSTRUCTIONS, *(tool.description for tool in TOOLS.values())):
+    for words in (INSTRUCTIONS, *(tool.description or "" for tool in TOOLS.values())):
         assert all(letter == "\n" or 32 <= ord(letter) < 127 for letter in words)
