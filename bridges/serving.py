@@ -44,7 +44,6 @@ class ServerOptions:
 
     @property
     def has_login(self) -> bool:
-        """Whether its users log in."""
         return bool(self.token)
 
     def check(self) -> None:
@@ -126,7 +125,6 @@ class DoorOptions(ServerOptions):
 
 
 def door_socket(settings: Settings, options: dict[str, Any]) -> Path:
-    """The socket of the signer behind a door."""
     return Path(options["socket"] or signer_folder(settings) / DOOR_SOCKET)
 
 

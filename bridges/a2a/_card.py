@@ -80,12 +80,10 @@ class CardKey:
         """The key's id in signatures."""
 
     def sign(self, card: AgentCard, url: str) -> AgentCard:
-        """Sign a card, of a door at a URL."""
         head: Any = {"alg": ALGORITHM, "kid": self.name, "typ": "JOSE", "jku": f"{url}{KEYS_PATH}"}
         return create_agent_card_signer(self._pem, head)(card)
 
     def published(self) -> dict[str, Any]:
-        """The public key, as a JSON Web Key Set."""
         return {"keys": [{**self._public, "kid": self.name, "alg": ALGORITHM, "use": "sig"}]}
 
 

@@ -163,13 +163,11 @@ class A2aDoor(RequestHandler):
 
     @validate_request_params
     async def on_get_task(self, params: GetTaskRequest, context: ServerCallContext) -> Task | None:
-        """A task as it is now."""
         validate_history_length(params)
         return await self._task(await self._job(params.id))
 
     @validate_request_params
     async def on_list_tasks(self, params: ListTasksRequest, context: ServerCallContext) -> ListTasksResponse:
-        """The latest tasks, those that changed last first."""
         validate_history_length(params)
         size = PAGE
         if params.HasField("page_size"):
@@ -230,14 +228,12 @@ class A2aDoor(RequestHandler):
     async def on_create_task_push_notification_config(
         self, params: TaskPushNotificationConfig, context: ServerCallContext
     ) -> TaskPushNotificationConfig:
-        """Push the changes of a task to an address."""
         return await self._push(await self._job(params.task_id), params)
 
     @validate_request_params
     async def on_get_task_push_notification_config(
         self, params: GetTaskPushNotificationConfigRequest, context: ServerCallContext
     ) -> TaskPushNotificationConfig:
-        """One of the addresses of a task."""
         job = await self._job(params.task_id)
         for config in self._store.pushes(job.job_id):
             if config.id == params.id:
@@ -248,7 +244,6 @@ class A2aDoor(RequestHandler):
     async def on_list_task_push_notification_configs(
         self, params: ListTaskPushNotificationConfigsRequest, context: ServerCallContext
     ) -> ListTaskPushNotificationConfigsResponse:
-        """The addresses of a task."""
         job = await self._job(params.task_id)
         return ListTaskPushNotificationConfigsResponse(configs=self._store.pushes(job.job_id))
 
@@ -256,7 +251,6 @@ class A2aDoor(RequestHandler):
     async def on_delete_task_push_notification_config(
         self, params: DeleteTaskPushNotificationConfigRequest, context: ServerCallContext
     ) -> None:
-        """Push the changes of a task there no more."""
         job = await self._job(params.task_id)
         self._store.no_push(job.job_id, params.id)
         await self._store.sync()
@@ -396,8 +390,6 @@ def error_of(error: AiraError) -> A2AError:
 
 
 def application(door: RequestHandler, card: Card, key: CardKey, options: DoorOptions) -> AsgiApplication:
-    """The ASGI application of a door."""
-
     async def keys(request: Request) -> Response:
         return JSONResponse(key.published())
 

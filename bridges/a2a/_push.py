@@ -63,7 +63,6 @@ class TaskStore:
         self.open, self.close = self._database.open, self._database.close
 
     def context(self, job: str) -> str:
-        """The context of a job's task."""
         rows = self._database.rows("SELECT context FROM contexts WHERE job = ?", (job,))
         return str(rows[0][0]) if rows else job
 
@@ -92,7 +91,6 @@ class TaskStore:
         self._write(("INSERT OR REPLACE INTO pushes (job, id, config) VALUES (?, ?, ?)", [values]), (old, [()]))
 
     def no_push(self, job: str, identity: str) -> None:
-        """Push there no more."""
         self._write(("DELETE FROM pushes WHERE job = ? AND id = ?", [(job, identity)]))
 
     def over(self, job: str) -> None:
@@ -110,8 +108,8 @@ class TaskStore:
             raise InternalError(f"the disk of this agent refuses: {type(error).__name__}") from None
 
 
-LONGEST_URL: Final = 2_000
-LONGEST_SECRET: Final = 2_000
+LONGEST: Final = 2_000
+"""Characters of a URL, and of a secret."""
 POST_SECONDS: Final = 10.0
 RETRY: Final = RetryPolicy(initial=1.0, ceiling=20.0, attempts=4)
 """How a change is posted to an address that does not take it."""
@@ -181,17 +179,14 @@ class Pusher(Lifecycle):
             host, _ = url.hostname or "", url.port
         except ValueError:
             raise InvalidParamsError("the URL of the push notification can't be read") from None
-        if (
-            not (host and len(text) <= LONGEST_URL and text.isascii() and text.isprintable())
-            or url.username is not None
-        ):
+        if not (host and len(text) <= LONGEST and text.isascii() and text.isprintable()) or url.username is not None:
             raise InvalidParamsError("the URL of the push notification is not one to post to")
         if url.scheme != "https" and not (self._anywhere and url.scheme == "http"):
             raise InvalidParamsError("push notifications are sent over HTTPS only")
         if not self._anywhere and (host == "localhost" or (_is_number(host) and not is_public(host))):
             raise InvalidParamsError("push notifications are sent to public addresses only")
         secrets = (config.token, config.authentication.scheme, config.authentication.credentials, config.id)
-        if not all(len(one) <= LONGEST_SECRET and one.isascii() and (one.isprintable()) for one in secrets):
+        if not all(len(one) <= LONGEST and one.isascii() and (one.isprintable()) for one in secrets):
             raise InvalidParamsError("the token or credentials of the push notification can't be sent in a header")
 
     def watch(self, job: str) -> None:
@@ -229,10 +224,7 @@ class Pusher(Lifecycle):
         log.warning("the address of a push notification takes none", extra=facts)
 
     async def _posted(self, url: str, body: dict[str, Any], headers: dict[str, str]) -> bool:
-        async with (
-            self._posts,
-            self._session.post(url, json=body, headers=headers, allow_redirects=False) as response,
-        ):
+        async with self._posts, self._session.post(url, json=body, headers=headers, allow_redirects=False) as response:
             return 200 <= response.status < 300
 
 

@@ -159,14 +159,12 @@ def artifact_of(job: Job, recording: Recording | None = None) -> Artifact:
 
 
 def data_part(value: Any) -> Part:
-    """A data part with a value of JSON."""
     part = Part(media_type="application/json")
     part.data.CopyFrom(ParseDict(_shown(value), Value()))
     return part
 
 
 def changed(job: Job) -> datetime:
-    """When a job changed last."""
     moment = datetime.fromisoformat(job.changed)
     return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
 
@@ -197,10 +195,6 @@ def _whole(value: Any) -> Any:
     return value
 
 
-WAIT: Final = 25.0
-"""Seconds of one look at a job."""
-ASK_AGAIN: Final = RetryPolicy(initial=1.0, ceiling=5.0)
-"""How a signer that does not answer is asked again."""
 UNKNOWN: Final = frozenset({"invalid-request", "unknown-job"})
 """The codes of errors for a job that there is none of."""
 
@@ -211,10 +205,10 @@ async def changes(signer: SignerClient, job_id: str) -> AsyncIterator[Job]:
     Waits while the signer is away. Raises the `AiraError` of a job that there is none of.
     """
     before: Job | None = None
-    revision, backoff = -1, Backoff(ASK_AGAIN)
+    revision, backoff = -1, Backoff(RetryPolicy(initial=1.0, ceiling=5.0))
     while True:
         try:
-            job = await signer.job(job_id, revision=revision, wait_seconds=WAIT)
+            job = await signer.job(job_id, revision=revision, wait_seconds=25.0)
         except AiraError as error:
             if error.code in UNKNOWN:
                 raise

@@ -109,7 +109,7 @@ def layout(name: str, plots: tuple[str, ...], images: tuple[str, ...], out: Any)
         require_new_file(out).write_text(text + "\n", encoding="utf-8")
 
 
-def layout_json(name: str, *, plots: tuple[str, ...] = (), images: tuple[str, ...] = ()) -> str:
+def layout_json(name: str, *, plots: tuple[str, ...], images: tuple[str, ...]) -> str:
     """The layout of that name, with these paths in its plot, and a panel for each of these topics of images."""
     text = (files("bridges.foxglove") / "layouts" / f"{name}.json").read_text(encoding="utf-8")
     layout: dict[str, Any] = decode_json(text)
@@ -129,10 +129,7 @@ async def _serve(
 ) -> None:
     """Open the address that clients connect to, and show something there until cancelled."""
     with needs_extra("foxglove", "aira foxglove"):
-        from bridges.foxglove.server import (
-            FoxgloveFront,
-            FoxgloveOptions,
-        )
+        from bridges.foxglove.server import FoxgloveFront, FoxgloveOptions
     from mesh.base.flood import Drops
 
     token = await asyncio.to_thread(token_in, options["token_file"])
@@ -168,7 +165,7 @@ async def _live(agent: str, settings: Settings, telemetry: Telemetry, front: Fox
 
 async def _job(address: str, settings: Settings, telemetry: Telemetry, front: FoxgloveFront) -> None:
     with needs_extra("chain", "aira foxglove job"):
-        from bridges.foxglove._player import show_job_until_end, show_recording
+        from bridges.foxglove.sources import show_job_until_end, show_recording
         from bridges.web.components import opened
 
     own = replace(settings, keyfile="")

@@ -237,7 +237,6 @@ class ShownTypes:
                 self._learn(kind)
 
     def shown(self, topic: str, payload: bytes, kind: PayloadType) -> Shown:
-        """A message of a topic as Foxglove gets it."""
         if kind.encoding == "json":
             return self._object(topic, payload, kind)
         if kind == EMPTY or kind.schema_data:
@@ -308,7 +307,6 @@ class OpenChannel:
         self.size = 0
 
     def keep(self, payload: bytes, kind: PayloadType, at_ns: int) -> None:
-        """Remember a message."""
         self.last.append((payload, kind, at_ns))
         self.size += len(payload)
         while len(self.last) > KEPT or self.size > 1 << 16:

@@ -30,6 +30,7 @@ from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.errors import InvalidMessage
 from mesh.network import Channel, NetworkChange, Pump, sending
+from mesh.network.services import declared
 from mesh.role.running import cause_of
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from schemas import Demand, PresenceKey, Withdrawal, lighthouse_selector
@@ -40,8 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
     from contextlib import AsyncExitStack
 
-    from bridges.ipfs._messages import RelayMessage, RelayValidator
-    from bridges.ipfs._relay import QueuedMessage, Rank, RelayJournal
+    from bridges.ipfs._relay import QueuedMessage, Rank, RelayJournal, RelayMessage, RelayValidator
     from bridges.ipfs.daemon import Daemon, PubsubMessage
     from mesh.network import Network
     from schemas import Offer, Signer, Verified
@@ -365,10 +365,10 @@ class ChannelBridge(Role):
         channel.announce(BRIDGE_ROLE, self.address)
         channel.watch_presence(self._appeared, gone=self._gone)
         loop = asyncio.get_running_loop()
-        queryable: Any = session.declare_queryable(
+        queryable = session.declare_queryable(
             bridge_status_key(self.address, self.lighthouse), lambda query: call_in_loop(loop, self._answer, query)
         )
-        stack.callback(lambda: None if session.is_closed() else queryable.undeclare())
+        stack.enter_context(declared(session, queryable))
         self.relay.restore()
         self._wake()
 

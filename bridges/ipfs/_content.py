@@ -11,7 +11,7 @@ import logging
 from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import aiohttp
 import zenoh
@@ -25,6 +25,7 @@ from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.content import ContentUnavailable, is_block, session_address
 from mesh.errors import AiraError
+from mesh.network.services import declared
 from mesh.telemetry.metrics import MetricFamily, counter, gauge
 from schemas import CidKey, InputError, cid_selector, parse_block, requested_cid
 from schemas.status import ContentMetrics
@@ -50,22 +51,17 @@ BLOCK_TIMEOUT: Final = 10.0
 """Seconds that a source has for a block."""
 
 
-class Gateway:
+class Gateway(Lifecycle):
     """The read-only HTTP gateway at `address` (a multiaddr or a URL): `async with Gateway(address) as gateway`."""
+
+    title = "IPFS gateway"
 
     def __init__(self, address: str) -> None:
         self._base = base_url(address)
         self.api: Final = without_credentials(self._base)
-        self._http: aiohttp.ClientSession | None = None
 
-    async def __aenter__(self) -> Self:
-        self._http = aiohttp.ClientSession()
-        return self
-
-    async def __aexit__(self, *exc_info: object) -> None:
-        http, self._http = self._http, None
-        if http is not None:
-            await http.close()
+    async def _open(self, stack: AsyncExitStack) -> None:
+        self._http = await stack.enter_async_context(aiohttp.ClientSession())
 
     async def block(self, cid: str, *, limit: int, timeout: float) -> bytes:
         """A block by its CID, unverified. `timeout` is in seconds.
@@ -73,7 +69,6 @@ class Gateway:
         Raises `IpfsError`, also for more than `limit` bytes. Gateways from before 2022 serve only whole files and can't
         be used.
         """
-        assert self._http is not None
         try:
             async with self._http.get(
                 f"{self._base}/ipfs/{cid}",
@@ -122,13 +117,7 @@ class ContentSources:
         raise ContentUnavailable(cid, "; ".join(reasons) or "no IPFS node is configured")
 
     async def fetch(
-        self,
-        store: Store,
-        cid: str,
-        *,
-        size_limit: int,
-        timeout: float,
-        found: Found = lambda cids: None,
+        self, store: Store, cid: str, *, size_limit: int, timeout: float, found: Found = lambda cids: None
     ) -> Path:
         """Fetch a file into `store`, which lacks it, verifying each block; returns its path there.
 
@@ -407,10 +396,10 @@ class ContentBridge(Lifecycle):
         stack.push_async_callback(self._end_tasks)
         await stack.enter_async_context(self.adds)
         await stack.enter_async_context(self.fetches)
-        queryable: Any = self._parts.session.declare_queryable(
+        queryable = self._parts.session.declare_queryable(
             cid_selector(self._address), lambda query: call_in_loop(loop, self._accept, query)
         )
-        stack.callback(lambda: None if self._parts.session.is_closed() else queryable.undeclare())
+        stack.enter_context(declared(self._parts.session, queryable))
 
     async def _end_tasks(self) -> None:
         tasks = [*self._tasks, *self._fetches.values()]
@@ -453,7 +442,6 @@ class ContentBridge(Lifecycle):
                 log.warning("%s is not pinned: %s", cid, error, extra=failed)
 
     def metrics(self) -> ContentMetrics:
-        """The counts so far."""
         return ContentMetrics(
             **{name: self._counts[name] for name in _COUNTED},
             fetched_bytes=self._parts.sources.bytes,

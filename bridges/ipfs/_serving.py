@@ -41,8 +41,6 @@ TOPICS: Final = 16
 """Topics that are subscribed to, at most."""
 WAITING: Final = 1000
 """Messages that wait for a subscriber."""
-LARGEST_PUBLICATION: Final = 64 << 10
-"""Bytes of a published message."""
 HERE: Final = ("localhost", "127.0.0.1", "::1")
 """Where a page must come from: a page of a stranger could publish and read in its visitor's name."""
 
@@ -94,7 +92,6 @@ class IpfsApi(Role):
 
     @property
     def url(self) -> str:
-        """Where it is served."""
         return f"http://{self._host}:{self._server.port}"
 
     async def _open(self, stack: AsyncExitStack) -> None:
@@ -137,7 +134,7 @@ class IpfsApi(Role):
     async def _publish(self, request: web.Request) -> web.Response:
         """Verify a message, and put it on the mesh."""
         (topic, _), more = _topic(request), request.query.getall("arg")[1:]
-        data = more[0].encode() if more else await self._file(request, LARGEST_PUBLICATION)
+        data = more[0].encode() if more else await self._file(request, 64 << 10)  # bytes of a message
         message = decode(data)
         if not isinstance(message, Demand | Offer | Result):
             raise InputError("only demands, offers and results are published here")

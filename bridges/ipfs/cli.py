@@ -9,20 +9,26 @@ from typing import TYPE_CHECKING
 
 import click
 
+from bridges.ipfs.daemon import base_url
+from bridges.ipfs.service import IpfsBridge
 from mesh.base.log_context import LogSource
 from mesh.base.outage_log import OutageLog
+from mesh.cli.chain_client import own_address
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
+from mesh.content import Exchange
 from mesh.errors import InputError
-from mesh.role.running import run_until_stopped
+from mesh.network import Endpoints, Services
+from mesh.role.composition import chain_of, open_network, open_store
+from mesh.role.running import run_until_stopped, wait_for_files
 from mesh.settings import ChainSettings, IpfsSettings, NetworkSettings, TelemetrySettings
 from mesh.telemetry.logs import LogService, set_process_source
+from mesh.telemetry.serving import Telemetry
 from schemas import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bridges.ipfs.service import IpfsBridge
     from mesh.chain import Chain
     from mesh.network import Network
     from mesh.settings import Settings
@@ -74,8 +80,6 @@ def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...], s
 
 def _address(settings: Settings) -> str | None:
     """The bridge's address: its certificate's holder, or the keyfile's account, or None for a random one."""
-    from mesh.cli.chain_client import own_address
-
     if not settings.tls_certificate:
         return own_address(settings)
     from mesh.ops.identity.certificates import holder_address
@@ -84,13 +88,6 @@ def _address(settings: Settings) -> str | None:
 
 
 async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
-    from bridges.ipfs.daemon import base_url
-    from bridges.ipfs.service import IpfsBridge
-    from mesh.network import Endpoints
-    from mesh.role.composition import open_network
-    from mesh.role.running import wait_for_files
-    from mesh.telemetry.serving import Telemetry
-
     base_url(settings.ipfs_http_provider)  # fail now rather than after waiting for files or a router
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
@@ -109,11 +106,7 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
 
 async def _serve_api(settings: Settings, address: str) -> None:
     """Serve the daemon's RPC from the mesh; no daemon is needed."""
-
     from bridges.ipfs._serving import IpfsApi
-    from mesh.content import Exchange
-    from mesh.network import Endpoints
-    from mesh.role.composition import open_network, open_store
 
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
@@ -138,8 +131,6 @@ async def _serve_api(settings: Settings, address: str) -> None:
 
 async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack) -> None:
     """Announce the bridge, and serve its log."""
-    from mesh.network import Services
-
     set_process_source(LogSource("bridge", parse_address(bridge.channels[0].address)))
     for channel in bridge.channels:
         words = f"bridge {channel.address} carries {channel.lighthouse} to and from {bridge.daemon.api}"
@@ -152,8 +143,6 @@ async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack
 
 def _chain(settings: ChainSettings) -> Callable[[], Chain] | None:
     """A factory of chain clients, None if the settings name no node. Raises `ConfigurationError`."""
-    from mesh.role.composition import chain_of
-
     if not settings.web3_http_provider.strip() and not settings.web3_ws_provider.strip():
         return None
     chain_of(settings, None)  # checks the settings now

@@ -1,4 +1,5 @@
-"""An IPFS daemon: its errors, its address, the two dialects of its PubSub, and a client of its HTTP RPC.
+"""An IPFS daemon: its errors, its address, the two dialects of its PubSub, a client of its HTTP RPC, and its checks for
+`aira doctor`.
 
 Since go-ipfs 0.11 and ipfs-core 0.13 (both December 2021) topics and data are multibase texts, and published data is a
 multipart file, because the older dialect broke topics and data that contain a line feed. Sources: the changelogs of
@@ -13,18 +14,25 @@ import math
 import re
 from base64 import b64decode, urlsafe_b64encode
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 from urllib.parse import urlsplit
 
 import aiohttp
 import msgspec
 
-from mesh.errors import ClosedError, ConfigurationError, RemoteError
-from schemas.decoding import InvalidData, decode_json
+from mesh.base.lifecycle import Lifecycle
+from mesh.errors import ConfigurationError, RemoteError
+from mesh.ops.doctor.checks import Check, CheckResult, passed, warning
+from schemas.decoding import InvalidData, decode_json, text_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator
-    from pathlib import Path
+    from contextlib import AsyncExitStack
+
+    from mesh.ops.doctor.checks import DoctorContext
+    from mesh.settings import IpfsSettings, Settings
 
 
 class IpfsError(RemoteError, code="daemon-refused"):
@@ -257,13 +265,15 @@ class _DaemonAnswer(msgspec.Struct):
     peers: list[_Peer] | None = msgspec.field(default=None, name="Peers")
 
 
-class Daemon:
+class Daemon(Lifecycle):
     """The daemon at `api` (a multiaddr or a URL): `async with Daemon(api) as daemon`, then `detect_version`.
 
     `authorization` is the value of the `Authorization` header of a protected API; `call_timeout` is in seconds, for
     calls that transfer no content. Opening makes no call, so the daemon may start later. Every call raises `IpfsError`:
     with the daemon's message when it answers with an error, and `daemon-unreachable` when it does not answer in time.
     """
+
+    title = "client of an IPFS daemon"
 
     def __init__(self, api: str, *, authorization: str = "", call_timeout: float = CALL_TIMEOUT) -> None:
         self._base = base_url(api)
@@ -272,21 +282,12 @@ class Daemon:
         self._published = -math.inf
         self.api: Final = without_credentials(self._base)
         self._headers = {"Authorization": authorization} if authorization else {}
-        self._http: aiohttp.ClientSession | None = None
         self.version: DaemonVersion | None = None
         """The result of the last `detect_version`."""
         self._dialect: PubsubDialect = MultibaseDialect()
 
-    async def __aenter__(self) -> Self:
-        if self._http is not None:
-            raise ClosedError("this daemon's client is already open")
-        self._http = aiohttp.ClientSession(headers=self._headers)
-        return self
-
-    async def __aexit__(self, *exc_info: object) -> None:
-        http, self._http = self._http, None
-        if http is not None:
-            await http.close()
+    async def _open(self, stack: AsyncExitStack) -> None:
+        self._http = await stack.enter_async_context(aiohttp.ClientSession(headers=self._headers))
 
     async def detect_version(self) -> DaemonVersion:
         """Ask for the daemon's version and use its dialect from now on. Call it after every reconnection."""
@@ -300,7 +301,6 @@ class Daemon:
         return self._dialect.name
 
     async def identity(self) -> str:
-        """The daemon's peer id."""
         return (await self._call("id", _DaemonAnswer)).id
 
     async def publish(self, topic: str, data: bytes) -> None:
@@ -336,7 +336,6 @@ class Daemon:
         return found.strings or []
 
     async def swarm_peers(self) -> list[str]:
-        """The peer ids of the nodes to which the daemon is connected."""
         found = await self._call("swarm/peers", _DaemonAnswer)
         return [peer.id for peer in found.peers or []]
 
@@ -369,7 +368,6 @@ class Daemon:
         await self._call("pin/add", msgspec.Raw, ("arg", cid), timeout=timeout)
 
     async def unpin(self, cid: str) -> None:
-        """Unpin a file, so that the daemon may collect it."""
         await self._call("pin/rm", msgspec.Raw, ("arg", cid))
 
     async def block(self, cid: str, *, limit: int, timeout: float = CALL_TIMEOUT) -> bytes:
@@ -412,19 +410,14 @@ class Daemon:
 
     @asynccontextmanager
     async def _post(
-        self,
-        call: str,
-        *arguments: tuple[str, str],
-        body: aiohttp.FormData | None = None,
-        timeout: float | None = None,
+        self, call: str, *arguments: tuple[str, str], body: aiohttp.FormData | None = None, timeout: float | None = None
     ) -> AsyncGenerator[aiohttp.ClientResponse]:
         """The successful response to a call; other responses raise.
 
         `timeout` is in seconds for the whole response, by default `call_timeout`. With an infinite one the response
         must still begin within `call_timeout`, because a frozen daemon accepts connections but never answers.
         """
-        if self._http is None:
-            raise ClosedError("the client of the IPFS daemon is not open", hint="use it inside `async with`")
+        self.check_open()
         url = f"{self._base}/api/v0/{call}"
         total = self._call_timeout if timeout is None else timeout
         limits = aiohttp.ClientTimeout(total=None if total == math.inf else total, connect=5.0)
@@ -464,3 +457,65 @@ def _form(content: bytes) -> aiohttp.FormData:
     form = aiohttp.FormData()
     form.add_field("file", content, filename="data", content_type="application/octet-stream")
     return form
+
+
+def authorization_of(settings: IpfsSettings) -> str:
+    """The daemon's `Authorization` header, empty if it needs none. Raises `ConfigurationError`."""
+    if not settings.ipfs_authorization_file:
+        return ""
+    path = Path(settings.ipfs_authorization_file).expanduser()
+    try:
+        value = text_of(path.read_bytes()).strip()
+    except (OSError, InvalidData) as error:
+        raise ConfigurationError(f"can't read the IPFS credentials in {path}: {error}") from None
+    if not value.isascii() or not value.isprintable():
+        raise ConfigurationError(
+            f"{path} does not hold the value of a header", hint="one line, such as Bearer … or Basic …"
+        )
+    return value
+
+
+def checks(context: DoctorContext) -> list[Check]:
+    """The checks of the daemon (entry point `aira.doctor_checks`)."""
+    settings = context.settings
+    daemon = Check("ipfs daemon", partial(check_daemon, settings))
+    needs = ((daemon,),)
+    return [
+        daemon,
+        Check("ipfs pubsub", partial(check_pubsub, settings), needs=needs),
+        Check("ipfs swarm", partial(check_swarm, settings), needs=needs),
+    ]
+
+
+async def check_daemon(settings: IpfsSettings) -> CheckResult:
+    """Whether it answers and accepts our credentials. Raises `IpfsError`, `ConfigurationError`."""
+    async with _connected(settings) as daemon:
+        return passed(f"{daemon.version} at {daemon.api}, with the {daemon.dialect} API")
+
+
+async def check_pubsub(settings: Settings) -> CheckResult:
+    """Whether PubSub is enabled, and how many others subscribe to the lighthouse's topic. Raises `IpfsError`."""
+    async with _connected(settings) as daemon:
+        topic = settings.lighthouse_contract
+        listeners = len(await daemon.listeners(topic))
+        return passed(f"enabled; {listeners} other subscriber{'' if listeners == 1 else 's'} of {topic}")
+
+
+async def check_swarm(settings: IpfsSettings) -> CheckResult:
+    async with _connected(settings) as daemon:
+        count = len(await daemon.swarm_peers())
+        if not count:
+            return warning(
+                "the daemon has no peers, so its messages reach no other node",
+                code="no-peers",
+                hint="name legacy nodes with --ipfs-swarm-connect /…/p2p/ID, or give the daemon internet access",
+            )
+        return passed(f"connected to {count} peer{'' if count == 1 else 's'}")
+
+
+@asynccontextmanager
+async def _connected(settings: IpfsSettings) -> AsyncIterator[Daemon]:
+    authorization = authorization_of(settings)
+    async with Daemon(settings.ipfs_http_provider, authorization=authorization, call_timeout=4.0) as daemon:
+        await daemon.detect_version()
+        yield daemon

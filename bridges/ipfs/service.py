@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bridges.ipfs._channel import BridgeParts, ChannelBridge, bridge_families, health_parts
 from bridges.ipfs._content import URGENT, ContentBridge, ContentParts, ContentSources, Gateway, content_families
-from bridges.ipfs._messages import RelayValidator
-from bridges.ipfs._relay import RelayJournal, Side
-from bridges.ipfs.daemon import Daemon
+from bridges.ipfs._relay import RelayJournal, RelayValidator, Side
+from bridges.ipfs.daemon import Daemon, authorization_of
 from mesh.base.flood import Drops
 from mesh.base.fresh_file import blocklist_at
 from mesh.base.lifecycle import Role
@@ -20,22 +18,22 @@ from mesh.base.log_context import log_event
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import REMOTE, Backoff, RetryPolicy
 from mesh.content import Exchange
-from mesh.errors import ChainError, ConfigurationError
+from mesh.errors import ChainError
 from mesh.market.store import MarketStore, Withdrawals
 from mesh.network import MarketRules
 from mesh.role.composition import open_store
 from mesh.telemetry.metrics import drop_family
 from schemas import Demand, Result, Signer, decode
-from schemas.decoding import InvalidData, text_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Mapping
     from contextlib import AbstractAsyncContextManager, AsyncExitStack
+    from pathlib import Path
 
-    from bridges.ipfs._messages import RelayMessage
+    from bridges.ipfs._relay import RelayMessage
     from mesh.chain import Chain
     from mesh.network import Network
-    from mesh.settings import IpfsSettings, Settings
+    from mesh.settings import Settings
     from mesh.telemetry.metrics import MetricFamily
 
 
@@ -177,7 +175,6 @@ class IpfsBridge(Role):
                 tasks.create_task(self._chain.run(), name="bridge: the chain")
 
     async def measure(self) -> Iterable[MetricFamily]:
-        """The metrics of each channel, of content and of the session."""
         return (
             *bridge_families(channel.health() for channel in self.channels),
             *content_families(self.content.metrics()),
@@ -245,19 +242,3 @@ class IpfsBridge(Role):
                 transfers.add(cid, message.signer)
             case Result(result=cid):
                 transfers.add(cid, message.signer, priority=URGENT)
-
-
-def authorization_of(settings: IpfsSettings) -> str:
-    """The daemon's `Authorization` header, empty if it needs none. Raises `ConfigurationError`."""
-    if not settings.ipfs_authorization_file:
-        return ""
-    path = Path(settings.ipfs_authorization_file).expanduser()
-    try:
-        value = text_of(path.read_bytes()).strip()
-    except (OSError, InvalidData) as error:
-        raise ConfigurationError(f"can't read the IPFS credentials in {path}: {error}") from None
-    if not value.isascii() or not value.isprintable():
-        raise ConfigurationError(
-            f"{path} does not hold the value of a header", hint="one line, such as Bearer … or Basic …"
-        )
-    return value

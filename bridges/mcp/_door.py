@@ -102,10 +102,7 @@ _WORDS: Final = {
         "Stop a job",
         "Stop a job that is a contract already. Whether its cost comes back is the model's `on_stop`.",
     ),
-    "withdraw": (
-        "Withdraw an order",
-        "Take back an order that is no contract yet; nothing is paid for it then.",
-    ),
+    "withdraw": ("Withdraw an order", "Take back an order that is no contract yet; nothing is paid for it then."),
     "recording": (
         "Read a recording",
         "What a job's recording has: its topics, or with `topic` the values on it, `limit` of them from the number "
@@ -309,9 +306,7 @@ def _arguments(given: dict[str, Any] | None) -> dict[str, Any]:
             arguments["messages"] = decode_json(messages)
         except InvalidData as error:
             raise SignerError(
-                f"messages is no list: {error}"[:200],
-                hint='give [{"topic": …, "value": …}]',
-                code="invalid-request",
+                f"messages is no list: {error}"[:200], hint='give [{"topic": …, "value": …}]', code="invalid-request"
             ) from None
     return arguments
 

@@ -35,9 +35,6 @@ KEYS_KEPT: Final = 600.0
 """Seconds until the keys of the authorization server are asked for again; at once for a key that is not known."""
 KEYS_PAUSE: Final = 10.0
 """Seconds between two such requests: anybody can name a key that is not known."""
-MOST_KEYS: Final = 100
-LARGEST_DOCUMENT: Final = 1 << 18
-"""Bytes of what the authorization server says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +46,6 @@ class McpOptions(DoorOptions):
 
     @property
     def has_login(self) -> bool:
-        """Whether clients log in."""
         return bool(self.token or self.issuer)
 
     def check(self) -> None:
@@ -64,7 +60,6 @@ class McpOptions(DoorOptions):
 
 
 def application(server: Server[Any], options: McpOptions) -> AsgiApplication:
-    """The ASGI application of the door."""
     auth, verifier = None, None
     if options.issuer:
         verifier = IssuedTokens(options.issuer, options.url)
@@ -147,7 +142,7 @@ class IssuedTokens(TokenVerifier):
                 raise LookupError("another issuer")
             listed = (await _document(session, str(about["jwks_uri"])))["keys"]
         keys = {}
-        for each in listed[:MOST_KEYS]:
+        for each in listed[:100]:
             if not (isinstance(each, dict) and each.get("kid") and each.get("use", "sig") == "sig"):
                 continue
             if each.get("alg", "ES256") in ALGORITHMS:
@@ -167,7 +162,7 @@ async def _document(session: aiohttp.ClientSession, url: str) -> dict[str, Any]:
         data = b""
         async for part in response.content.iter_any():
             data += part
-            if len(data) > LARGEST_DOCUMENT:
+            if len(data) > 1 << 18:
                 raise LookupError("too long")
         found = decode_json(data)
         return found if isinstance(found, dict) else {}

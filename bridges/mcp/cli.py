@@ -15,16 +15,7 @@ import msgspec
 from bridges.serving import door_fields, door_socket, served_door, with_door
 from mesh.base.extras import needs_extra
 from mesh.cli.options import FILE, with_json, with_settings
-from mesh.cli.output import (
-    announce,
-    json_text,
-    plural,
-    print_facts,
-    print_json,
-    print_line,
-    print_result,
-    printable,
-)
+from mesh.cli.output import announce, json_text, plural, print_facts, print_json, print_line, print_result, printable
 from mesh.errors import AiraError, InputError
 from mesh.role.running import run_until_stopped
 from mesh.settings import StorageSettings
@@ -180,7 +171,6 @@ async def use(settings: Settings, socket: Path | None, as_json: bool) -> None:
 
 
 def _owner(settings: Settings, socket: Path | None) -> SignerClient:
-    """The client of the owner's socket."""
     with needs_extra("mcp", "aira mcp"):
         from mesh.signer.client import SignerClient
 

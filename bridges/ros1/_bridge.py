@@ -1,27 +1,25 @@
 """The bridge: a ROS 1 system as a device and a control surface of an agent.
 
-The legacy stack's nodes, topics and services are in the graph (`control`, `files`); what objectives play is published
-below `/liability/eth_ADDRESS`, and what nodes publish there is recorded (`jobs`). What boards of the agent say is
-published, too (`devices`).
+The legacy stack's nodes, topics and services are in the graph (`_legacy`); the topics of jobs and of boards are carried
+between it and the mesh (`_topics`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from bridges.devices import ABOUT, DeviceAbout, DeviceTopic
-from bridges.ros1._control import NODES, LegacyGraph
 from bridges.ros1._definitions import md5_of, message_types
-from bridges.ros1._devices import DEVICES_NODE, RosDevices
-from bridges.ros1._files import FILES_NODE, PLAYER_NODE, LegacyFiles
-from bridges.ros1._jobs import RosJobs
+from bridges.ros1._legacy import FILES_NODE, NODES, PLAYER_NODE, LegacyFiles, LegacyGraph
+from bridges.ros1._topics import DEVICES_NODE, RosDevices, RosJobs
 from bridges.ros1._wire import Ros1Error
 from bridges.ros1.node import Ros1Node
 from mesh.base.background import Background, call_in_loop
 from mesh.base.lifecycle import Role
 from mesh.base.log_context import log_event
+from mesh.network.services import declared
 from mesh.telemetry.metrics import MetricFamily, by_label, drop_family
 from schemas.keys import IDLE, PRESENT, DeviceTopicKey
 from schemas.status import ALIVE
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from bridges.ros1._parts import RosBridgeOptions, RosBridgeParts
+    from bridges.ros1._topics import RosBridgeOptions, RosBridgeParts
 
 log = logging.getLogger(__name__)
 
@@ -70,14 +68,14 @@ class Ros1Bridge(Role):
         await stack.enter_async_context(RosDevices(self._parts, nodes[DEVICES_NODE]))
         await stack.enter_async_context(LegacyFiles(self._parts, options, nodes))
         await stack.enter_async_context(LegacyGraph(self._parts, options, nodes, self.jobs))
-        declared: list[Any] = [
+        for declaration in (
             self._session.liveliness().declare_token(self._key(PRESENT)),
             self._session.declare_queryable(
                 self._key(ABOUT), lambda query: call_in_loop(loop, self._reply_about, query)
             ),
             self._session.declare_queryable(self._key(IDLE), lambda query: call_in_loop(loop, self._ask_idle, query)),
-        ]
-        stack.callback(lambda: None if self._session.is_closed() else [each.undeclare() for each in declared])
+        ):
+            stack.enter_context(declared(self._session, declaration))
         self._tasks.start(self._graph.watch(), "registrations")
         self._tasks.start(self._graph.drops.run(), "drops")
 
@@ -89,15 +87,13 @@ class Ros1Bridge(Role):
             hint="was it `rosnode kill`? Or is another bridge, or the legacy stack, on this master? Stop one of them",
         )
 
-    def families(self) -> tuple[MetricFamily, ...]:
-        """The metrics now."""
+    async def measure(self) -> tuple[MetricFamily, ...]:
         counts = {"in": self.jobs.received, "out": self.jobs.published}
         help_text = "Messages of jobs from the ROS 1 system (in) and to it (out)"
         families = by_label("aira_ros1_messages_total", "counter", help_text, "direction", counts)
-        return families, drop_family(self._graph.drops)
+        return families, drop_family(self._graph.drops), *self._parts.network.families()
 
     def parts(self) -> Mapping[str, str]:
-        """The state of each part now: the router, and the ROS master."""
         is_linked = not self._session.is_closed() and bool(self._session.info.routers_zid())
         return {
             "channel": ALIVE if is_linked else "waits for a router",

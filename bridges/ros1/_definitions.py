@@ -128,13 +128,11 @@ _SERVICES: Final[dict[str, dict[str, str]]] = {
     "robonomics_liability/StartLiability": _of_liability("", _DONE),
     "robonomics_liability/FinishLiability": _of_liability("bool success\n", ""),
     "robonomics_liability/ReadLiability": {
-        "5": "ethereum_common/Address address\n---\nbool read\nLiability liability\n",
+        "5": "ethereum_common/Address address\n---\nbool read\nLiability liability\n"
     },
-    "robonomics_liability/PersistenceContainsLiability": {
-        "4": "ethereum_common/Address address\n---\nbool exists\n",
-    },
+    "robonomics_liability/PersistenceContainsLiability": {"4": "ethereum_common/Address address\n---\nbool exists\n"},
     "robonomics_liability/PersistenceLiabilityTimestamp": {
-        "4": "ethereum_common/Address address\n---\ntime timestamp\n",
+        "4": "ethereum_common/Address address\n---\ntime timestamp\n"
     },
     "robonomics_liability/CreateRosbagPlayer": {
         "4": "ipfs_common/Multihash ipfs_address\nstring namespace\n---\n"

@@ -140,7 +140,6 @@ def stays_open(head: bytes) -> bool:
 
 
 def encode_call(uri: str, method: str, arguments: tuple[Any, ...]) -> bytes:
-    """The HTTP request of an XML-RPC call."""
     body = xmlrpc.client.dumps(arguments, method).encode()
     place = urlsplit(uri)
     head = f"POST {place.path or '/'} HTTP/1.1\r\nHost: {place.netloc}\r\nConnection: close\r\n"
@@ -148,7 +147,6 @@ def encode_call(uri: str, method: str, arguments: tuple[Any, ...]) -> bytes:
 
 
 def encode_reply(value: Any) -> bytes:
-    """The HTTP reply to an XML-RPC call."""
     try:
         body = xmlrpc.client.dumps((value,), methodresponse=True).encode()
     except (OverflowError, TypeError) as error:

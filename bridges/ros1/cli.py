@@ -6,7 +6,7 @@ import ipaddress
 import logging
 import tempfile
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,11 +28,8 @@ from mesh.settings import (
 from mesh.telemetry.logs import set_process_source
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from bridges.ros1._parts import RosBridgeParts
+    from bridges.ros1._topics import RosBridgeParts
     from bridges.ros1.node import Ros1Graph
-    from mesh.telemetry.metrics import MetricFamily
     from mesh.telemetry.serving import Telemetry
 
 log = logging.getLogger(__name__)
@@ -49,21 +46,15 @@ PARAMETERS: Final = {f"{node}/{name}": name for node, names in _OF_NODES.items()
     "/eth/erc20_token/token_contract": "erc20_token"
 }
 """The parameters of the legacy stack's nodes, and our settings that they are."""
-WITHOUT_MEANING: Final = frozenset(
-    {
-        "/liability/executor/ipfs_http_provider",
-        "/liability/executor/master_check_interval",
-        "/liability/infochan/ipfs_channel/ipfs_http_provider",
-        "/liability/infochan/ipfs_common_node/ipfs_file_providers",
-        "/liability/infochan/ipfs_common_node/ipfs_http_provider",
-        "/liability/infochan/ipfs_common_node/ipfs_swarm_connect_to",
-        "/liability/listener/ipfs_http_provider",
-        "/liability/listener/poll_interval",
-        "/liability/persistence/persistence_update_interval",
-        "/liability/player_service/ipfs_http_provider",
-        "/liability/player_service/master_check_interval",
-    }
-)
+_IGNORED: Final = {
+    "/liability/executor": ("ipfs_http_provider", "master_check_interval"),
+    "/liability/infochan/ipfs_channel": ("ipfs_http_provider",),
+    "/liability/infochan/ipfs_common_node": ("ipfs_file_providers", "ipfs_http_provider", "ipfs_swarm_connect_to"),
+    "/liability/listener": ("ipfs_http_provider", "poll_interval"),
+    "/liability/persistence": ("persistence_update_interval",),
+    "/liability/player_service": ("ipfs_http_provider", "master_check_interval"),
+}
+WITHOUT_MEANING: Final = frozenset(f"{node}/{name}" for node, names in _IGNORED.items() for name in names)
 """The parameters of the legacy stack's nodes that nothing here needs; docs/reference/ros1.md says why."""
 PRIVATE: Final = frozenset({"keyfile", "keyfile_password_file", "web3_http_provider", "web3_ws_provider"})
 """Settings that are read from the parameter server and never written to it: paths, and URLs of nodes."""
@@ -108,23 +99,7 @@ def command(settings: Settings, messages: Path | None, message_version: str | No
     if messages is not None:
         _write_messages(messages, generation)
         return
-    run_until_stopped(
-        lambda: _serve(settings, Ros1Options(generation=generation, **options)), settings=settings, role="edge"
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ros1Options:
-    """The flags of the command."""
-
-    agent: str | None
-    name: str
-    serves_master: bool
-    ros_master_uri: str
-    ros_ip: str
-    folders: tuple[Path, ...]
-    original_timing: bool
-    generation: str
+    run_until_stopped(lambda: _serve(settings, options | {"generation": generation}), settings=settings, role="edge")
 
 
 def _write_messages(folder: Path, generation: str) -> None:
@@ -140,42 +115,38 @@ def _write_messages(folder: Path, generation: str) -> None:
     click.echo(f"for rosmsg and rossrv: export ROS_PACKAGE_PATH={folder}/src:$ROS_PACKAGE_PATH")
 
 
-async def _serve(settings: Settings, options: Ros1Options) -> None:
+async def _serve(settings: Settings, options: dict[str, Any]) -> None:
     from bridges.ros1._bridge import Ros1Bridge
-    from bridges.ros1._parts import RosBridgeOptions
+    from bridges.ros1._topics import RosBridgeOptions
     from mesh.telemetry.serving import Telemetry
     from schemas import parse_address
 
-    if options.agent is not None:
-        options = replace(options, agent=parse_address(options.agent))
-    if not _is_loopback(options.ros_ip):
-        facts = log_event("ros1-open", address=options.ros_ip)
+    if options["agent"] is not None:
+        options = options | {"agent": parse_address(options["agent"])}
+    if not _is_loopback(options["ros_ip"]):
+        facts = log_event("ros1-open", address=options["ros_ip"])
         log.warning(
-            "ROS 1 has no access control: who reaches %s can do what the agent allows", options.ros_ip, extra=facts
+            "ROS 1 has no access control: who reaches %s can do what the agent allows", options["ros_ip"], extra=facts
         )
     async with AsyncExitStack() as stack:
-        telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen if options.agent else ""))
+        telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen if options["agent"] else ""))
         graph = await _graph(options, stack, telemetry)
         settings = await settings_with_parameters(graph, settings)
         parts = await _parts(graph, settings, options, stack, telemetry)
         chosen = RosBridgeOptions(
-            name=options.name,
+            name=options["name"],
             recording_topics=frozenset(filter(None, map(str.strip, settings.recording_topics.split(",")))),
-            as_original=options.original_timing,
-            folders=options.folders or (Path(tempfile.gettempdir()),),
-            generation=options.generation,
-            is_alone=options.serves_master,
+            as_original=options["original_timing"],
+            folders=options["folders"] or (Path(tempfile.gettempdir()),),
+            generation=options["generation"],
+            is_alone=options["serves_master"],
             size_limit=settings.objective_size_limit,
         )
         bridge = await stack.enter_async_context(Ros1Bridge(parts, chosen))
         set_process_source(LogSource("edge", parse_address(parts.agent)))
-
-        async def measure() -> Iterable[MetricFamily]:
-            return (*bridge.families(), *parts.network.families())
-
-        stack.enter_context(telemetry.showing(measure=measure, health=bridge.parts))
+        stack.enter_context(telemetry.showing(measure=bridge.measure, health=bridge.parts))
         words = f"bridge of {parts.agent}: the ROS master is {graph.master}"
-        announce(log, "edge-started", words, device=options.name)
+        announce(log, "edge-started", words, device=options["name"])
         await bridge.run()
 
 
@@ -186,7 +157,7 @@ def _is_loopback(address: str) -> bool:
         raise InputError(f"--ros-ip: {address!r} is no IP address", hint="as in 192.168.0.7") from None
 
 
-async def _graph(options: Ros1Options, stack: AsyncExitStack, telemetry: Telemetry) -> Ros1Graph:
+async def _graph(options: dict[str, Any], stack: AsyncExitStack, telemetry: Telemetry) -> Ros1Graph:
     """The ROS graph, on our master or on another one, for which it waits, as nodes of ROS do."""
     from bridges.ros1._wire import Ros1Error, place_of
     from bridges.ros1.master import RosMaster
@@ -194,19 +165,19 @@ async def _graph(options: Ros1Options, stack: AsyncExitStack, telemetry: Telemet
     from mesh.base.flood import Drops
     from mesh.base.retry import Backoff
 
-    drops, uri = Drops(), options.ros_master_uri
+    drops, uri = Drops(), options["ros_master_uri"]
     try:
         port = place_of(uri)[1]
     except Ros1Error as error:
         raise InputError(f"--ros-master-uri: {error}", hint="as in http://127.0.0.1:11311") from None
-    if options.serves_master:
+    if options["serves_master"]:
         try:
-            master = await stack.enter_async_context(RosMaster(options.ros_ip, port, drops))
+            master = await stack.enter_async_context(RosMaster(options["ros_ip"], port, drops))
         except PortUnavailable as error:
             error.hint = "if a ROS master runs there, leave out --master; or choose another port by --ros-master-uri"
             raise
-        return Ros1Graph(master.uri, options.ros_ip, drops)
-    graph, backoff = Ros1Graph(uri, options.ros_ip, drops), Backoff(RECONNECT)
+        return Ros1Graph(master.uri, options["ros_ip"], drops)
+    graph, backoff = Ros1Graph(uri, options["ros_ip"], drops), Backoff(RECONNECT)
     while True:
         try:
             await graph.call("getUri")
@@ -220,15 +191,15 @@ async def _graph(options: Ros1Options, stack: AsyncExitStack, telemetry: Telemet
 
 
 async def _parts(
-    graph: Ros1Graph, settings: Settings, options: Ros1Options, stack: AsyncExitStack, telemetry: Telemetry
+    graph: Ros1Graph, settings: Settings, options: dict[str, Any], stack: AsyncExitStack, telemetry: Telemetry
 ) -> RosBridgeParts:
     """Those of the agent that is run here, or what is needed beside one that runs elsewhere."""
-    from bridges.ros1._parts import RosBridgeParts
+    from bridges.ros1._topics import RosBridgeParts
     from mesh.content import Exchange
     from mesh.role.composition import open_store, watching
 
     directory = settings.state_directory / "bridge" / "ros1"
-    if options.agent is None:
+    if options["agent"] is None:
         from mesh import Agent
 
         if not settings.keyfile:
@@ -250,7 +221,7 @@ async def _parts(
     )
     store = await open_store(stack, settings, directory / "content", limit=settings.objective_size_limit)
     return RosBridgeParts(
-        agent=options.agent,
+        agent=options["agent"],
         network=network,
         channel=channel,
         graph=graph,

@@ -28,8 +28,6 @@ PORT: Final = 11311
 """Where a master of ROS 1 usually is."""
 MOST_NAMES: Final = 20_000
 """Registrations and parameters, each, that it keeps."""
-MOST_CALLS: Final = 64
-"""Nodes that it notifies at the same time."""
 
 Reply = tuple[int, str, Any]
 
@@ -50,7 +48,7 @@ class RosMaster(Lifecycle):
         self._services: dict[str, tuple[str, str]] = {}
         self._types: dict[str, str] = {}
         self.parameters: dict[str, Any] = {}
-        self._calls = asyncio.Semaphore(MOST_CALLS)
+        self._calls = asyncio.Semaphore(64)  # nodes that it notifies at the same time
 
     @property
     def uri(self) -> str:

@@ -335,7 +335,6 @@ class Ros1Subscription:
             self._readers[uri] = self._node.tasks.start(self._read_always(uri), name)
 
     async def close(self) -> None:
-        """Unsubscribe."""
         self.update(())
         await self._node._withdraw(self)
 
@@ -402,7 +401,6 @@ class Ros1Service:
 
     @property
     def type(self) -> str:
-        """The name of its type."""
         return self.default.name
 
     async def serve(

@@ -1,8 +1,8 @@
-from bridges.ros2._actions import RosActionServer as RosActionServer, RosGoal as RosGoal
+from bridges.ros2._services import RosActionServer as RosActionServer, RosGoal as RosGoal
 from bridges.ros2._node import RosGraph as RosGraph
 from bridges.ros2._robot import Robot as Robot, RosAllowed as RosAllowed
 from bridges.ros2._services import RosParameters as RosParameters, RosServer as RosServer
-from bridges.ros2._topics import (
+from bridges.ros2._node import (
     RosMessage as RosMessage,
     RosPublisher as RosPublisher,
     RosSubscription as RosSubscription,

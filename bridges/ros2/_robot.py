@@ -7,19 +7,18 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
-from bridges.ros2._actions import RosActionClient, RosActionServer
-from bridges.ros2._node import RosNode
-from bridges.ros2._services import REQUESTS, RosClient, RosOwnParameters, RosParameters, RosServer, add_definitions
-from bridges.ros2._topics import RosPublisher, RosSubscription
-from bridges.ros2._wire import (
-    ACTION,
-    DEFAULT_QOS,
-    SEND_GOAL,
-    RmwZenoh,
-    Ros2Dds,
-    full_type,
-    type_mismatch,
+from bridges.ros2._node import RosNode, RosPublisher, RosSubscription
+from bridges.ros2._services import (
+    REQUESTS,
+    RosActionClient,
+    RosActionServer,
+    RosClient,
+    RosOwnParameters,
+    RosParameters,
+    RosServer,
+    add_definitions,
 )
+from bridges.ros2._wire import ACTION, DEFAULT_QOS, SEND_GOAL, RmwZenoh, Ros2Dds, full_type, type_mismatch
 from mesh.base.extras import needs_extra
 from mesh.base.flood import Drops
 from mesh.base.lifecycle import Lifecycle
@@ -32,9 +31,8 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from bridges.ros2._actions import RosGoal
     from bridges.ros2._node import RosGraph
-    from bridges.ros2._services import RosRecorder
+    from bridges.ros2._services import RosGoal, RosRecorder
     from bridges.ros2._wire import RosQos
     from mesh.recording.ros import RosTypes
 
@@ -128,12 +126,7 @@ class Robot(Lifecycle):
         await self._node.wait(self._node.resolve(name), timeout)
 
     def publish(
-        self,
-        topic: str,
-        message: Payload | str,
-        fields: Mapping[str, Any] | None = None,
-        *,
-        qos: RosQos | None = None,
+        self, topic: str, message: Payload | str, fields: Mapping[str, Any] | None = None, *, qos: RosQos | None = None
     ) -> None:
         """Publish a payload of `types.message`, or a message of the type `message` with these `fields`.
 

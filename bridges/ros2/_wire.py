@@ -367,7 +367,6 @@ class Ros2Dds:
         """What all tokens match."""
 
     def key(self, name: str, kind: str, type_hash: str) -> str:
-        """The key of a topic or service."""
         return name.strip("/")
 
     def token(self, entity: RosEntity) -> str:

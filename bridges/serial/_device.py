@@ -13,14 +13,7 @@ import msgspec
 import zenoh
 
 from bridges.devices import ABOUT, DeviceAbout, said_by
-from bridges.serial.dialect import (
-    PATIENCE,
-    REASONS,
-    CallFailed,
-    CallStatus,
-    Flow,
-    call_failed,
-)
+from bridges.serial.dialect import PATIENCE, REASONS, CallFailed, CallStatus, Flow, call_failed
 from mesh.errors import RemoteError
 from mesh.network import Pump
 from mesh.network.presence import present_keys

@@ -1,4 +1,5 @@
-"""Simulated boards: firmware in a simulated Arduino Uno, with its serial line on a pseudo-terminal.
+"""Simulated boards: firmware in a simulated Arduino Uno, with its serial line on a pseudo-terminal; also for tests of
+robots that have one.
 
 The simulator is a small C program of ours on libsimavr; it is compiled on first use and kept in the cache folder that
 the programs of the tests share. A board uses about two thirds of a core. As on a real line, bytes are garbage if host
@@ -7,13 +8,15 @@ and firmware have different baud rates.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
-import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
@@ -21,11 +24,15 @@ from typing import TYPE_CHECKING, Final, Self
 import click
 
 from bridges.serial.dialect import LineError
+from bridges.serial.firmware import CORE, cache_folder, compile_sketch
+from mesh.base.background import in_daemon_thread
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 from mesh.role.running import INTERRUPTED, fail
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable, Sequence
+
+    from mesh import Agent
 
 
 SOURCES: Final = Path(__file__).parent / "board"
@@ -266,9 +273,56 @@ class SimulatedBoard:
         return self._process
 
 
-def cache_folder() -> Path:
-    """The folder that `make peers` also uses; it may be deleted at any time."""
-    return Path(os.environ.get("AIRA_PEERS_CACHE") or "~/.cache/aira-mesh").expanduser()
+@asynccontextmanager
+async def simulated_board(
+    sketch: str | Path,
+    agent: Agent,
+    *,
+    name: str = "board",
+    protocol: str = "frames",
+    baud: int = 57600,
+    libraries: Sequence[Path] = (),
+) -> AsyncIterator[SimulatedBoard]:
+    """Compile a sketch for an Uno, simulate the board, and connect it to an agent at work as `aira edge` does.
+
+    `sketch` is its folder. `name`, `protocol` and `baud` (bits per second) are those of
+    `aira edge`, `libraries` Arduino libraries and folders of them. Yields the board: its pins change `pins` and
+    `dimmings`; `set_pin`, `set_voltage`, `unplug` and `plug` change it. Compiling takes some seconds.
+
+    Skips the test where the AVR tools are not installed. Raises `InputError` for a sketch that does not compile.
+    """
+    from bridges.serial._edge import Edge, EdgeOptions
+    from mesh.network import Endpoints, Network
+
+    if missing := _missing_tool():
+        import pytest
+
+        packages = "gcc-avr avr-libc arduino-core-avr libsimavr-dev gcc"
+        pytest.skip(f"{missing} is not installed; on Debian: apt-get install {packages}")
+    with tempfile.TemporaryDirectory(prefix="aira-sketch-") as made:
+        elf = Path(made) / "board.elf"
+        await asyncio.to_thread(compile_sketch, Path(sketch), elf, libraries=libraries)
+        board = SimulatedBoard(elf)
+        await asyncio.to_thread(board.__enter__)
+        try:
+            options = EdgeOptions(agent=agent.address, name=name, port=str(board.port), protocol=protocol, baud=baud)
+            edge = Edge(options)
+            async with Network(Endpoints(connect=agent.settings.connect)) as network:
+                running = in_daemon_thread(lambda: edge.run(network.session), "edge of the board")
+                try:
+                    yield board
+                finally:
+                    edge.stop()
+                    await asyncio.wrap_future(running)
+        finally:
+            await asyncio.to_thread(board.__exit__, None, None, None)
+
+
+def _missing_tool() -> str:
+    """A program that is needed and not installed; empty if all are."""
+    if not CORE.is_dir():
+        return "the Arduino core"
+    return next((tool for tool in ("avr-gcc", "gcc") if shutil.which(tool) is None), "")
 
 
 HELP = (
@@ -302,8 +356,6 @@ def run(firmware: Path, port: Path | None, reset_on_open: bool, monitor: bool) -
     `adc 0 2500` puts 2.5 V on A0, `send hello` sends a line to the sketch, `unplug` and `plug` disconnect and connect
     the cable, `reset` restarts the board, `noise 0.01` corrupts 1 % of the bytes on the line. `quit` or Ctrl-C ends it.
     """
-    from bridges.serial.boards import SimulatedBoard
-
     try:
         with SimulatedBoard(firmware, port=port, resets=reset_on_open, monitor=monitor, watch=_show) as board:
             click.echo(f"{HELP}\nconnect it with: aira edge {board.port} --agent ADDRESS")

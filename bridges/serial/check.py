@@ -50,9 +50,7 @@ def check_board(settings: SerialSettings, *, timeout: float | None = None) -> Ch
     dialect = make_dialect(settings.protocol, settings.baud)
     ready = threading.Event()
     line = SerialLine(
-        PortName(settings.port),
-        dialect,
-        on_event=lambda event: ready.set() if isinstance(event, BoardReady) else None,
+        PortName(settings.port), dialect, on_event=lambda event: ready.set() if isinstance(event, BoardReady) else None
     )
     thread = threading.Thread(target=line.run, name="line of the doctor", daemon=True)
     began = time.monotonic()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 import re
 import subprocess
 import tempfile
@@ -21,7 +22,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bridges.serial.boards import cache_folder
 from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.role.running import fail
 
@@ -182,6 +182,11 @@ def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), d
         made = _objects(parts, Path(folder), [*macros, *(f"-I{path}" for path in includes)])
         _run("avr-gcc", *FLAGS, "-Wl,--gc-sections", "-fuse-linker-plugin", *made, core, "-lm", "-o", elf)
     return elf
+
+
+def cache_folder() -> Path:
+    """The folder that `make peers` also uses; it may be deleted at any time."""
+    return Path(os.environ.get("AIRA_PEERS_CACHE") or "~/.cache/aira-mesh").expanduser()
 
 
 def compiled_core(macros: Sequence[str]) -> Path:

@@ -123,13 +123,7 @@ class SerialLine:
     raise: it waits for a port that is missing or was unplugged.
     """
 
-    def __init__(
-        self,
-        name: PortName,
-        dialect: Dialect,
-        *,
-        on_event: Callable[[LineEvent], None],
-    ) -> None:
+    def __init__(self, name: PortName, dialect: Dialect, *, on_event: Callable[[LineEvent], None]) -> None:
         self.name = name
         self.dialect = dialect
         self._on_event = on_event

@@ -37,13 +37,10 @@ from bridges.web._files import (
     picture_of,
     summary_of,
 )
-from bridges.web._history import PastContracts
-from bridges.web._jobs import Views
 from bridges.web._live import Live
 from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms, liability_json
-from bridges.web._robots import Questions
-from bridges.web._stops import Stops
 from bridges.web._stream import Stream
+from bridges.web._views import PastContracts, Questions, Views
 from mesh.agent.orders import lifetime_of
 from mesh.base.background import Background
 from mesh.base.lifecycle import Lifecycle
@@ -103,13 +100,6 @@ class RpcRequest(msgspec.Struct, frozen=True):
     jsonrpc: str = "2.0"
 
 
-class Form(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Values for a model's topics."""
-
-    model: str
-    values: list[dict[str, Any]]
-
-
 OPENAPI: Final = Path(__file__).with_name("openapi.json")
 AGENTS_INTERVAL: Final = 3.0
 """Seconds between two lists of agents on the stream, …"""
@@ -119,9 +109,15 @@ LISTED: Final = 500
 """Things in one list."""
 
 
-class LocalOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename="camel"):
-    """What the local account orders."""
+# The bodies of requests, which openapi.json describes.
 
+
+class Form(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    model: str
+    values: list[dict[str, Any]]
+
+
+class LocalOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename="camel"):
     model: str
     objective: str
     cost: str
@@ -134,47 +130,33 @@ class LocalOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename
 
 
 class QuotesWanted(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The job for which robots are asked what they want."""
-
     model: str
     objective: str
 
 
 class LocalWithdrawal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The order that the local account withdraws."""
-
     order: str
 
 
 class LocalRefund(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The job whose cost the local account takes back."""
-
     liability: str
 
 
 class LocalStop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The job that the local account stops, and why, for people."""
-
     liability: str
     why: str = ""
 
 
 class AgentAction(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The job that an operator starts, finishes or restarts."""
-
     liability: str
     success: bool = True
 
 
 class RobotStop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Why a robot is stopped."""
-
     why: str = ""
 
 
 class ConsentAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Whether an operator allows an order that a program asks for."""
-
     allow: bool
 
 
@@ -194,7 +176,6 @@ class Api(Lifecycle):
         self._publisher = OrderPublisher(components, self._market)
         self._live = Live(components, self._market, self.stream)
         self._history = PastContracts(components, self._market)
-        self._stops = Stops(components, self._market)
         self._questions = Questions(components, self._market.labels)
         self._facts: dict[str, Any] = {}
         self._facts_at = float("-inf")
@@ -259,7 +240,7 @@ class Api(Lifecycle):
             get("/api/v1/consents", self.consents),
             post("/api/v1/consents/{id}", self.answer_consent),
             get("/api/v1/lighthouse", self.lighthouse),
-            get("/api/v1/stream", self.open_stream),
+            get("/api/v1/stream", self.stream.serve),
             post("/rpc", self.rpc),
         ]
 
@@ -400,10 +381,10 @@ class Api(Lifecycle):
 
     async def local_stop(self, request: web.Request) -> web.Response:
         wanted = await body_of(request, LocalStop)
-        return answer(await self._stops.stop(parse_address(wanted.liability), wanted.why))
+        return answer(await self._publisher.stop(parse_address(wanted.liability), wanted.why))
 
     async def stop(self, request: web.Request) -> web.Response:
-        return answer(await self._stops.send(StopRequest.decode(await request.read())))
+        return answer(await self._publisher.pass_stop(StopRequest.decode(await request.read())))
 
     async def consents(self, request: web.Request) -> web.Response:
         async with self._signer(request) as signer:
@@ -580,9 +561,6 @@ class Api(Lifecycle):
     async def release_robot(self, request: web.Request) -> web.Response:
         await body_of(request, Nothing)
         return await self.control(request, ControlRobot(release=True))
-
-    async def open_stream(self, request: web.Request) -> web.StreamResponse:
-        return await self.stream.serve(request)
 
     async def rpc(self, request: web.Request) -> web.Response:
         return answer(await _answer_rpc(self._parts.chain.node, await request.read()))

@@ -73,8 +73,6 @@ LARGEST_PICTURE: Final = 256 << 10
 """Bytes of the largest picture that is shown."""
 NUMBERS: Final = 32
 """Numbers of one message."""
-AFTER_END: Final = 15.0
-"""Seconds for which a job is followed after its end was seen."""
 
 
 class Samples:
@@ -185,12 +183,10 @@ class Followed:
         self.task: asyncio.Task[None] | None = None
 
     def stop(self) -> None:
-        """End the subscription, if it is open."""
         if self.task is not None:
             self.task.cancel()
 
     async def run(self) -> None:
-        """Subscribe until it is stopped."""
         pump = Pump(
             self._parts.network.session,
             self._selector,
@@ -356,7 +352,7 @@ class Live(Lifecycle):
             for address, (followed, _) in self._jobs.items():
                 job = self._market.jobs.get(address)
                 if job is not None and job.liability.is_finalized:
-                    if now - ended.setdefault(address, now) > AFTER_END:
+                    if now - ended.setdefault(address, now) > 15.0:  # seconds after the end
                         followed.stop()
                 else:
                     ended.pop(address, None)

@@ -1,4 +1,5 @@
-"""What the page knows of the market: orders, contracts, what providers and agents say of them; and orders posted here.
+"""What the page knows of the market: orders, contracts, what providers and agents say of them; and the orders and stops
+that are posted here.
 
 Contracts are as the chain has them. What agents say is kept only of a job's promisor, and everything is bounded. Orders
 that people post are checked as a provider would, and published until they have an effect. In JSON, amounts are decimal
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from bridges.web._access import WebError, unusable
-from mesh.agent.contracts import is_about, verdict_words
+from mesh.agent.contracts import is_about, send_stop, verdict_words
 from mesh.agent.hiring import PROVIDERS, send_pair
 from mesh.agent.orders import OrderState
 from mesh.agent.validators import accepted_of
@@ -70,6 +71,8 @@ if TYPE_CHECKING:
     from mesh.agent.trade import Order
     from mesh.chain import Chain
     from schemas import SignedMessage
+    from schemas.rpc import Stopped
+    from schemas.signing import StopRequest
 
 
 class Labels:
@@ -95,7 +98,6 @@ class Labels:
 
 
 def liability_json(liability: Liability, labels: Labels) -> dict[str, Any]:
-    """A liability with its state and the label of its token."""
     return record_json(liability) | {"token": labels.of(liability.token)}
 
 
@@ -189,7 +191,6 @@ class SeenOrder:
         return message
 
     def json(self) -> dict[str, Any]:
-        """The order with its hash and its signer."""
         fields: dict[str, Any] = msgspec.to_builtins(self.message)
         fields |= {name: str(fields[name]) for name in AMOUNTS if name in fields}
         fields |= {"nonce": str(fields["nonce"]), "sender": fields.get("sender")}
@@ -216,13 +217,10 @@ class Market(Lifecycle):
 
     title = "market of the page"
 
-    def __init__(
-        self, components: WebComponents, stream: Stream, *, from_block: int = 0, clock: Callable[[], float] = time.time
-    ) -> None:
+    def __init__(self, components: WebComponents, stream: Stream, *, from_block: int) -> None:
         self._parts = components
         self._stream = stream
         self._from_block = from_block
-        self._clock = clock
         self._start = components.chain_head.head
         self.labels = Labels(components.chain)
         self._seen: BoundedDict[str, SeenOrder] = BoundedDict(ORDERS)
@@ -280,7 +278,7 @@ class Market(Lifecycle):
         if known is not None and known.verified.signer != verified.signer and not posted:
             return known  # the same terms, signed by another account
         if known is None or known.verified.signer != verified.signer:
-            known = SeenOrder(verified, self._clock(), robot=robot)
+            known = SeenOrder(verified, time.time(), robot=robot)
             known.liability = self._matched.get((order_hash, verified.signer), "")
             if not robot:
                 self._stream.publish("market", "order", known.json())
@@ -369,14 +367,14 @@ class Market(Lifecycle):
         order = self._questions.get(result.message.liability)
         if order is None or len(order.answers) >= 8:  # answers to one question that are remembered
             return
-        answer = result_json(result) | {"at": self._clock()}
+        answer = result_json(result) | {"at": time.time()}
         if all(known["signature"] != answer["signature"] for known in order.answers):
             order.answers.append(answer)
             self.changed(order, "answered")
 
     def take_statement(self, order_hash: str, kind: str, agent: str, code: str, detail: str) -> None:
         """What a provider (`rejected`) or a robot (`declined`) says of an order."""
-        statement = {"kind": kind, "agent": agent, "code": code, "detail": detail[:500], "at": self._clock()}
+        statement = {"kind": kind, "agent": agent, "code": code, "detail": detail[:500], "at": time.time()}
         order = self.order(order_hash)
         if order is None or not order.robot:
             self._stream.publish("market", kind, statement | {"order": order_hash})
@@ -405,7 +403,7 @@ class Market(Lifecycle):
         with suppress(AiraError):
             if await accepted_of(self._parts.chain, report.validator, [report.juror]):
                 job.reports[report.juror] = report
-                self._step(job, "judged", agent=report.juror, detail=verdict_words(report), at=self._clock())
+                self._step(job, "judged", agent=report.juror, detail=verdict_words(report), at=time.time())
 
     def _say(self, address: str, agent: str, kind: str, detail: str) -> None:
         """An agent says that its job took a step. Of a liability that was not read yet, it is kept until then."""
@@ -414,7 +412,7 @@ class Market(Lifecycle):
             if len(said) < STEPS and (agent, kind, detail) not in said:
                 self._said[address] = [*said, (agent, kind, detail)]
         elif job.liability.promisor == agent and all(step["kind"] != kind for step in job.steps):
-            self._step(job, kind, agent=agent, detail=detail, at=self._clock())
+            self._step(job, kind, agent=agent, detail=detail, at=time.time())
 
     def _step(self, job: SeenJob, kind: str, *, is_live: bool = True, **fields: Any) -> None:
         step = {"kind": kind, "at": None, "block": None, "tx": None, "agent": None, "detail": ""} | fields
@@ -476,7 +474,7 @@ class Market(Lifecycle):
                     count = partial(self._parts.chain.node.contract_blocks.last, block.block_number)
                     contract_block = await self._parts.chain.retrying(count)
                     self._parts.chain_head.advance_to(block.block_number, contract_block)
-                    self._stream.publish("chain", "block", {"number": contract_block, "at": self._clock()})
+                    self._stream.publish("chain", "block", {"number": contract_block, "at": time.time()})
                     self._new_head(contract_block)
 
     def _revert(self, event: object, block: int) -> None:
@@ -521,7 +519,7 @@ class Market(Lifecycle):
         job.liability = liability
         if "created" in news:
             block, tx = news["created"]
-            at = self._clock() if is_live else None
+            at = time.time() if is_live else None
             self._step(job, "created", is_live=is_live, block=block, tx=tx, at=at)
             self._match(job, is_live=is_live)
             for agent, kind, detail in self._said.pop(liability.address, ()):
@@ -531,7 +529,7 @@ class Market(Lifecycle):
                 self._tasks.start(self._recall(job), f"phase of {liability.address}")
         if "ended" in news and liability.is_finalized:
             block, tx = news["ended"]
-            at = self._clock() if is_live else None
+            at = time.time() if is_live else None
             kind = "paid" if liability.is_success else "refunded"
             job.phase = "finalized"
             self._step(job, kind, is_live=is_live, block=block, tx=tx, detail=liability.result, at=at)
@@ -573,7 +571,7 @@ class Sent(msgspec.Struct):
 
 
 class OrderPublisher(Lifecycle):
-    """Posts orders: `async with OrderPublisher(components, market) as publisher`.
+    """Posts orders, and passes stops on: `async with OrderPublisher(components, market) as publisher`.
 
     A message is sent again with the backoff of agents until its order is a contract, withdrawn or expired, a withdrawal
     until its deadline. Nothing is kept on disk: after a restart the page posts its orders again.
@@ -585,6 +583,7 @@ class OrderPublisher(Lifecycle):
         self._parts = components
         self._market = market
         self._sent: dict[str, Sent] = {}
+        self._stopping = asyncio.Semaphore(16)  # stops at a time: a robot that is silent takes ten seconds
 
     async def _open(self, stack: AsyncExitStack) -> None:
         self._tasks = tasks = await stack.enter_async_context(Background())
@@ -717,6 +716,39 @@ class OrderPublisher(Lifecycle):
         if not state.is_refundable:
             raise ChainError(f"{address} can't be refunded: {refund_words(state)}", code="not-refundable")
         await liabilities.refund(address)
+
+    async def pass_stop(self, request: StopRequest) -> dict[str, Any]:
+        """Pass a signed request to stop a job on to its robot; returns what the robot's devices say.
+
+        Raises `InvalidMessage` for one that is not signed by a party of the job, `NotALiability`, `ServiceFailed`.
+        """
+        job = await self._stoppable(request.liability)
+        liability = job.liability
+        if not request.is_signed or request.by not in (liability.promisee, liability.promisor):
+            raise InvalidMessage("signature", "a stop is signed by the customer or the robot of the job")
+        async with self._stopping:
+            stopped = await send_stop(self._parts.network.session, liability.promisor, request)
+        return self._stopped(job, by=request.by, why=request.why, stopped=stopped)
+
+    async def stop(self, address: str, why: str) -> dict[str, Any]:
+        """The local account stops its job. Raises `WebError`, and as `Contract.stop`."""
+        agent = self._local_agent("sign the stop with your wallet")
+        job = await self._stoppable(address)
+        contract = await agent.contract(address)
+        async with self._stopping:
+            stopped = await contract.stop(why)
+        return self._stopped(job, by=agent.address, why=why, stopped=stopped)
+
+    async def _stoppable(self, address: str) -> SeenJob:
+        job = await self._market.job(address)
+        if job.liability.is_finalized:
+            raise ChainError(f"{address} has ended", code="liability-ended")
+        return job
+
+    def _stopped(self, job: SeenJob, *, by: str, why: str, stopped: Stopped) -> dict[str, Any]:
+        known = self._market.jobs.get(job.liability.address, job)
+        known.stopped = known.stopped or {"by": by, "why": why}
+        return {"devices": [msgspec.structs.asdict(device) for device in stopped.devices]}
 
     def _local_agent(self, hint: str) -> Agent:
         if self._parts.agent is None:

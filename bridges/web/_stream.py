@@ -50,11 +50,10 @@ class StreamRequest(msgspec.Struct, frozen=True):
 
 
 class Stream:
-    """The events of one server. Used in one event loop. `clock` gives Unix time."""
+    """The events of one server. Used in one event loop."""
 
-    def __init__(self, *, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self) -> None:
         self.id: Final = secrets.token_hex(8)
-        self._clock = clock
         self._kept: deque[StreamEvent] = deque()
         self._bytes = 0
         self._connections: set[StreamConnection] = set()
@@ -66,7 +65,7 @@ class Stream:
     def publish(self, topic: str, kind: str, data: Any) -> None:
         """Send an event to those who subscribed to its topic."""
         self.seq += 1
-        body = {"seq": self.seq, "topic": topic, "kind": kind, "data": data, "at": self._clock()}
+        body = {"seq": self.seq, "topic": topic, "kind": kind, "data": data, "at": time.time()}
         event = StreamEvent(self.seq, topic, msgspec.json.encode(body))
         if not topic.startswith(LIVE):
             self._kept.append(event)
@@ -112,7 +111,7 @@ class Stream:
 
     def event(self, kind: str, data: Any) -> bytes:
         """An event of the connection itself, with the current sequence number."""
-        return msgspec.json.encode({"seq": self.seq, "kind": kind, "data": data, "at": self._clock()})
+        return msgspec.json.encode({"seq": self.seq, "kind": kind, "data": data, "at": time.time()})
 
     async def close(self) -> None:
         """End all connections, and those that are still being made: the server stops."""

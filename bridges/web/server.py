@@ -12,14 +12,7 @@ from urllib.parse import urlsplit
 from aiohttp import web
 
 from bridges.serving import is_loopback
-from bridges.web._access import (
-    SENDER,
-    Logins,
-    WebError,
-    WebOptions,
-    answer,
-    status_of,
-)
+from bridges.web._access import SENDER, Logins, WebError, WebOptions, answer, status_of
 from bridges.web._api import Api
 from bridges.web.components import opened
 from mesh.base.door import network_of

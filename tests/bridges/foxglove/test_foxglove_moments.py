@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.foxglove import _player
-from bridges.foxglove._player import POINTS, Moments
+from bridges.foxglove import sources
+from bridges.foxglove.sources import POINTS, Moments
 from mesh.recording import GENEROUS, open_objective
 from tests.support.objectives import timed
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 
 @pytest.mark.parametrize("count", [1, 5, POINTS, 10 * POINTS + 7])
-@pytest.mark.parametrize("remembered", [_player.REMEMBERED, 50])
+@pytest.mark.parametrize("remembered", [sources.REMEMBERED, 50])
 def test_a_moment_is_what_a_full_reading_finds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int, remembered: int
 ) -> None:
-    monkeypatch.setattr(_player, "REMEMBERED", remembered)
+    monkeypatch.setattr(sources, "REMEMBERED", remembered)
     chance = random.Random(count)
     path = tmp_path / "recording.mcap"
     # Many messages have the same time.

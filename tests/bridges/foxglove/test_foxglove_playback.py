@@ -11,8 +11,8 @@ from foxglove.websocket import PlaybackCommand, PlaybackStatus
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridges.foxglove._player import FASTEST, SLOWEST, PlaybackHead, RecordingPlayer
 from bridges.foxglove.server import FoxgloveServer
+from bridges.foxglove.sources import FASTEST, SLOWEST, PlaybackHead, RecordingPlayer
 from mesh.base.background import Background
 from mesh.recording import GENEROUS, open_objective
 from tests.bridges.foxglove.viewer import PAUSE, PLAY, Viewer, viewing

@@ -6,9 +6,8 @@ import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-from bridges.foxglove._player import show_job_until_end, show_recording
 from bridges.foxglove.server import FoxgloveServer
-from bridges.foxglove.sources import show_agent, show_market
+from bridges.foxglove.sources import show_agent, show_job_until_end, show_market, show_recording
 from bridges.web.components import opened
 from mesh import Agent, Job, String
 from mesh.base.background import Background

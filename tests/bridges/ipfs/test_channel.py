@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bridges.ipfs._channel import BRIDGE_MARK
-from bridges.ipfs._messages import legacy_json
+from bridges.ipfs._relay import legacy_json
 from mesh.network import message_key
 from schemas import OrderFeedback, Permit, TransactionFeedback, Withdrawal, encode
 from tests.bridges.ipfs.bridges import Mesh, bridging, on_mesh, until_seen

@@ -6,7 +6,7 @@ import asyncio
 import signal
 from typing import TYPE_CHECKING
 
-from bridges.ipfs._messages import legacy_json
+from bridges.ipfs._relay import legacy_json
 from mesh.network import Channel, Network
 from mesh.ops.identity.roster import Member
 from schemas import encode

@@ -12,7 +12,7 @@ import aiohttp
 import pytest
 
 from bridges.ipfs import Daemon, IpfsError
-from bridges.ipfs._messages import legacy_json
+from bridges.ipfs._relay import legacy_json
 from schemas import encode
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
 from tests.bridges.ipfs.legacy import LegacyClient

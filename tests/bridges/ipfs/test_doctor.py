@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ipfs.check import checks
+from bridges.ipfs.daemon import checks
 from mesh.ops.doctor import CheckStatus, DoctorContext
 from mesh.settings import Settings
 from tests.bridges.ipfs.replays import RecentDaemon

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec.structs import replace
 
-from bridges.ipfs._messages import RelayValidator, legacy_json
+from bridges.ipfs._relay import RelayValidator, legacy_json
 from mesh.errors import ChainError, InputError
 from mesh.network import MarketRules, message_key
 from schemas import (

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ipfs._messages import RelayMessage
 from bridges.ipfs._relay import (
     DEDUPLICATION_LIMIT,
     DEDUPLICATION_WINDOW,
     MessageRelay,
     RelayJournal,
+    RelayMessage,
     SeenMessages,
     Side,
     rank_for,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bridges.ipfs import RelayJournal
-from bridges.ipfs._messages import legacy_json
+from bridges.ipfs._relay import legacy_json
 from mesh.errors import ConfigurationError
 from schemas import TransactionFeedback, encode
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen

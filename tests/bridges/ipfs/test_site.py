@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bridges.ipfs import BridgeParts, ChannelBridge, Daemon, RelayJournal, RelayValidator
-from bridges.ipfs._messages import legacy_json
+from bridges.ipfs._relay import legacy_json
 from mesh.base.background import Background
 from mesh.network import Channel, MarketRules, Network
 from mesh.ops.identity.roster import Member

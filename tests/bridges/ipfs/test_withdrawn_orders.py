@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.ipfs._messages import legacy_json
+from bridges.ipfs._relay import legacy_json
 from mesh.market import OrderBook
 from mesh.market._services import OrderBookService
 from mesh.market.store import MarketStore, Withdrawals

@@ -21,6 +21,7 @@ def test_a_tool_has_schemas_that_clients_read(name: str) -> None:
     tool = TOOLS[name]
     for schema in (tool.input_schema, tool.output_schema):
         Draft202012Validator.check_schema(schema)
+        assert schema is not None
         assert schema["type"] == "object"
         text = json.dumps(schema)
         for reference in {part.partition('"')[0] for part in text.split('"$ref": "')[1:]}:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from bridges.ros1._bridge import Ros1Bridge
-from bridges.ros1._parts import RosBridgeOptions, RosBridgeParts
+from bridges.ros1._topics import RosBridgeOptions, RosBridgeParts
 from mesh.base.background import Background
 from mesh.content import Exchange, Store
 from mesh.network import Channel, Endpoints, Network

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.ros1._control import decimal
 from bridges.ros1._definitions import service_types
+from bridges.ros1._legacy import decimal
 from bridges.ros1._wire import Ros1Error
 from bridges.ros1.messages import plain
 from bridges.ros1.node import Ros1Graph, Ros1Node

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bridges.ros1._payloads import RosPayloads
+from bridges.ros1._topics import RosPayloads
 from bridges.ros1.messages import Ros1Type
 from mesh.recording.ros import RosTypes
 from schemas import InvalidPayload

@@ -143,7 +143,7 @@ async def test_goals_are_aborted_cancelled_and_rejected(
         unknown = {"goal_info": {"goal_id": {"uuid": b"x" * 16}}}
         reply = await ours.call("/drive/_action/cancel_goal", "action_msgs/CancelGoal", unknown)
 
-        monkeypatch.setattr("bridges.ros2._actions.GOALS", 0)
+        monkeypatch.setattr("bridges.ros2._services.GOALS", 0)
         with pytest.raises(RosGoalFailed) as rejected:
             await ours.action("/drive", FIBONACCI, {"order": 2}, timeout=20)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bridges.web._jobs import timeline_of
+from bridges.web._views import timeline_of
 
 
 def step(kind: str, at: float | None) -> dict[str, Any]:

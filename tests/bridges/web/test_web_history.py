@@ -7,7 +7,7 @@ import csv
 import io
 from typing import TYPE_CHECKING, Any
 
-from bridges.web._history import time_between
+from bridges.web._views import time_between
 from tests.bridges.web.test_page_server import COST
 from tests.bridges.web.test_web_robots import contract_of, made
 from tests.mesh.agent.trades import working

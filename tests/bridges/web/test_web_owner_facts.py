@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from bridges.web._jobs import ALERTS, LONGEST, alerts_of
+from bridges.web._views import ALERTS, LONGEST, alerts_of
 from mesh import Job, String  # noqa: TC001  handlers are read at run time
 from schemas.status import Status, StoreUse, Work
 from tests.support.market import MODEL, offering

@@ -13,7 +13,7 @@ import msgspec
 import pytest_asyncio
 from msgspec.structs import replace
 
-from bridges.web import _robots
+from bridges.web import _views
 from mesh import Agent, Demand, Verified
 from mesh.agent.handlers import Declined
 from mesh.chain import Account
@@ -159,7 +159,7 @@ async def test_robots_that_have_left_are_known_as_away(
                 assert (here["address"], here["profile"]["formerly"]) == (successor.address, [place.address("robot")])
                 assert here["record"]["done"] == done
                 assert await known() == []
-            monkeypatch.setattr(_robots, "AWAY_SECONDS", -3600.0)
+            monkeypatch.setattr(_views, "AWAY_SECONDS", -3600.0)
             monkeypatch.setattr(later.server.api._views, "_agents", None)
             assert await known() == []
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.ipfs.service import authorization_of
+from bridges.ipfs.daemon import authorization_of
 from bridges.web.cli import token_in
 from mesh.base.fresh_file import Blocklist
 from mesh.chain import Account

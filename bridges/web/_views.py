@@ -1,42 +1,50 @@
-"""A job, an account, the agents, the lighthouse, as the page shows them: from the chain, the market and the files."""
+"""What the page shows: jobs, accounts, agents and the lighthouse, from the chain, the market and the files; what robots
+say of themselves and ask for a job, which is their word; and what has been.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import time
+from bisect import bisect_right
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from bridges.web._access import WebError
 from bridges.web._market import liability_json, result_json
-from bridges.web._robots import LastSeen, profile_json
 from mesh.agent.contracts import refusal
-from mesh.agent.hiring import PROVIDERS
+from mesh.agent.hiring import PROVIDERS, asked_offer
 from mesh.agent.jobs import ROBOT_STOPPED, STOPPED, read_reason
+from mesh.agent.statement import read_statement
 from mesh.agent.trade import are_permits_carried
-from mesh.base.flood import BoundedDict
+from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.chain import NotOffered
-from mesh.errors import AiraError, RemoteError
+from mesh.cli.statement import ENTRY_COLUMNS, csv_of, statement_json
+from mesh.errors import AiraError, RemoteError, public_text
 from mesh.network import call
 from mesh.telemetry.metrics import is_healthy
 from mesh.validator.verification import Claim, JobFiles, Verdict, check_end, verify
 from mesh.watching import present, statuses
-from mesh.watching.robots import accounts_of
-from schemas import ZERO_ADDRESS, encode, parse_cid
+from mesh.watching.robots import QUOTE_TIMEOUT, accounts_of, asked_quotes
+from schemas import ZERO_ADDRESS, InvalidAddress, InvalidMessage, encode, parse_address, parse_cid
 from schemas.decoding import decode_json
 from schemas.rpc import PermitFeeRequest
 from schemas.status import BridgeStatus, Status
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from bridges.web._files import Files
-    from bridges.web._market import Market, SeenJob, SeenOrder
+    from bridges.web._market import Labels, Market, SeenJob, SeenOrder
     from bridges.web.components import WebComponents
+    from mesh.agent.statement import Statement
+    from mesh.cli.statement import Units
     from mesh.watching import Robot, RoleStatus
     from schemas import Liability
-
+    from schemas.rpc import AcceptDemand, Accepted, Quote
 
 LONGEST: Final = 200
 """Characters of a detail, which a stranger may have written."""
@@ -82,8 +90,6 @@ LISTED: Final = 200
 """Jobs and orders in one answer."""
 AGENTS: Final = 256
 """Agents in one answer."""
-REJOINING: Final = 10.0
-"""Seconds in which agents have found the router again."""
 
 
 _ORDER: Final = ("created", "ready", "playing", "result", "judged", "reverted", "paid", "refunded")
@@ -303,7 +309,8 @@ class Views:
 
     def _with_lost(self, found: dict[str, Any]) -> dict[str, Any]:
         """With the agents that could not be found because the router is lost, or that must still find it again."""
-        if self._agents is None or asyncio.get_running_loop().time() - self._alone_at > REJOINING:
+        # Seconds in which agents have found the router again.
+        if self._agents is None or asyncio.get_running_loop().time() - self._alone_at > 10.0:
             return found
         listed = {(one["role"], one["address"]): one for one in (*self._agents["agents"], *found["agents"])}
         away = [one for one in found["away"] if ("agent", one["address"]) not in listed]
@@ -436,3 +443,237 @@ def records_of(jobs: list[SeenJob], token: str) -> dict[str, AccountRecord]:
             record.earned += liability.cost
             found.setdefault(liability.promisee, AccountRecord()).spent += liability.cost
     return found
+
+
+QUESTIONS: Final = Rate(per_second=1.0, burst=16)
+"""Questions for quotes or offers that one person may ask."""
+AWAY: Final = 32
+"""Robots that are listed as away: those that have had jobs, then those that were here last, …"""
+AWAY_SECONDS: Final = 30 * 86_400.0
+"""… and for how long."""
+REMEMBERED: Final = 256
+"""Robots of which it is remembered how they presented themselves."""
+
+
+def profile_json(robot: Robot) -> dict[str, Any]:
+    """How a robot presents itself, with neither its address nor what the chain says of it."""
+    facts = msgspec.to_builtins(robot)
+    return {name: facts[name] for name in facts if name not in ("address", "model", "paid", "refunded")}
+
+
+class LastSeen:
+    """Robots that were here: how each presented itself last, and when; and when those were last heard that have had
+    jobs."""
+
+    def __init__(self, components: WebComponents, market: Market) -> None:
+        self._parts = components
+        self._market = market
+        self._robots: BoundedDict[str, tuple[Robot, float]] = BoundedDict(REMEMBERED)
+
+    def saw(self, robots: Iterable[Robot]) -> None:
+        """These robots are here now."""
+        for robot in robots:
+            self._robots[robot.address] = robot, time.time()
+
+    async def away(self, present: Collection[str]) -> dict[str, tuple[Robot | None, float]]:
+        """The robots (addresses) that are not `present`: their profiles, if known, and since when they are away."""
+        jobs = await self._last_jobs(present)
+        found: dict[str, tuple[Robot | None, float]] = {address: (None, at) for address, at in jobs.items()}
+        for address, (robot, at) in self._robots.items():
+            if address not in present:
+                found[address] = robot, max(at, jobs.get(address, 0.0))
+        oldest = time.time() - AWAY_SECONDS
+        recent = [address for address, (_, since) in found.items() if since > oldest]
+        recent.sort(key=lambda address: (address in jobs, found[address][1]), reverse=True)
+        return {address: found[address] for address in recent[:AWAY]}
+
+    async def _last_jobs(self, present: Collection[str]) -> dict[str, float]:
+        """When the latest job of each robot that is not `present` took its last step."""
+        steps: dict[str, dict[str, Any]] = {}
+        for job in reversed(self._market.jobs.values()):
+            robot, is_ours = job.liability.promisor, job.liability.lighthouse == self._parts.lighthouse
+            if is_ours and job.steps and robot not in present and len(steps) < AWAY:
+                steps.setdefault(robot, job.steps[-1])
+        times = [step["at"] or await self._market.time_of(step["block"] or 0) or 0.0 for step in steps.values()]
+        return dict(zip(steps, times, strict=True))
+
+
+class Questions:
+    """Asks robots for quotes, as the server's `asker`, and for offers, as people sign that."""
+
+    def __init__(self, components: WebComponents, labels: Labels) -> None:
+        self._parts = components
+        self._labels = labels
+        self._limiter = RateLimiter(per_sender=QUESTIONS)
+        self._asking = asyncio.Semaphore(8)  # questions for quotes that are open at a time
+        self._asking_offers = asyncio.Semaphore(32)  # those for offers: a robot may take half a minute
+
+    async def quotes(self, model: str, objective: str, *, sender: str) -> list[dict[str, Any]]:
+        """What the robots of a model that are present want for an objective: the cheapest first, refusals last.
+
+        Raises `WebError` if `sender` asks too often.
+        """
+        self._check(sender)
+        parts = self._parts
+        async with self._asking:
+            robots = {one.address: one for one in await parts.robots.present(model, timeout=QUOTE_TIMEOUT)}
+            quotes = await asked_quotes(
+                parts.network.session,
+                parts.channel,
+                asker=parts.asker,
+                robots=[*robots],
+                model=model,
+                objective=objective,
+            )
+            return [await self._json(quote, robots[quote.agent].name) for quote in quotes]
+
+    async def offer(self, request: AcceptDemand, *, sender: str) -> Accepted:
+        """The offer of a robot for a demand that is for it alone, or its refusal.
+
+        Raises `InvalidMessage`, `RemoteError`, and `WebError` if `sender` asks too often.
+        """
+        self._check(sender)
+        if not request.is_signed or request.demand.signature:
+            raise InvalidMessage("signature", "the maker of the order signs the request, and not yet the order")
+        parse_address(request.robot)
+        async with self._asking_offers:
+            return await asked_offer(self._parts.network.session, request)
+
+    def _check(self, sender: str) -> None:
+        if not self._limiter.allow(sender):
+            raise WebError("too many questions to robots", hint="wait a moment", code="too-many-requests")
+
+    async def _json(self, quote: Quote, name: str) -> dict[str, Any]:
+        token, validator = _address(quote.token), _address(quote.validator)
+        code, detail = quote.code, quote.detail
+        if not code and not token:
+            code, detail = "unknown-token", "it does not say in which token"
+        return {
+            "agent": quote.agent,
+            "name": name,
+            "cost": str(int(quote.cost)),
+            "token": await self._labels.learn(token or self._parts.token),
+            "validator": validator,
+            "start": quote.start,
+            "seconds": quote.seconds,
+            "until": quote.until,
+            "code": public_text(code, longest=64),
+            "detail": public_text(detail, longest=LONGEST),
+        }
+
+
+def _address(text: str) -> str:
+    """The address (EIP-55) in a text of a stranger; empty if there is none."""
+    try:
+        return parse_address(text)
+    except InvalidAddress:
+        return ""
+
+
+KEPT: Final = 10.0
+"""Seconds for which a statement is used again."""
+STATEMENTS: Final = Rate(per_second=0.5, burst=16)
+"""Statements that one person may ask for, beside those that are used again."""
+CONTRACTS: Final = 2_000
+"""Contracts in a statement and in the history, the latest ones."""
+HEADERS: Final = 32
+"""Blocks whose times are read for the history."""
+
+
+class PastContracts:
+    """Answers questions about the past."""
+
+    def __init__(self, components: WebComponents, market: Market) -> None:
+        self._parts = components
+        self._market = market
+        self._reading = asyncio.Lock()
+        self._limiter = RateLimiter(per_sender=STATEMENTS)
+        self._statements: BoundedDict[str, tuple[Statement, Units, float]] = BoundedDict(64)  # accounts
+
+    async def statement(self, account: str, *, sender: str) -> dict[str, Any]:
+        """What `aira statement --json` says of an account.
+
+        Raises `WebError` if `sender` asks too often, `ChainError`.
+        """
+        return statement_json(*await self._read(account, sender))
+
+    async def statement_csv(self, account: str, *, sender: str) -> str:
+        """What `aira statement --csv` says. Raises as `statement`."""
+        found, units = await self._read(account, sender)
+        return csv_of(ENTRY_COLUMNS, found.entries, units)
+
+    async def _read(self, account: str, sender: str) -> tuple[Statement, Units]:
+        if (known := self._known(account)) is not None:
+            return known
+        if not self._limiter.allow(sender):
+            raise WebError("too many statements", hint="wait a moment", code="too-many-requests")
+        async with self._reading:  # one after the other: each reads the chain from its first block
+            if (known := self._known(account)) is None:
+                found = await read_statement(self._parts.chain, account)
+                found = replace(found, entries=found.entries[-CONTRACTS:])
+                units = await self._parts.chain.tokens.units(one.token for one in found.entries)
+                known = found, units
+                self._statements[account] = *known, time.monotonic()
+            return known
+
+    def _known(self, account: str) -> tuple[Statement, Units] | None:
+        """A statement that is young enough."""
+        found, units, at = self._statements.get(account, (None, {}, 0.0))
+        return None if found is None or time.monotonic() - at > KEPT else (found, units)
+
+    async def jobs(self, model: str = "") -> dict[str, Any]:
+        """The contracts that this server knows, or those of a model (CID), the newest first."""
+        known = [(block, job) for job in self._market.jobs.values() if (block := _block_of(job)) is not None]
+        known = [(block, job) for block, job in known if model in ("", job.liability.model)]
+        known.sort(key=lambda one: one[0], reverse=True)
+        listed = known[:CONTRACTS]
+        times = await self._times([block for block, _ in reversed(listed)])
+        return {"jobs": [self._json(job, block, times) for block, job in listed], "truncated": len(known) > CONTRACTS}
+
+    def _json(self, job: SeenJob, block: int, times: Sequence[tuple[int, float]]) -> dict[str, Any]:
+        one = job.liability
+        return {
+            "address": one.address,
+            "model": one.model,
+            "cost": str(one.cost),
+            "token": self._market.labels.of(one.token),
+            "state": one.state,
+            "promisor": one.promisor,
+            "promisee": one.promisee,
+            "block": block,
+            "at": time_between(times, block),
+        }
+
+    async def _times(self, blocks: Sequence[int]) -> list[tuple[int, float]]:
+        """The times of a few blocks around these, which ascend.
+
+        They stay the same while the chain grows, so that few are read again.
+        """
+        if not blocks:
+            return []
+        first, last = blocks[0], blocks[-1]
+        step = 1
+        while (last - first) // step > HEADERS - 3:
+            step *= 2
+        chosen = sorted({first, *range(first - first % step + step, last, step), last})
+        times = await asyncio.gather(*map(self._market.time_of, chosen))
+        return [(block, at) for block, at in zip(chosen, times, strict=True) if at is not None]
+
+
+def _block_of(job: SeenJob) -> int | None:
+    """The block of its creation."""
+    return next((step["block"] for step in job.steps if step["kind"] == "created"), None)
+
+
+def time_between(times: Sequence[tuple[int, float]], block: int) -> float | None:
+    """The time (Unix) of a block by the times of others, which ascend: exact for these, else between its neighbours.
+
+    That of the next one outside of them, and None without any.
+    """
+    if not times:
+        return None
+    place = bisect_right(times, (block, float("inf")))
+    if place in (0, len(times)):
+        return times[min(place, len(times) - 1)][1]
+    (before, since), (after, until) = times[place - 1 : place + 1]
+    return since + (until - since) * (block - before) / (after - before)

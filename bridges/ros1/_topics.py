@@ -1,36 +1,61 @@
-"""The jobs of an agent on the ROS graph: what objectives play is published, what nodes answer is recorded.
+"""The topics that the bridge carries, and what it is built from.
 
-The topics of a job are below `/liability/eth_ADDRESS`. Which jobs there are is seen in the names of the graph's topics,
-so a bridge that was killed goes on where it was. A node that started a job and then disappears fails it.
+Jobs: what objectives play is published below `/liability/eth_ADDRESS`, what nodes answer there is recorded. Which jobs
+there are is seen in the names of the graph's topics, so a bridge that was killed goes on where it was. A node that
+started a job and then disappears fails it.
+
+Devices: what the agent's boards say is published under the names that the boards give their topics, so a node hears a
+board on `aira edge` as it heard one on rosserial, in a job and outside.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import tempfile
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from bridges.ros1._payloads import RosPayloads, advertise, type_in
+from bridges.devices import is_said_by_device
 from bridges.ros1._wire import Ros1Error
+from bridges.ros1.messages import Ros1Type
 from bridges.ros1.node import call_api
 from mesh.base.background import Background
+from mesh.base.flood import BoundedDict
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import liability_context, log_event
 from mesh.errors import AiraError, InvalidKey
 from mesh.network import Pump, call, sending
 from mesh.recording import NOTE_TOPIC
-from mesh.recording.ros import LEGACY_TOPIC, legacy_topic
+from mesh.recording.ros import LEGACY_TOPIC, RosConverter, legacy_topic
 from schemas import String, parse_address
-from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, objective_selector, parse_agent_key
+from schemas.errors import InvalidPayload
+from schemas.keys import (
+    DeviceTopicKey,
+    LiabilityTopicKey,
+    ObjectiveTopicKey,
+    device_selector,
+    objective_selector,
+    parse_agent_key,
+    topic_selector,
+)
 from schemas.payloads import (
+    EMPTY,
+    JSON,
+    RAW,
+    STRING,
     PayloadType,
     SentDefinitions,
+    decode_value,
+    defined_by,
+    encode_value,
+    payload_type,
 )
 from schemas.rpc import FinishLiability
 
@@ -38,21 +63,120 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from contextlib import AsyncExitStack
 
-    from bridges.ros1._parts import RosBridgeOptions, RosBridgeParts
-    from bridges.ros1.node import Ros1Node, Ros1Publisher, Ros1Subscription
+    from bridges.ros1.node import Ros1Graph, Ros1Node, Ros1Publisher, Ros1Subscription
+    from mesh.content import Exchange, Store
+    from mesh.network import Channel, Network
+    from mesh.recording.ros import RosConversion
 
 log = logging.getLogger(__name__)
 
+GONE_SECONDS: Final = 30.0
+"""For which the node that started a job may be away: it may be restarted. Then the job fails."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RosBridgeParts:
+    """The agent with the address `agent`, which the bridge shows, and the ROS graph that it shows it to.
+
+    `channel` is that of the agent's market; files are those of `store` and `exchange`; recordings of the player of
+    bags are made in `directory`.
+    """
+
+    agent: str
+    network: Network
+    channel: Channel
+    graph: Ros1Graph
+    store: Store
+    exchange: Exchange
+    directory: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class RosBridgeOptions:
+    """How a bridge serves its graph.
+
+    It is the device `name` of its agent. `recording_topics` are recorded besides those of jobs. With `as_original`
+    topics are published after a second, whether anybody subscribes or not. `folders` are those that the services for
+    files may read and write, up to `size_limit` bytes of a file. `generation` is the version of messages for those who
+    take any. With `is_alone`, our master is the only one: it has /rosout. A job whose node has disappeared for
+    `gone_seconds` fails.
+    """
+
+    name: str = "ros1"
+    recording_topics: frozenset[str] = frozenset()
+    as_original: bool = False
+    folders: tuple[Path, ...] = (Path(tempfile.gettempdir()),)
+    generation: str = "3"
+    is_alone: bool = False
+    size_limit: int = 256 << 20
+    gone_seconds: float = GONE_SECONDS
+
+
+MOST_TYPES: Final = 10_000
+"""Definitions of topics' types that are remembered."""
+MOST_CONVERSIONS: Final = 256
+"""Types of ROS 2 whose conversions are remembered."""
+
+
+def type_in(header: Mapping[str, str]) -> PayloadType:
+    """The type of a publisher's messages, with its definition, by the header of its connection."""
+    definition = header.get("message_definition", "").encode()
+    return PayloadType("ros1", header.get("type", ""), "ros1msg", definition)
+
+
+async def advertise(node: Ros1Node, topic: str, kind: PayloadType) -> Ros1Publisher:
+    """Publish a topic of messages that are encoded already. Raises `InvalidPayload`, `InvalidGraphName`."""
+    return await node.advertise(topic, Ros1Type(kind.schema_name, kind.schema_data.decode(errors="replace")))
+
+
+class RosPayloads:
+    """Makes messages of ROS 1 from what arrives. It remembers the definitions that come with some messages only."""
+
+    def __init__(self) -> None:
+        self._types: dict[tuple[str, str], PayloadType] = {}
+        self._converter = RosConverter(0, "jazzy")
+        self._conversions: BoundedDict[PayloadType, RosConversion] = BoundedDict(MOST_CONVERSIONS)
+        """Of types of ROS 2: to make one takes some 90 ms."""
+
+    def type_of(self, sample: zenoh.Sample) -> PayloadType:
+        """The type of what arrived, with its definition if that is known. On the thread of a pump."""
+        key, kind = str(sample.key_expr), payload_type(str(sample.encoding))
+        if kind.schema_data or not kind.schema_name:
+            return kind
+        found = None if sample.attachment is None else defined_by(sample.attachment.to_bytes(), kind)
+        if found is not None and len(self._types) < MOST_TYPES:
+            self._types[key, kind.schema_name] = found
+        return found or self._types.get((key, kind.schema_name), kind)
+
+    def for_ros(self, payload: bytes, kind: PayloadType) -> tuple[bytes, PayloadType]:
+        """A message as one of ROS 1, with its definition. Raises `InvalidPayload`, `PackageMissing`."""
+        if kind.encoding == "ros1":
+            kind = kind if kind.schema_data else self._converter.of(kind).type
+            if not kind.schema_data and kind != EMPTY:
+                raise InvalidPayload(kind.schema_name, "its definition is not known")
+            return payload, kind
+        if kind.encoding == "cdr":
+            conversion = self._conversions.get(kind)
+            if conversion is None:
+                conversion = self._conversions[kind] = RosConverter(1, "jazzy").of(kind)
+            if conversion.why:
+                raise InvalidPayload(kind.schema_name, conversion.why)
+            try:
+                return conversion.convert(payload), conversion.type
+            except Exception as error:  # whatever rosbags raises for a stranger's payload
+                raise InvalidPayload(kind.schema_name, str(error)) from None
+        changed, type = encode_value(decode_value(payload, kind))
+        if type not in (JSON, RAW):
+            return changed, type
+        return encode_value(String(payload.decode(errors="replace")))
+
+
 SUBSCRIBER_SECONDS: Final = 5.0
 """For which the first message of a topic waits for a subscriber."""
-ORIGINAL_SECONDS: Final = 1.0
-"""After which the original player published it, subscriber or not."""
 LOOK_SECONDS: Final = 0.25
 """Between two looks at the graph's topics."""
 CONNECT_SECONDS: Final = 1.0
 """For which the first message of a topic waits for the recorder to be connected."""
-CONNECTED_SECONDS: Final = 0.05
-"""After which a node of rospy sends messages to a subscriber that it has just accepted."""
 QUIET_SECONDS: Final = 0.2
 """For which nodes must have said nothing before a job ends: what they said just before comes another way …"""
 LONGEST_QUIET: Final = 2.0
@@ -191,7 +315,7 @@ class RosJobs(Lifecycle):
         """Publish a topic of the job, and wait for its first subscriber, as the original waited a second."""
         publisher = job.publishers[topic] = await advertise(self._node, legacy_topic(liability, topic), kind)
         if self._options.as_original:
-            await asyncio.sleep(ORIGINAL_SECONDS)
+            await asyncio.sleep(1.0)  # as the original player did, subscriber or not
         elif not await publisher.wait_for_subscriber(SUBSCRIBER_SECONDS):
             facts = log_event("ros1-no-subscriber", topic=publisher.topic)
             log.warning(
@@ -238,7 +362,8 @@ class RosJobs(Lifecycle):
             async with asyncio.timeout(CONNECT_SECONDS):
                 for subscription in tuple(self._subscriptions.values()):
                     await subscription.wait_until_connected()
-        await asyncio.sleep(CONNECTED_SECONDS)
+        # Seconds after which a node of rospy sends messages to a subscriber that it has just accepted.
+        await asyncio.sleep(0.05)
 
     def _record(self, topic: str, payload: bytes, header: Mapping[str, str]) -> None:
         """A node has said something: it becomes part of the recording of its job."""
@@ -290,3 +415,77 @@ class RosJobs(Lifecycle):
             await call(self._session, self._agent, "finish", FinishLiability(liability, False))
         except AiraError as error:
             log.warning("the job can't be ended: %s", error, extra=log_event("job-not-ended", code=error.code))
+
+
+DEVICES_NODE: Final = "/aira_devices"
+RESERVED: Final = ("/liability/", "/eth/", "/ipfs/", "/rosbagplayer/", "/rosout")
+"""What names of topics begin with that only the bridge publishes."""
+MOST_OF_DEVICES: Final = 256
+"""Topics of devices."""
+
+
+class RosDevices(Lifecycle):
+    """The topics of the agent's devices on the node `node`: `async with RosDevices(...)`."""
+
+    title = "devices on ROS 1"
+
+    def __init__(self, parts: RosBridgeParts, node: Ros1Node) -> None:
+        self._session = parts.network.session
+        self._agent = parts.agent
+        self._node = node
+        self._payloads = RosPayloads()
+        self._topics: dict[str, tuple[Ros1Publisher, PayloadType]] = {}
+        self._refused: set[str] = set()
+        """Keys whose refusal is in the log already."""
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        tasks = await stack.enter_async_context(Background())
+        for selector in (topic_selector(self._agent), device_selector(self._agent)):
+            pump: Pump[tuple[str, bytes, PayloadType]] = Pump(
+                self._session,
+                selector,
+                self._taken,
+                payload_limit=16 << 20,  # bytes of the largest message to ROS
+                drops=self._node.drops,
+            )
+            await stack.enter_async_context(pump)
+            tasks.start(self._publish_all(pump), f"devices on {selector}")
+
+    def _taken(self, sample: zenoh.Sample) -> tuple[str, bytes, PayloadType] | None:
+        """What a board says; robots of ROS 2 have a graph of their own. Runs on the pump's thread."""
+        if sample.kind != zenoh.SampleKind.PUT or not is_said_by_device(sample.attachment):
+            return None
+        kind = self._payloads.type_of(sample)
+        return None if kind.encoding == "cdr" else (str(sample.key_expr), sample.payload.to_bytes(), kind)
+
+    async def _publish_all(self, pump: Pump[tuple[str, bytes, PayloadType]]) -> None:
+        async for key, payload, kind in pump:
+            try:
+                parsed = parse_agent_key(key)
+                if isinstance(parsed, DeviceTopicKey | LiabilityTopicKey):
+                    await self._publish(parsed.topic, payload, kind)
+            except AiraError as error:
+                self._refuse(key, error)
+
+    async def _publish(self, topic: str, payload: bytes, kind: PayloadType) -> None:
+        """Raises `InvalidKey`, `InvalidGraphName`, `InvalidPayload`, `PackageMissing`."""
+        if kind.encoding == "json":  # whose values may have another type each time
+            payload, kind = String(payload.decode(errors="replace")).encode(), STRING
+        else:
+            payload, kind = self._payloads.for_ros(payload, kind)
+        if topic not in self._topics:
+            if topic.startswith(RESERVED) or len(self._topics) >= MOST_OF_DEVICES:
+                raise InvalidKey(topic, "the bridge has it itself, or has too many")
+            publisher = await advertise(self._node, topic, kind)
+            self._topics[topic] = publisher, kind
+            await publisher.wait_for_subscriber(1.0)  # seconds for one that is there already
+        publisher, known = self._topics[topic]
+        if kind != known:
+            raise InvalidPayload(topic, f"it was {known.schema_name} before, and is {kind.schema_name}")
+        publisher.publish(payload)
+
+    def _refuse(self, key: str, error: AiraError) -> None:
+        self._node.drops.count("ros1-topic", key)
+        if key not in self._refused and len(self._refused) < MOST_OF_DEVICES:
+            self._refused.add(key)
+            log.warning("a device is not heard in ROS: %s", error, extra=log_event("ros1-not-sent", topic=key))
