@@ -52,3 +52,10 @@ def test_every_argument_is_bounded(name: str) -> None:
 def test_the_words_are_printable_ascii() -> None:
     for words in (INSTRUCTIONS, *(tool.description or "" for tool in TOOLS.values())):
         assert all(letter == "\n" or 32 <= ord(letter) < 127 for letter in words)
+
+
+def test_clients_know_which_tools_change_something() -> None:
+    hints = {name: tool.annotations for name, tool in TOOLS.items()}
+    acting = {name for name, hint in hints.items() if hint is not None and hint.destructive_hint}
+    assert acting == {"order", "stop_job", "withdraw"}
+    assert {name for name, hint in hints.items() if hint is not None and hint.read_only_hint} == TOOLS.keys() - acting
