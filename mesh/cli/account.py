@@ -33,10 +33,7 @@ def command() -> None:
 @command.command("new", short_help="create an account")
 @click.argument("keyfile", type=FILE)
 @click.option(
-    "--password-file",
-    required=True,
-    type=FILE,
-    help="file with the password; created with a random one if missing",
+    "--password-file", required=True, type=FILE, help="file with the password; created with a random one if missing"
 )
 @with_json
 def new(keyfile: Path, password_file: Path, as_json: bool) -> None:

@@ -17,13 +17,7 @@ from mesh.amounts import XRT, Unit
 from mesh.cli import LazyGroup
 from mesh.cli.chain_client import READ_ATTEMPTS, open_chain, own_address
 from mesh.cli.lighthouse import check_lighthouse
-from mesh.cli.options import (
-    FiniteRange,
-    with_chain_settings,
-    with_json,
-    with_lighthouse_options,
-    with_signing_settings,
-)
+from mesh.cli.options import FiniteRange, with_chain_settings, with_json, with_lighthouse_options, with_signing_settings
 from mesh.cli.output import print_json, print_line, print_result, print_table, printable
 from mesh.errors import ChainError, ConfigurationError
 

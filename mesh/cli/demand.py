@@ -250,10 +250,8 @@ class JobPrinter:
         return f"{plural(len(self._offers), 'robot')} offered, {declines}"
 
     def _words(self, seen: Progress) -> str:
-        who, why = (
-            labelled(seen.agent, self._name_of(seen.agent)),
-            f"{printable(seen.detail)} ({printable(seen.code)})".lstrip(),
-        )
+        who = labelled(seen.agent, self._name_of(seen.agent))
+        why = f"{printable(seen.detail)} ({printable(seen.code)})".lstrip()
         match seen.kind:
             case "offer":
                 return f"offer by {who}{self._difference(seen)}"
@@ -382,10 +380,8 @@ class JudgedTerms:
         if announced.is_silent:
             doubts["silent"] = "nobody answers as this validator on the mesh, so perhaps nobody will judge"
         elif not announced.has_quorum:
-            missing = (
-                f"only {len(announced.announcements)} of the {announced.quorum} jurors that must judge alike answer"
-            )
-            doubts["few-jurors"] = missing
+            online = len(announced.announcements)
+            doubts["few-jurors"] = f"only {online} of the {announced.quorum} jurors that must judge alike answer"
         if self.fee < announced.fee:
             offered = f"the fee is {XRT.show(self.fee)}, but the validator wants {XRT.show(announced.fee)}"
             doubts["low-fee"] = f"{offered}, so it may refuse the work"
@@ -501,9 +497,7 @@ async def agreed_fee(
     help="what you pay: whole tokens (1.5, 3.50 USDC, 3.50 0x…), or the smallest unit (1500000000wn, 15units)",
 )
 @click.option(
-    "--robot",
-    default="",
-    help="the only robot that gets the job: name, address, cheapest or first (done first) [any]",
+    "--robot", default="", help="the only robot that gets the job: name, address, cheapest or first (done first) [any]"
 )
 @click.option(
     "--max-cost",
@@ -534,9 +528,7 @@ async def agreed_fee(
     "that wants more says how much [nothing]",
 )
 @click.option(
-    "--lifetime",
-    type=click.IntRange(min=1),
-    help="number of blocks for which the demand is valid [about ten minutes]",
+    "--lifetime", type=click.IntRange(min=1), help="number of blocks for which the demand is valid [about ten minutes]"
 )
 @click.option(
     "--existing",
@@ -552,13 +544,7 @@ async def agreed_fee(
     "--withdraw-on-exit", is_flag=True, help="withdraw the demand if the command is interrupted before the contract"
 )
 @with_json
-@with_settings(
-    NetworkSettings,
-    "lighthouse_contract",
-    "erc20_token",
-    AccountSettings,
-    ChainSettings,
-)
+@with_settings(NetworkSettings, "lighthouse_contract", "erc20_token", AccountSettings, ChainSettings)
 async def demand(
     settings: Settings,
     *,
@@ -908,10 +894,7 @@ def _attempts(number: str, outcome: Outcome) -> dict[str, Any]:
 
 
 async def _interruptible(
-    contract: Contract,
-    waiting: asyncio.Task[Outcome],
-    printer: JobPrinter,
-    leave: Callable[[], Awaitable[None]],
+    contract: Contract, waiting: asyncio.Task[Outcome], printer: JobPrinter, leave: Callable[[], Awaitable[None]]
 ) -> Outcome:
     """What `waiting` returns. If it is interrupted in a terminal, another Ctrl-C stops the robot.
 

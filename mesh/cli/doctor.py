@@ -24,9 +24,7 @@ MARK: Final = 6
 
 @click.command("doctor")
 @click.option(
-    "--role",
-    type=click.Choice(get_args(Role)),
-    help="the role to check this machine for [inferred from the settings]",
+    "--role", type=click.Choice(get_args(Role)), help="the role to check this machine for [inferred from the settings]"
 )
 @click.option(
     "--timeout",

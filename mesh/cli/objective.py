@@ -257,14 +257,7 @@ def convert_recording(
     cid = ",".join(map(cid_of_file, files))
     with writing(out), progress(f"converting {source.name}") as tell:
         done = convert(
-            source,
-            out,
-            to=to,
-            cid=cid,
-            topics=topics,
-            leave_out=leave_out,
-            distribution=distribution,
-            progress=tell,
+            source, out, to=to, cid=cid, topics=topics, leave_out=leave_out, distribution=distribution, progress=tell
         )
     made = cid_of_file(done.path)
     if as_json:

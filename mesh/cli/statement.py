@@ -84,15 +84,9 @@ def _amounts(one: Entry | Sum, unit: Unit) -> tuple[str, ...]:
 def _print_entries(found: Statement, units: Units) -> None:
     rows = []
     for entry in found.entries:
-        one, unit = entry.liability, units[entry.token]
+        one = entry.liability
         other = one.promisor if one.promisee == found.account else one.promisee
-        amounts = (
-            unit.show(entry.earned),
-            unit.show(entry.spent),
-            XRT.show(entry.fee),
-            _eth(entry.gas),
-            _eth(entry.own_gas),
-        )
+        amounts = _amounts(entry, units[entry.token])
         rows.append((format_time(entry.time), one.address, one.state, *amounts, short_address(other)))
     heads = ("TIME", "LIABILITY", "STATE", *AMOUNTS, "WITH")
     print_table(heads, rows, numbers=AMOUNTS)

@@ -14,7 +14,7 @@ import click
 
 from mesh.base.extras import PackageMissing, needs_extra
 from mesh.cli.files import require_readable
-from mesh.cli.options import BLOCK_TIME, FOLDER, PATH, PORT, with_json, with_settings
+from mesh.cli.options import BLOCK_TIME, FILE, FOLDER, PATH, PORT, with_json, with_settings
 from mesh.cli.output import announce, print_json
 from mesh.dev.page import PAGE_PORT, page_server
 from mesh.errors import ConfigurationError
@@ -40,9 +40,8 @@ def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
         show_default=True,
         help="the EVM that runs the chain; auto uses anvil if it is installed",
     )
-    anvil = click.option("--anvil", type=click.Path(path_type=Path), help="the program anvil [searched on the PATH]")
-    kept = click.Path(dir_okay=False, path_type=Path)
-    state = click.option("--state", type=kept, help="file in which anvil stores the chain")
+    anvil = click.option("--anvil", type=PATH, help="the program anvil [searched on the PATH]")
+    state = click.option("--state", type=FILE, help="file in which anvil stores the chain")
     return engine(anvil(state(function)))
 
 

@@ -7,7 +7,6 @@ import signal
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -19,7 +18,7 @@ from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.cli.chain_client import open_chain
 from mesh.cli.demand import print_connection_changes
 from mesh.cli.files import model_named
-from mesh.cli.options import CHAIN_SETTINGS, with_json, with_settings
+from mesh.cli.options import CHAIN_SETTINGS, FILE, with_json, with_settings
 from mesh.cli.output import json_text, plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
 from mesh.errors import AiraError, ChainError
 from mesh.network import Reading
@@ -34,6 +33,7 @@ from schemas.verdicts import ValidatorReport
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping
+    from pathlib import Path
 
     import zenoh
 
@@ -223,9 +223,7 @@ PRESENCE_CHANGES: Final = Rate(per_second=4.0, burst=64)
 @click.option("--model", help="print only events of this model: its file or CID")
 @click.option("--open", "with_open", is_flag=True, help="first print the orders that are open now")
 @click.option("--readings", is_flag=True, help="also print what agents publish outside of jobs, and their answers")
-@click.option(
-    "--out", type=click.Path(dir_okay=False, path_type=Path), help="record the readings to this MCAP file (new)"
-)
+@click.option("--out", type=FILE, help="record the readings to this MCAP file (new)")
 @with_json
 @with_settings(NetworkSettings, "lighthouse_contract", *CHAIN_SETTINGS)
 def command(

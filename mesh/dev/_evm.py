@@ -658,10 +658,7 @@ class NodeFilters:
     """
 
     def __init__(
-        self,
-        evm: Evm,
-        logs: Callable[[dict[str, Any]], list[dict[str, Any]]],
-        bound: Callable[[object], int],
+        self, evm: Evm, logs: Callable[[dict[str, Any]], list[dict[str, Any]]], bound: Callable[[object], int]
     ) -> None:
         self._evm = evm
         self._logs = logs

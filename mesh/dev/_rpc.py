@@ -528,11 +528,7 @@ class WebSocketConnection:
     """One WebSocket: answers its requests one after another, and sends what it subscribed to."""
 
     def __init__(
-        self,
-        request: web.Request,
-        socket: web.WebSocketResponse,
-        dispatcher: Dispatcher,
-        subscriptions: Subscriptions,
+        self, request: web.Request, socket: web.WebSocketResponse, dispatcher: Dispatcher, subscriptions: Subscriptions
     ) -> None:
         self._request = request
         self._socket = socket

@@ -69,9 +69,7 @@ def prepare_state(state: Path) -> None:
     except OSError as error:
         raise ConfigurationError(f"can't keep the chain in {state}: {error.strerror}") from None
     log.warning(
-        "%s was cut off: using the last complete copy",
-        state,
-        extra=log_event("chain-state-restored", path=state),
+        "%s was cut off: using the last complete copy", state, extra=log_event("chain-state-restored", path=state)
     )
 
 

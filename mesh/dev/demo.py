@@ -377,13 +377,7 @@ class Demo:
         self._narrator.chapter("A person wants work done")
         cid = await asyncio.to_thread(cid_of_file, path)
         event("person", "objective", f"holds the objective {path.name}\n{cid}", objective=cid, file=str(path))
-        event(
-            "person",
-            "asking",
-            f"will pay {_xrt(COST)} for it, and publishes a Demand",
-            model=MODEL,
-            cost=COST,
-        )
+        event("person", "asking", f"will pay {_xrt(COST)} for it, and publishes a Demand", model=MODEL, cost=COST)
         async with asyncio.timeout(self._timeout):
             contract = await self._person.demand(path, cost=COST)
         async with asyncio.timeout(self._timeout + objective.duration_ns / 1e9 + objective.count * BLINK_SECONDS):

@@ -446,9 +446,7 @@ DEFAULTS: Final = Settings()
 """Every option with its default."""
 
 PREFIX: Final = "AIRA_"
-RETIRED: Final = {
-    "master_check_interval": "there is no ROS master; delete the option",
-}
+RETIRED: Final = {"master_check_interval": "there is no ROS master; delete the option"}
 """Options of the legacy stack that have no meaning here, and why. They are logged and ignored."""
 
 NOT_OPTIONS: Final = frozenset(

@@ -1,5 +1,4 @@
 from mesh.testing._fake_job import FakeJob as FakeJob, run as run
-from mesh.testing._judging import judge as judge
 from mesh.testing._market import Market as Market, MarketChain as MarketChain
 from mesh.testing._outcomes import (
     JobRecording as JobRecording,
@@ -7,4 +6,5 @@ from mesh.testing._outcomes import (
     assert_declined as assert_declined,
     assert_paid as assert_paid,
     assert_refunded as assert_refunded,
+    judge as judge,
 )

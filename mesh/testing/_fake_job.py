@@ -10,7 +10,7 @@ from contextlib import suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from mesh.agent.agent import require_fit
 from mesh.agent.handlers import Job
@@ -22,8 +22,8 @@ from mesh.errors import AiraError, InputError
 from mesh.recording import Limits, pack_values, preflight
 from mesh.recording.objective import Played
 from mesh.role.models import description_in
-from mesh.testing._outcomes import JobRecording, RecordedOutcome
-from mesh.testing._simulated_time import SimulatedTimeLoop
+from mesh.testing._clock import SimulatedTimeLoop
+from mesh.testing._outcomes import CONTRACT, ROBOT, JobRecording, RecordedOutcome
 from schemas import Liability, cid_of_file
 from schemas.keys import LiabilityTopicKey, parse_agent_key
 
@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from schemas.payloads import PayloadType
 
 log = logging.getLogger(__name__)
-
-ROBOT: Final = "0x00000000000000000000000000000000000000A1"
-CONTRACT: Final = "0x00000000000000000000000000000000000000c1"
-"""Addresses of nobody."""
 
 
 @dataclass(frozen=True)
@@ -198,9 +194,4 @@ class _FakeRun(Job):
 
 def _liability(model: str, objective: Path) -> Liability:
     """A contract that costs nothing, between addresses of nobody."""
-    return Liability.of_nobody(
-        address=CONTRACT,
-        model=model,
-        objective=cid_of_file(objective),
-        promisor=ROBOT,
-    )
+    return Liability.of_nobody(address=CONTRACT, model=model, objective=cid_of_file(objective), promisor=ROBOT)

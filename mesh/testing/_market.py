@@ -29,9 +29,8 @@ from mesh.network import Endpoints, Network
 from mesh.network.endpoints import free_endpoint
 from mesh.recording import open_objective
 from mesh.settings import Settings
-from mesh.testing._cable import Cable
 from mesh.testing._clock import MarketClock
-from mesh.testing._disk import full, small_disk
+from mesh.testing._faults import Cable, full, small_disk
 from mesh.testing._outcomes import JobRecording, RecordedOutcome
 from schemas import cid_of_bytes, keccak256
 from schemas.keys import RpcKey

@@ -1,22 +1,30 @@
-"""How a job of a test ended, what was recorded of it, and assertions about that.
+"""How a job of a test ended, what was recorded of it, assertions about that, and what a validator would say of it.
 
 What they say when they fail is what a person would look for next.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from mesh.agent.contracts import Outcome
 from mesh.agent.handlers import Declined
 from mesh.agent.hiring import DemandDeclined
+from mesh.validator.policies import COMPLETE, Evidence
+from schemas import Liability
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from mesh.recording import Played
+    from mesh.validator.validator import Validator
+
+
+ROBOT: Final = "0x00000000000000000000000000000000000000A1"
+CONTRACT: Final = "0x00000000000000000000000000000000000000c1"
+"""Addresses of nobody."""
 
 
 class JobRecording:
@@ -86,6 +94,22 @@ def assert_declined(error: BaseException, *, code: str = "") -> None:
     if code and code not in said:
         words = "; ".join(f"{reason} ({detail})" if detail else reason for reason, detail in said.items())
         raise AssertionError(f"expected a decline with the code {code}, but the robots said: {words}")
+
+
+def judge(validator: Validator, outcome: RecordedOutcome) -> list[str]:
+    """Why a validator would not let a job count, by its own checks and by the shipped policies but `complete`.
+
+    It is empty if they hold. The validator need not run; `outcome` is what `run` and `Market.order` return.
+    """
+    messages = outcome.recording.messages
+    evidence = Evidence(Liability.of_nobody(address=CONTRACT, promisor=ROBOT), keep=True)
+    evidence._start_ns = min((message.log_time_ns for message in messages), default=0)
+    checks = [policy.begin(evidence) for policy in validator.policies if policy != COMPLETE]
+    for message in messages:
+        judged = evidence.add(message, 0)
+        for check in checks:
+            check.add(judged)
+    return [found.detail or found.name for check in checks for found in check.findings() if found.holds is not True]
 
 
 def _reason(outcome: Outcome) -> str:

@@ -410,7 +410,8 @@ class ReadingFetcher(Lifecycle):
         self._timeout = timeout
         self._contracts = RecentSet()
         self._turns = asyncio.Semaphore(MAX_FETCHES)
-        self._pending = 0
+        self.pending = 0
+        """Results being fetched or waiting."""
 
     async def _open(self, stack: AsyncExitStack) -> None:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-readings-"))
@@ -418,11 +419,6 @@ class ReadingFetcher(Lifecycle):
         stack.callback(store.close)
         self._exchange = await stack.enter_async_context(Exchange(self._session, store))
         self._tasks = await stack.enter_async_context(Background())
-
-    @property
-    def pending(self) -> int:
-        """Results being fetched or waiting."""
-        return self._pending
 
     def handle(self, event: MarketEvent) -> None:
         """Take an event of the market."""
@@ -432,11 +428,11 @@ class ReadingFetcher(Lifecycle):
             result = event.message
             if result.liability in self._contracts:
                 return
-            if self._pending == MAX_PENDING:
+            if self.pending == MAX_PENDING:
                 fields = log_event("result-skipped", result=result.result, signer=event.signer)
                 log.warning("skipped the result %s of %s: too many at once", result.result, event.signer, extra=fields)
                 return
-            self._pending += 1
+            self.pending += 1
             self._tasks.start(self._fetch(result.result, event.signer), f"reading {result.result}")
 
     async def _fetch(self, cid: str, signer: str) -> None:
@@ -451,7 +447,7 @@ class ReadingFetcher(Lifecycle):
             for reading in readings:
                 self._deliver(reading)
         finally:
-            self._pending -= 1
+            self.pending -= 1
 
 
 def _read(path: Path, cid: str, signer: str) -> list[Reading]:

@@ -201,9 +201,7 @@ class RobotDirectory:
             )
         there = f"these are present: {', '.join(shown)}" if shown else "no robot is present that says who it is"
         raise InputError(
-            f"no robot is called {text[:80]!r}",
-            hint=f"{there}; `aira robots` lists them",
-            code="robot-unknown",
+            f"no robot is called {text[:80]!r}", hint=f"{there}; `aira robots` lists them", code="robot-unknown"
         )
 
     def name(self, address: str) -> str:
@@ -272,6 +270,5 @@ async def asked_quotes(
             if is_asked and quote.agent not in found and quote.is_signed:
                 found[quote.agent] = quote
     return sorted(
-        found.values(),
-        key=lambda one: (bool(one.code), one.token != token, one.token, one.cost, one.start, one.agent),
+        found.values(), key=lambda one: (bool(one.code), one.token != token, one.token, one.cost, one.start, one.agent)
     )

@@ -22,15 +22,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.network import Tls
 from mesh.network.endpoints import SPARE_DESCRIPTORS, check_locators, room_for_sessions
 from mesh.network.tls import WILDCARD_HOSTS, TlsRefusal, shake_hands
-from mesh.ops.doctor.checks import (
-    CheckResult,
-    certificate_info,
-    expiry_of,
-    failed,
-    passed,
-    subject_values,
-    warning,
-)
+from mesh.ops.doctor.checks import CheckResult, certificate_info, expiry_of, failed, passed, subject_values, warning
 from mesh.ops.identity.roster import read_roster
 from mesh.ops.identity.routers import router_endpoints
 

@@ -320,9 +320,7 @@ def with_fingerprint(path: Path, address: str, *, old: str, new: str) -> str:
     where = f"{path}, member {member.name!r}"
     if member.revoked:
         raise roster_error(
-            where,
-            "it is revoked, so its certificate is not renewed",
-            hint="delete the folder of its certificate",
+            where, "it is revoked, so its certificate is not renewed", hint="delete the folder of its certificate"
         )
     if member.fingerprint not in ("", old):
         hint = "use the folder of the current certificate, or correct the fingerprint in the roster"

@@ -97,10 +97,7 @@ def _presence(*roles: str) -> Grant:
 
 
 _OWN_SPACE: Final = _grant("put delete serve token get subscribe presence", "aira/agent/{own}/**")
-_READ_MARKET: Final = (
-    _grant("get subscribe", "aira/{market}/**"),
-    _grant("presence", "aira/{market}/@agent/*/*"),
-)
+_READ_MARKET: Final = (_grant("get subscribe", "aira/{market}/**"), _grant("presence", "aira/{market}/@agent/*/*"))
 _READ_CONTENT: Final = _grant("get", "aira/agent/*/cid/*")
 """Who holds content serves it in its own space."""
 _READINGS: Final = _grant("subscribe", "aira/agent/*/reading/**")
@@ -375,10 +372,4 @@ def access_control(roster: Roster) -> dict[str, Any]:
         subjects.append({"id": address, "cert_common_names": [address, parse_address(address)]})
         own = [rule["id"] for rule in rules if rule in SHARED or rule["id"].startswith(address)]
         policies.append({"subjects": [address], "rules": own})
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}

@@ -1,14 +1,26 @@
-"""The cable between a robot of a test and the router, which can be cut."""
+"""What can fail around a robot of a test: the cable to the router can be cut, a small disk of its own can be filled."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+import os
+import subprocess
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
 
 from mesh.base.lifecycle import Lifecycle
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from contextlib import AsyncExitStack
+    from pathlib import Path
+
+FILLER: Final = "filler"
+PIECE: Final = 64 * 1024
+"""Bytes that are written at a time."""
 
 
 class Cable(Lifecycle):
@@ -101,3 +113,37 @@ class _End(asyncio.Protocol):
 
     def connection_lost(self, error: Exception | None) -> None:
         self._cable.closed(self)
+
+
+@contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[None]:
+    """Mount a file system of `size` bytes in memory at a new folder. Skips the test where that is not allowed."""
+    if sys.platform != "linux" or os.geteuid() != 0:
+        pytest.skip("a robot gets a disk of its own only on Linux, and as root")
+    folder.mkdir()
+    options = f"size={size},mode=700"
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip(f"a robot can't get a disk of its own here: {mounted.stderr.strip()}")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@contextmanager
+def full(folder: Path) -> Iterator[None]:
+    """Meanwhile the disk has no byte left."""
+    filler = folder / FILLER
+    try:
+        with filler.open("wb", buffering=0) as file:
+            while True:
+                try:
+                    file.write(bytes(PIECE))
+                except OSError:  # ENOSPC
+                    break
+        yield
+    finally:
+        filler.unlink()
