@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, Unpack
 
 from mesh.base.lifecycle import Lifecycle
 from mesh.chain._abi import is_code_of
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mesh.chain._accounts import Account
     from mesh.chain._contracts import ContractKind
     from mesh.chain._node import FeePolicy, Timing
-    from mesh.chain.following import BlockEvents, Choose, History
+    from mesh.chain.following import BlockEvents, History, Selection
     from mesh.chain.rpc import Endpoint
     from mesh.errors import AiraError
     from mesh.settings.chains import ChainProfile
@@ -203,27 +203,17 @@ class Chain(Lifecycle):
         cursor: int,
         *,
         history: History | None = None,
-        token: str = "",
-        parties: Iterable[str] | None = None,
-        choose: Choose | None = None,
         outages: OutageLog | None = None,
+        **selection: Unpack[Selection],
     ) -> AsyncGenerator[BlockEvents, None]:
         """Blocks with their events from the block `cursor` on, and reorganisations, without end: see `following`.
 
-        Transfers and approvals are those of `token` (an address; XRT by default), all or those that concern one of
-        `parties` (addresses). `choose` says which liabilities' events are read; all by default. Outages of the node are
-        logged to `outages` and survived. Raises `ChainWentBack`.
+        The events are those of the `Selection`: its `token`, `parties` and `choose`. Outages of the node are logged to
+        `outages` and survived. Raises `ChainWentBack`.
         """
-        contracts = self._opened()
-        sources = EventSources(
-            factory=contracts.factory,
-            token=token or contracts.xrt,
-            parties=None if parties is None else frozenset(parties),
-            choose=choose,
-            version=contracts.version,
-        )
+        sources = EventSources.of(self._opened(), selection)
         read = partial(read_events, self.node, sources)
-        look = None if parties is None else partial(glance, self.node, sources)
+        look = None if sources.parties is None else partial(glance, self.node, sources)
         return follow(self.node, read, cursor, look=look, history=history, outages=outages)
 
     async def retrying(

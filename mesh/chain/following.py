@@ -54,7 +54,7 @@ from contextlib import aclosing
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import groupby, pairwise
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypedDict, TypeVar, get_args
 
 import msgspec
 from eth_utils.abi import event_abi_to_log_topic
@@ -77,7 +77,7 @@ from schemas.errors import InvalidCid
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 
-    from mesh.chain._contracts import ContractVersion
+    from mesh.chain._contracts import Contracts, ContractVersion
     from mesh.chain._node import Node
     from mesh.chain.answers import BlockHeader, Log
     from mesh.errors import AiraError
@@ -256,6 +256,17 @@ ReadRange: TypeAlias = "Callable[[int, int, BlockHeader | None], Awaitable[list[
 """Reads the blocks from one to another, both included, as `read_events` does; of a single block it gets the header."""
 
 
+class Selection(TypedDict, total=False):
+    """Which events are read, by default all."""
+
+    token: str
+    """The address of the token whose transfers and approvals are read; XRT by default."""
+    parties: Collection[str]
+    """Addresses: transfers and approvals are read that concern one of them."""
+    choose: Choose | None
+    """Which liabilities' events are read."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventSources:
     """The contracts whose events are read: the factory, a token (empty: none), and the factory's liabilities.
@@ -270,6 +281,17 @@ class EventSources:
     """Which liabilities' events are read; those of all by default."""
     version: ContractVersion
     """Told each liability that the factory's events name, before it is asked about its events."""
+
+    @classmethod
+    def of(cls, contracts: Contracts, selection: Selection) -> EventSources:
+        """Those of a generation's contracts."""
+        return cls(
+            factory=contracts.factory,
+            token=selection.get("token") or contracts.xrt,
+            parties=frozenset(selection["parties"]) if "parties" in selection else None,
+            choose=selection.get("choose"),
+            version=contracts.version,
+        )
 
     def logs_in(self, header: BlockHeader | None) -> bool:
         """Whether a block may hold a log of the named contracts; with None, it is not known."""

@@ -20,6 +20,7 @@ from mesh.base.background import Background
 from mesh.cli.chain_client import own_address
 from mesh.cli.output import printable, progress, short_address
 from mesh.content import Exchange, Store
+from mesh.content.store import make_store
 from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.recording import pack_described
 from mesh.settings import NetworkSettings
@@ -188,20 +189,20 @@ def required_description(path: Path) -> ModelDescription:
         return parse_description(file.read(MAX_MODEL_SIZE + 1))
 
 
-def open_store(settings: Settings) -> Store:
+def account_store(settings: Settings) -> Store:
     """The store of the settings' account; without an account, the store that the data folder has for no account.
 
     This and the store's methods block on the disk; use threads. Raises `ConfigurationError`.
     """
     address = own_address(settings)
     folder = settings.state_directory / address if address else settings.state_directory
-    return Store(folder / "content", limit=LARGEST_FILE, quota=settings.content_limit)
+    return make_store(settings, folder / "content", limit=LARGEST_FILE)
 
 
 @asynccontextmanager
 async def opened_store(settings: Settings) -> AsyncIterator[Store]:
-    """`open_store` in a thread; the store is closed at the end."""
-    store = await asyncio.to_thread(open_store, settings)
+    """`account_store` in a thread; the store is closed at the end."""
+    store = await asyncio.to_thread(account_store, settings)
     try:
         yield store
     finally:

@@ -20,10 +20,10 @@ from mesh.cli import LazyGroup
 from mesh.cli.files import (
     FETCH_SETTINGS,
     STORE_SETTINGS,
+    account_store,
     fetch,
     file_or_cid,
     names_in,
-    open_store,
     opened_store,
     require_new_file,
     require_readable,
@@ -117,7 +117,7 @@ def add(settings: Settings, files: tuple[Path, ...], as_json: bool) -> None:
     if not settings.keyfile:
         click.echo("no agent serves the store of no account; --keyfile FILE selects that of yours", err=True)
     added, refused = [], []
-    with open_store(settings) as store:
+    with account_store(settings) as store:
         for path in files:
             with progress(f"adding {path.name}") as tell:
                 cid = store.put_file(path, pin=PIN, progress=tell)
@@ -173,7 +173,7 @@ def check(settings: Settings, objective: str | None, topics: str | None, as_json
     Without OBJECTIVE, check every file of the store against its CID. The exit code is 1 if a check fails. The printed
     reason is a stable code.
     """
-    with open_store(settings) as store:
+    with account_store(settings) as store:
         if objective is None:
             is_fine = _check_store(store, as_json=as_json)
         else:

@@ -74,6 +74,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from mesh.content.files import Progress, Readable
+    from mesh.settings.groups import ContentSettings
 
 
 _BATCH: Final = 128
@@ -1023,6 +1024,11 @@ def _damaged_file(directory: Path, cid: str) -> BinaryIO | None:
         return (directory / f"{cid}{DAMAGED_SUFFIX}").open("rb", buffering=0)
     except FileNotFoundError:
         return None
+
+
+def make_store(settings: ContentSettings, folder: Path, *, limit: int) -> Store:
+    """The files by CID in a folder. `limit` is the largest file, bytes. It blocks on the disk, as the store does."""
+    return Store(folder, limit=limit, quota=settings.content_limit)
 
 
 def is_in_use(directory: Path) -> bool:

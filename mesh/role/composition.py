@@ -17,6 +17,7 @@ from mesh.base.fresh_file import blocklist_at
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff
 from mesh.content import Exchange, Store
+from mesh.content.store import make_store
 from mesh.errors import NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network, Services
 from mesh.role.handover import adopt_content, check_not_retired
@@ -194,7 +195,7 @@ async def state_folder(settings: StorageSettings, chain: Chain, address: str) ->
 
 async def open_store(stack: AsyncExitStack, settings: Settings, folder: Path, *, limit: int) -> Store:
     """Files by CID in a folder, closed with `stack`. `limit` is the largest file, bytes."""
-    store = await asyncio.to_thread(Store, folder, limit=limit, quota=settings.content_limit)
+    store = await asyncio.to_thread(make_store, settings, folder, limit=limit)
     stack.callback(store.close)
     return store
 

@@ -24,7 +24,7 @@ import asyncio
 import logging
 import time
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, Unpack
 
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff
@@ -42,11 +42,11 @@ from mesh.chain.following import QUICK, history_at
 from mesh.telemetry.metrics import gauge
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Sequence
+    from collections.abc import Awaitable, Callable, Sequence
 
     from mesh.base.outage_log import OutageLog
     from mesh.chain import BlockEvents, Chain, ChainEvent
-    from mesh.chain.following import Choose
+    from mesh.chain.following import Selection
     from mesh.telemetry.metrics import MetricFamily
     from schemas import Liability
 
@@ -164,26 +164,23 @@ async def follow_chain(
     outages: OutageLog,
     *,
     store: CursorStore | None = None,
-    token: str = "",
-    parties: Iterable[str] = (),
-    choose: Choose | None = None,
     read: Callable[[Sequence[str]], Awaitable[Sequence[Created]]] | None = None,
+    **selection: Unpack[Selection],
 ) -> None:
-    """Tell a role what happens, until cancelled. `token`, `parties` and `choose` select events as in `Chain.follow`.
+    """Tell a role what happens, until cancelled. Events are selected as in `Chain.follow`, by default of no `parties`.
 
     `read` reads the records of new liabilities, by default all in one call.
 
     Raises `ChainWentBack`, and what the role raises, but for a node that is away.
     """
     read = read or chain.liabilities.get_all_with_orders
+    selection.setdefault("parties", ())
     kept, backoff = History(chain.node.timing.reorg_depth), Backoff(chain.node.timing.outage_retry)
     pace, save_at = SAVE_SECONDS if chain.node.profile.block_seconds < QUICK else 0.0, 0.0
     while True:
         last, history = await _position(chain, head, kept, store)
         try:
-            blocks = chain.follow(
-                last + 1, history=history, token=token, parties=parties, choose=choose, outages=outages
-            )
+            blocks = chain.follow(last + 1, history=history, outages=outages, **selection)
             async with aclosing(blocks):
                 async for block in blocks:
                     contract_block = await chain.node.contract_blocks.last(block.block_number)  # first: it may fail
