@@ -1,6 +1,6 @@
 """Identities of a site: certificates, the roster, and the rights of members on the site's routers.
 
-`certificates` and `folders` need the extra `identity`; import them where you use them.
+`certificates` needs the extra `identity`; import it where you use it.
 """
 
 from mesh.ops.identity.roster import (

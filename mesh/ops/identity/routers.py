@@ -125,7 +125,7 @@ async def check_admission(endpoints: Endpoints, address: str, *, agent: str = ""
 
     A router does not report a denial, so this subscribes to a key below the own address, which every role but `edge`
     may do; an edge agent subscribes below the device `device` of the agent at `agent`. Raises `RemoteError`,
-    `RemoteError`, `InvalidKey`.
+    `InvalidKey`.
     """
     keys = [str(DeviceTopicKey(address, "check", "/check"))]
     if agent:
