@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 PLAIN: Final = {
     **dict(zip("…→·●○", ("...", "->", "*", "*", "o"), strict=True)),
     **dict(zip("▁▂▃▄▅▆▇█", "_.-:=+*#", strict=True)),
-    "\N{EN DASH}": "-",
-    "\N{RIGHT SINGLE QUOTATION MARK}": "'",
+    "\u2013": "-",
+    "\u2019": "'",
 }
-"""Characters of our own texts, and usual ones of others, in ASCII."""
+"""Characters of our own texts, and usual ones of others, in ASCII. Their names (`\\N{…}`) would load Unicode's tables."""
 ASCII: Final = "aira_ascii"
 """The encoding ASCII under another name: click writes UTF-8 to a terminal whose encoding has the name ASCII."""
 
