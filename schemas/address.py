@@ -67,7 +67,6 @@ def parse_address(text: str) -> str:
 
 
 def shortened(address: str) -> str:
-    """An address shortened to its ends."""
     return f"{address[:6]}…{address[-4:]}"
 
 

@@ -318,10 +318,7 @@ def _rule(table: dict[str, Any], at: Path, faults: list[TomlFault]) -> ValueRule
     if len(faults) == before and ranged + bool(one_of) + (table.get("any") is True) != 1:
         faults.append(TomlFault(at, "say one of: min and max; one_of; any = true"))
     return ValueRule(
-        minimum=limits["min"],
-        maximum=limits["max"],
-        one_of=tuple(one_of),
-        is_optional=table.get("optional") is True,
+        minimum=limits["min"], maximum=limits["max"], one_of=tuple(one_of), is_optional=table.get("optional") is True
     )
 
 

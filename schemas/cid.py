@@ -75,7 +75,6 @@ def parse_ahead(texts: Iterable[str]) -> None:
 
 
 def is_cid(text: str) -> bool:
-    """Whether a text is a CIDv0."""
     try:
         parse_cid(text)
     except InvalidCid:

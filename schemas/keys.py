@@ -53,7 +53,6 @@ _CHUNKS: Final = re.compile(rf"{_CHUNK}(?:/{_CHUNK})*")
 
 @lru_cache(maxsize=CACHED)
 def address_chunk(text: str) -> str:
-    """An address, in lower case."""
     try:
         return parse_address(text).lower()
     except InvalidAddress as error:
@@ -61,7 +60,6 @@ def address_chunk(text: str) -> str:
 
 
 def cid_chunk(text: str) -> str:
-    """A CIDv0."""
     try:
         parse_cid(text)
     except InvalidCid as error:

@@ -295,7 +295,6 @@ class OwnerWatch:
         """Of the parts that can't be reached."""
 
     def tasks(self) -> Iterator[tuple[str, Coroutine[object, object, object]]]:
-        """What it does until it is cancelled."""
         if "robot-unreachable" in self._notifier.wanted:
             yield "absent devices", self._watch_devices()
             yield "lost routers", self._watch_router()

@@ -49,21 +49,12 @@ class OwnerRules:
     of its model's description. Raises `ConfigurationError` for settings that can't be read.
     """
 
-    def __init__(
-        self,
-        parts: AgentComponents,
-        jobs: Callable[[], int],
-        hold: Hold,
-        *,
-        price: str = "",
-        clock: Callable[[], float] = time.time,
-    ) -> None:
+    def __init__(self, parts: AgentComponents, jobs: Callable[[], int], hold: Hold, *, price: str = "") -> None:
         settings = parts.settings
         self._parts = parts
         self._jobs = jobs
         self._hold = hold
         self._described = price
-        self._clock = clock
         self._limit = settings.queue_limit
         self._accepted = _addresses("accept", settings.accept)
         self._refused = _addresses("refuse", settings.refuse)
@@ -141,7 +132,7 @@ class OwnerRules:
         """Why the agent takes no jobs of anybody now, if it doesn't."""
         if (stopped := self.stopped()) is not None:
             return stopped
-        if self._hours and not any(hours.contain(self._clock()) for hours in self._hours):
+        if self._hours and not any(hours.contain(time.time()) for hours in self._hours):
             return Declined(OUTSIDE_HOURS, f"it works at {', '.join(self._parts.settings.hours)}")
         return None
 

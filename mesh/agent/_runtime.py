@@ -322,7 +322,6 @@ class AgentRuntime(Lifecycle):
         services.offer("status", self.status.status)
 
     def tasks(self) -> Iterator[tuple[str, Coroutine[Any, Any, object]]]:
-        """What it does until it is cancelled."""
         if self.parts.settings.enable_executor:
             yield "executor", self._do_jobs()
         yield "outbox", self.parts.outbox.run()

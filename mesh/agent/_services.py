@@ -243,7 +243,6 @@ class MessageServices:
         self._chain = parts.chain
 
     def services(self) -> dict[str, Service]:
-        """The services by name."""
         return {
             "sign/demand": self.sign_order,
             "sign/offer": self.sign_order,

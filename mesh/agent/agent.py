@@ -208,8 +208,6 @@ Messages: TypeAlias = Sequence[tuple[str, object]]
 
 
 class DemandTerms(TypedDict, total=False):
-    """The optional arguments of `Agent.order` and `Agent.demand`."""
-
     cost: int | str
     model: str
     token: str
@@ -233,8 +231,6 @@ ASK_SECONDS: Final = 60.0
 
 
 class Changes(TypedDict, total=False):
-    """The arguments of `Agent.control`."""
-
     price: str
     paused: bool
     refuse: tuple[str, ...]

@@ -702,7 +702,6 @@ class Contract:
 
     @property
     def _latest(self) -> Contract:
-        """The contract of the latest attempt."""
         return self if self.following is None else self.following._latest
 
     @property
@@ -755,10 +754,7 @@ class Contract:
     async def end(self, on_progress: OnProgress = nothing) -> Outcome:
         """The same for this contract alone, whatever follows it."""
         liability = self._liability
-        async with (
-            self._reports.followed(liability, on_progress),
-            followed_job(self._parts, liability, on_progress),
-        ):
+        async with self._reports.followed(liability, on_progress), followed_job(self._parts, liability, on_progress):
             ended, liability = await asyncio.shield(self._ended), self._liability
             facts: dict[str, Any] = {"robot": liability.promisor, "contract": liability.address}
             ended = msgspec.structs.replace(ended, reports=await self._last_reports(), **facts)
@@ -948,7 +944,6 @@ class WatchedContracts:
                 fail_future(watched.ended, LiabilityReverted(address, watched.reverted_until))
 
     def fail(self, error: Exception) -> None:
-        """Fail everything that is waited for."""
         for watched in self._watched.values():
             fail_future(watched.ended, error)
 

@@ -90,7 +90,6 @@ def check_handler(handler: Any, wanted: str, *, arguments: int) -> None:
 
 
 def name_of(handler: Any) -> str:
-    """A handler's name for people."""
     return str(getattr(handler, "__name__", None) or type(handler).__name__)
 
 
@@ -536,8 +535,6 @@ def check_model(model: object) -> None:
 
 @dataclass
 class Handlers:
-    """The handlers of one agent."""
-
     topics: TopicHandlers = field(default_factory=TopicHandlers)
     """`topics.declared` has the type of each topic's messages."""
     market: dict[type[Demand | Offer | Result], list[Handler]] = field(default_factory=dict)

@@ -143,7 +143,6 @@ def read_reason(recording: Path) -> Reason:
 
 
 def reason_in(note: str) -> Reason:
-    """What a note says."""
     found = _CODE.fullmatch(note)
     return Reason(note) if found is None else Reason(*found.groups())
 

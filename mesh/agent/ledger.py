@@ -531,7 +531,6 @@ class Outbox:
         self._held.update(identities)
 
     async def release(self, identities: Iterable[str]) -> None:
-        """Send messages that were held."""
         self._held.difference_update(identities)
         await self.send_new()
 

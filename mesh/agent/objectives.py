@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.handlers import TopicHandlers
-    from mesh.base.clock import Clock
     from mesh.content import Exchange, Store
     from mesh.recording import Objective
     from mesh.settings import ContentSettings
@@ -177,12 +176,12 @@ def _require_allowed(cid: str, objective: Objective, allowed: AllowedTopics) -> 
 class FetchBudget:
     """What may be fetched for demands: `async with budget.spend(cid, buyer)` around a fetch."""
 
-    def __init__(self, clock: Clock = SYSTEM_CLOCK) -> None:
-        self._rate = RateLimiter(per_sender=FETCH_RATE, clock=clock)
-        self._free = RateLimiter(per_sender=FETCH_RATE, total=FREE_FETCH_RATE, clock=clock)
+    def __init__(self) -> None:
+        self._rate = RateLimiter(per_sender=FETCH_RATE)
+        self._free = RateLimiter(per_sender=FETCH_RATE, total=FREE_FETCH_RATE)
         self._waiting: Counter[str] = Counter()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._missing = Absences(4096, clock)
+        self._missing = Absences(4096, SYSTEM_CLOCK)
 
     @asynccontextmanager
     async def spend(self, cid: str, buyer: Buyer) -> AsyncIterator[None]:

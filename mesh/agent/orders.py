@@ -25,13 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec.structs import replace
 
-from mesh.agent.contracts import (
-    Contract,
-    Progress,
-    fail_future,
-    report,
-    stated,
-)
+from mesh.agent.contracts import Contract, Progress, fail_future, report, stated
 from mesh.agent.handlers import Declined
 from mesh.base.flood import BoundedDict
 from mesh.errors import AiraError, InputError
@@ -477,10 +471,9 @@ class AnsweredDemand:
 
 
 class AnsweredDemands:
-    """The open demands on which an agent's handlers decide, or have decided; the last `limit` of them."""
+    """The open demands on which an agent's handlers decide, or have decided; the last 8192 of them."""
 
-    def __init__(self, limit: int = 8192) -> None:
-        self._limit = limit
+    def __init__(self) -> None:
         self._known: OrderedDict[tuple[str, str], AnsweredDemand] = OrderedDict()
         """By maker, and by what the versions of a demand share."""
         self._makers: Counter[str] = Counter()
@@ -497,7 +490,7 @@ class AnsweredDemands:
         key = demand.signer, lasting_hash(demand.message)
         known = self._known.get(key)
         if known is None:
-            if len(self._known) >= self._limit:
+            if len(self._known) >= 8192:
                 self.forget(next(iter(self._known.values())))
             known = self._known[key] = AnsweredDemand(demand)
             self._makers[demand.signer] += 1
@@ -528,7 +521,6 @@ class AnsweredDemands:
         return None
 
     def offered_by(self, offer: TradedOrder) -> AnsweredDemand | None:
-        """The demand that an offer answers."""
         return next((one for one in self._known.values() if one.offer is offer), None)
 
     def declined_like(self, order: Demand | Offer) -> list[AnsweredDemand]:

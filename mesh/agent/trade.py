@@ -448,7 +448,6 @@ class Trader(Lifecycle):
             self.ask_again(answered.demand)
 
     async def take_back_offers(self, why: str) -> None:
-        """Withdraw all open offers of the account."""
         await self._take_back(self._offers(), why)
 
     async def _take_back(self, offers: Iterable[TradedOrder], why: str) -> None:

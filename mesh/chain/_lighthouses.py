@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import aclosing
-from functools import partial
 from typing import TYPE_CHECKING
 
 from mesh.chain._tokens import Tokens
 from mesh.chain.errors import InsufficientTokens
-from mesh.chain.following import NewLighthouse, first_event, follow, list_created, read_created
+from mesh.chain.following import NewLighthouse, first_event, list_created
 from mesh.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Sequence
+    from collections.abc import Sequence
 
     from mesh.chain._contracts import Contracts, LighthouseState
 
@@ -43,22 +41,6 @@ class Lighthouses:
         """All lighthouses created since a block, in order."""
         created = await list_created(self._contracts.node, self._contracts.factory, from_block)
         return [event for event in created if isinstance(event, NewLighthouse)]
-
-    async def watch(self, from_block: int | None = None) -> AsyncGenerator[NewLighthouse, None]:
-        """Each lighthouse created from a block on (by default from the next), without end, each once.
-
-        A lighthouse that a reorganisation reverts is not yielded again when it is created again. Outages of the node
-        are survived, but without `from_block` one at the start raises `NodeUnreachable`.
-        """
-        node = self._contracts.node
-        cursor = await node.block_number() + 1 if from_block is None else from_block
-        yielded: set[str] = set()
-        async with aclosing(follow(node, partial(read_created, node, self._contracts.factory), cursor)) as blocks:
-            async for block in blocks:
-                for event in block.events:
-                    if isinstance(event, NewLighthouse) and event.lighthouse not in yielded:
-                        yielded.add(event.lighthouse)
-                        yield event
 
     async def create(self, *, minimal_stake: int, timeout_blocks: int, name: str) -> NewLighthouse:
         """Create a lighthouse. `minimal_stake` is in wn; `name` is one label of ENS, of a to z, 0 to 9 and -."""

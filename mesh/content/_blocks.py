@@ -148,21 +148,17 @@ class CheckedFile(io.RawIOBase):
             raise
 
     def close(self) -> None:
-        """Close the file."""
         if hasattr(self, "_file"):  # otherwise it could not be opened
             self._file.close()
         super().close()
 
     def readable(self) -> bool:
-        """Always."""
         return True
 
     def seekable(self) -> bool:
-        """Always."""
         return True
 
     def tell(self) -> int:
-        """The position in bytes."""
         return self._position
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:

@@ -348,8 +348,6 @@ _TIMING: Final = DownloadTiming()
 
 @dataclass(frozen=True, kw_only=True)
 class ExchangeStatistics:
-    """What an exchange has done so far."""
-
     served: int
     """Blocks sent to others."""
     missed: int

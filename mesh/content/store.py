@@ -852,7 +852,6 @@ class CopyingStream(io.RawIOBase):
         self._reserved = size
 
     def readable(self) -> bool:
-        """Always."""
         return True
 
     def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]

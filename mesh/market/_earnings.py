@@ -103,7 +103,6 @@ class EarningsLedger:
         self._enter(created.tx, entry)
 
     def finalized(self, settled: Settled) -> None:
-        """A contract was finalized."""
         entry = EarningsEntry(finalized=1, gas_used=settled.gas_used, spent=settled.wei, minted=settled.minted)
         self._enter(settled.tx, entry)
 
@@ -117,7 +116,6 @@ class EarningsLedger:
         self._rejected[reason if known else OTHER] += 1
 
     def matched(self) -> None:
-        """A demand and an offer matched."""
         self._matches += 1
 
     def creation_reverted(self, liability: str, tx: str) -> None:

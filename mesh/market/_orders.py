@@ -383,8 +383,6 @@ class _Undecided(NamedTuple):
 
 @dataclass(slots=True)
 class _Family:
-    """The versions of one order."""
-
     newest: _Newest | None = None
     sending: bytes = b""
     """The version with which a transaction is on its way."""
@@ -396,22 +394,22 @@ class _Family:
 
 
 class OrderVersions:
-    """The versions of the orders that a provider has seen; of the last `limit` of them.
+    """The versions of the orders that a provider has seen; of the last `REMEMBERED` of them.
 
     In generation 3 there is one of each. A reorganisation replaces up to `depth` blocks.
     """
 
-    def __init__(self, depth: int, *, limit: int = REMEMBERED) -> None:
+    def __init__(self, depth: int) -> None:
         self._depth = depth
-        self._keys: BoundedDict[bytes, _Key] = BoundedDict(limit)
+        self._keys: BoundedDict[bytes, _Key] = BoundedDict(REMEMBERED)
         """Of each version (identity) its lasting hash and signer."""
-        self._noted: BoundedDict[_Key, _Family] = BoundedDict(limit)
+        self._noted: BoundedDict[_Key, _Family] = BoundedDict(REMEMBERED)
         """Those of which only the newest version is known: a stranger can sign any number."""
-        self._kept: BoundedDict[_Key, _Family] = BoundedDict(limit)
+        self._kept: BoundedDict[_Key, _Family] = BoundedDict(REMEMBERED)
         """Those with a transaction."""
-        self._undecided: BoundedDict[_Key, _Family] = BoundedDict(limit)
+        self._undecided: BoundedDict[_Key, _Family] = BoundedDict(REMEMBERED)
         """Those of them that are undecided."""
-        self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(limit)
+        self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(REMEMBERED)
         """What each contract (address) is of."""
         self._ended: dict[bytes, int] = {}
         """The versions (identity) on disk with which no transaction is on its way, and the block at which it ended."""

@@ -50,7 +50,6 @@ from schemas.signing import Refusal, Rejection
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
 
-    from mesh.base.clock import Clock
     from mesh.base.flood import Drops
     from mesh.base.outage_log import OutageLog
     from mesh.chain import Account, Chain, ChainEvent
@@ -104,13 +103,11 @@ class SettlementParts:
 
     @property
     def account(self) -> Account:
-        """The provider's account."""
         assert self.chain.account is not None
         return self.chain.account
 
     @property
     def lighthouse(self) -> str:
-        """The lighthouse's address."""
         assert self.channel.address is not None
         return self.channel.address
 
@@ -378,22 +375,14 @@ QUIET: Final = frozenset({"AlreadyFinalized", VALIDATOR_FINALIZES})
 class Results:
     """Finalizes liabilities by results: the promisor's own, or so many jurors' as a liability's validator needs."""
 
-    def __init__(
-        self,
-        parts: SettlementParts,
-        events: LiabilityEvents,
-        rejections: RejectionPublisher,
-        *,
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
+    def __init__(self, parts: SettlementParts, events: LiabilityEvents, rejections: RejectionPublisher) -> None:
         self._parts = parts
         self._events = events
         self._rejections = rejections
-        self._clock = clock
         self._accepted: BoundedDict[tuple[str, str], tuple[bool, float]] = BoundedDict(SIGNERS_REMEMBERED)
         """By validator and signer: whether it was accepted, and until when that holds, on the monotonic clock."""
-        self._budget = RateLimiter(per_sender=PER_VALIDATOR, total=ALL_VALIDATORS, clock=clock)
-        self._waste = RateLimiter(per_sender=WASTED, clock=clock)
+        self._budget = RateLimiter(per_sender=PER_VALIDATOR, total=ALL_VALIDATORS)
+        self._waste = RateLimiter(per_sender=WASTED)
         self._shunned: BoundedDict[str, float] = BoundedDict(SIGNERS_REMEMBERED)
         """Validators that let too many finalizations fail, and until when, on the monotonic clock."""
 
@@ -505,12 +494,12 @@ class Results:
         except (RequestRefused, NoContracts) as error:
             log.debug("it is not known whether %s is a jury: %s", validator, error)
         if not self._waste.allow(validator):
-            self._shunned[validator] = self._clock.monotonic() + SHUNNED_SECONDS
+            self._shunned[validator] = SYSTEM_CLOCK.monotonic() + SHUNNED_SECONDS
             facts = log_event("validator-shunned", validator=validator, seconds=SHUNNED_SECONDS)
             log.warning("the validator %s lets finalizations fail on the chain", validator, extra=facts)
 
     def _is_shunned(self, validator: str) -> bool:
-        return self._clock.monotonic() < self._shunned.get(validator, 0.0)
+        return SYSTEM_CLOCK.monotonic() < self._shunned.get(validator, 0.0)
 
     def _hold(self, result: Verified[Result]) -> None:
         """Keep a result: the last one of its signer for a liability."""
@@ -537,11 +526,11 @@ class Results:
         """
         signer = result.signer
         accepted, until = self._accepted.get((validator, signer), (False, 0.0))
-        if self._clock.monotonic() >= until:
+        if SYSTEM_CLOCK.monotonic() >= until:
             accepted = False
             if not self._is_shunned(validator) and self._budget.allow(validator):
                 accepted = await self._parts.ask(partial(self._parts.chain.validators.accepts, validator, signer))
-                self._accepted[validator, signer] = accepted, self._clock.monotonic() + ACCEPTED_SECONDS
+                self._accepted[validator, signer] = accepted, SYSTEM_CLOCK.monotonic() + ACCEPTED_SECONDS
         if not accepted:
             self._parts.forget(result, after=ACCEPTED_SECONDS)
         return accepted

@@ -170,7 +170,6 @@ class OrderRecord:
         return Verified(self.message, self.identity[:32], self.signer)
 
     def move(self, state: OrderStage) -> None:
-        """Enter another state."""
         assert state in TRANSITIONS[self.state], f"an order that is {self.state} can't become {state}"
         self.state = state
 
@@ -195,7 +194,6 @@ class _Share:
         return self._signers.items(signer)
 
     def add(self, record: OrderRecord) -> None:
-        """Add an order."""
         record.share = self
         self._signers.append(record.signer, record)
         self._ages.append(None, record)
@@ -205,7 +203,6 @@ class _Share:
             self._heaviest = record.signer
 
     def remove(self, record: OrderRecord) -> None:
-        """Remove an order that was added."""
         self._signers.remove(record.signer, record)
         self._ages.remove(None, record)
         self._size -= 1

@@ -314,7 +314,6 @@ class Provider(Role):
 
     @property
     def book(self) -> OrderBook:
-        """The open orders."""
         return self.orders.book
 
     async def _restore(self, head: int) -> None:
@@ -338,11 +337,7 @@ class Provider(Role):
                 await self._permits.recall()
                 tasks.create_task(self._take_permits(), name="provider permits")
                 arrivals = Arrivals(
-                    self.settlement,
-                    self.queue,
-                    worth=self._chain.funds.worth,
-                    known=self.book.known,
-                    drops=self.drops,
+                    self.settlement, self.queue, worth=self._chain.funds.worth, known=self.book.known, drops=self.drops
                 )
                 tasks.create_task(arrivals.take_orders(self._demands), name="provider demands")
                 tasks.create_task(arrivals.take_orders(self._offers), name="provider offers")

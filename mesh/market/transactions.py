@@ -157,8 +157,6 @@ def may_pass(error: NodeUnreachable | RequestRefused | Reverted) -> bool:
 
 @dataclass(slots=True)
 class _SendAttempts:
-    """The attempts at one transaction."""
-
     since: int
     """The latest block when the transaction was queued."""
     backoff: Backoff

@@ -49,8 +49,6 @@ _FIELDS: Final = 12
 
 
 class BagOp(IntEnum):
-    """The kinds of records."""
-
     MESSAGE = 2
     BAG = 3
     INDEX = 4
@@ -300,8 +298,6 @@ def _add_message(found: list[RecordingBlock | BagRecord], record: BagRecord, lim
 
 @dataclass
 class BagReader(ChunkReader):
-    """Reads a bag block by block."""
-
     format = "bag"
 
     _connections_seen: dict[int, tuple[dict[bytes, bytes], bytes]] = field(default_factory=dict)
@@ -332,7 +328,6 @@ class BagReader(ChunkReader):
 
     @staticmethod
     def records_in(data: bytes) -> Iterator[BagRecord]:
-        """See `ChunkReader`."""
         position, end = 0, len(data)
         while position < end:
             header = position + _LENGTH.size

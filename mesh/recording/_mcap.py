@@ -326,8 +326,6 @@ def open_mcap(
 
 @dataclass
 class McapReader(ChunkReader):
-    """Reads an MCAP file record by record."""
-
     format = "mcap"
 
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
@@ -372,7 +370,6 @@ class McapReader(ChunkReader):
 
     @staticmethod
     def records_in(data: bytes) -> Iterator[McapRecordHeader]:
-        """See `ChunkReader`."""
         position, end = 0, len(data)
         while position < end:
             if end - position < _PREFIX.size:
@@ -386,7 +383,6 @@ class McapReader(ChunkReader):
 
     @staticmethod
     def message_of(record: McapRecordHeader, data: bytes) -> RecordedMessage | None:
-        """See `ChunkReader`."""
         opcode, offset, length = record
         if opcode != Opcode.MESSAGE:
             return None

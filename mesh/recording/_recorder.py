@@ -117,7 +117,6 @@ class PartialFile:
 
     @property
     def messages(self) -> int:
-        """How many messages it has."""
         return self._writer.messages
 
     def _begin(self, about: RecordingAbout) -> int:

@@ -138,7 +138,6 @@ class _Faults:
         return True
 
     def add(self, error: RecordingError) -> None:
-        """Add a fault."""
         self._found[error.why] += 1
 
     def compare(self, found: int, stated: int, what: str) -> None:

@@ -162,12 +162,7 @@ class Limits:
 
 
 GENEROUS: Final = Limits(
-    size=8 << 30,
-    expanded=32 << 30,
-    bz2=32 << 30,
-    definitions=64 << 20,
-    messages=50_000_000,
-    blocks=1_000_000,
+    size=8 << 30, expanded=32 << 30, bz2=32 << 30, definitions=64 << 20, messages=50_000_000, blocks=1_000_000
 )
 """For a file that a person asked for: more than a robot accepts from a stranger."""
 

@@ -54,8 +54,6 @@ class PlaybackClock(Protocol):
 
 
 class MonotonicClock:
-    """The monotonic clock of this machine."""
-
     def now_ns(self) -> int:
         """The time now."""
         return time.monotonic_ns()
@@ -99,12 +97,7 @@ _CLOCK: Final = MonotonicClock()
 
 
 async def play(
-    objective: Objective,
-    *,
-    speed: float = 1.0,
-    start_index: int = 0,
-    start_ns: int = 0,
-    clock: PlaybackClock = _CLOCK,
+    objective: Objective, *, speed: float = 1.0, start_index: int = 0, start_ns: int = 0, clock: PlaybackClock = _CLOCK
 ) -> AsyncGenerator[Step, None]:
     """Play an objective: each of its messages when it is due, at `speed` times the recorded pace.
 

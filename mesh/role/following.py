@@ -2,7 +2,7 @@
 
 A role says what events mean to it (`FollowsChain`), and `follow_chain` does the rest:
 
-    position          where to go on: the cursor and the history that the role has stored (`CursorStore`)
+    position          where to go on: the cursor and the history that the role has stored (`RoleLedger`)
     for each block    a reorganisation: `on_revert` for each event that it reverts, the newest first; `on_reorganised`
                       the records of new liabilities are read in one call
                       `on_event` for each event, in the order of the chain
@@ -44,6 +44,7 @@ from mesh.telemetry.metrics import gauge
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
 
+    from mesh.base.database import RoleLedger
     from mesh.base.outage_log import OutageLog
     from mesh.chain import BlockEvents, Chain, ChainEvent
     from mesh.chain.following import Selection
@@ -114,16 +115,6 @@ SAVE_SECONDS: Final = 5.0
 """How often a role saves how far it has read, where blocks are quick and nothing happens."""
 
 
-class CursorStore(Protocol):
-    """Where a role keeps how far it has handled the chain; `RoleLedger` is one."""
-
-    async def cursor(self) -> tuple[int | None, bytes]:
-        """The last block that was handled (None: none was), and the encoded history."""
-
-    async def set_cursor(self, block: int, *, history: bytes = b"") -> None:
-        """Save that all of `block` was handled, with the encoded history."""
-
-
 class FollowsChain(Protocol):
     """What events mean to a role. All may be called again for the same event."""
 
@@ -140,7 +131,7 @@ class FollowsChain(Protocol):
         """All of `block` was handled."""
 
 
-async def first_position(store: CursorStore, chain: Chain, *, lookback: int | None = None) -> int:
+async def first_position(store: RoleLedger, chain: Chain, *, lookback: int | None = None) -> int:
     """The last block that a role has handled. Later ones may concern what it did before.
 
     A new role begins at the head, or `lookback` blocks before, and remembers that block before it does anything: if it
@@ -163,7 +154,7 @@ async def follow_chain(
     head: ChainHead,
     outages: OutageLog,
     *,
-    store: CursorStore | None = None,
+    store: RoleLedger | None = None,
     read: Callable[[Sequence[str]], Awaitable[Sequence[Created]]] | None = None,
     **selection: Unpack[Selection],
 ) -> None:
@@ -198,7 +189,7 @@ async def follow_chain(
             await backoff.wait()
 
 
-async def _position(chain: Chain, head: ChainHead, kept: History, store: CursorStore | None) -> tuple[int, History]:
+async def _position(chain: Chain, head: ChainHead, kept: History, store: RoleLedger | None) -> tuple[int, History]:
     """The last block that was handled, and the history up to it."""
     if store is None:
         return head.head, kept
@@ -216,7 +207,7 @@ async def _take_block(
     read: Callable[[Sequence[str]], Awaitable[Sequence[Created]]],
     block: BlockEvents,
     history: History,
-    store: CursorStore | None,
+    store: RoleLedger | None,
 ) -> None:
     if isinstance(block, Reorganisation):
         facts = log_event("chain-reorganised", block=block.block_number, events=len(block.reverted_events))

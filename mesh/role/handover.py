@@ -68,9 +68,7 @@ def adopt_content(state: Path, address: str) -> None:
         return
     if is_in_use(before):
         raise ConfigurationError(
-            f"the robot still runs under its old key, {handovers[-1].agent}",
-            hint="stop it",
-            code="predecessor-running",
+            f"the robot still runs under its old key, {handovers[-1].agent}", hint="stop it", code="predecessor-running"
         )
     before.rename(content)
 

@@ -156,7 +156,6 @@ class RoleStatus(ABC, Generic[P]):
         self._started = time.monotonic()
 
     async def status(self, _request: Nothing) -> Status:
-        """The answer of the service `status`."""
         parts, usage = self.parts, await asyncio.to_thread(self.parts.store.usage)
         return Status(
             role=self.role,
@@ -175,7 +174,6 @@ class RoleStatus(ABC, Generic[P]):
         )
 
     def health(self) -> dict[str, str]:
-        """The state of each part."""
         return {
             "channel": self.parts.network.state,
             "listener": "waits for the node" if self.parts.outages.is_down else ALIVE,

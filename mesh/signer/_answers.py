@@ -11,7 +11,7 @@ import msgspec
 
 from mesh.recording import shown_value
 from mesh.signer import protocol
-from mesh.signer._log import time_text
+from mesh.signer._kept import time_text
 from mesh.signer.protocol import StrangersText
 from schemas.model import PRICE
 
@@ -188,13 +188,13 @@ def recorded(objective: Objective, cid: str, author: str, asked: protocol.ReadRe
     )
 
 
-def message_lines(messages: Iterable[tuple[str, Any]], author: str, most: int = 20) -> tuple[list[StrangersText], int]:
+def message_lines(messages: Iterable[tuple[str, Any]], author: str) -> tuple[list[StrangersText], int]:
     """The first messages of an order, a line each for people, and how many more there are."""
     lines: list[StrangersText] = []
     count = 0
     for topic, value in messages:
         count += 1
-        if len(lines) < most:
+        if len(lines) < 20:
             text = "…" if isinstance(value, bytes) else msgspec.json.encode(value).decode()
             lines.append(strangers(f"{topic} {text}", author))
     return lines, count - len(lines)

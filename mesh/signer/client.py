@@ -69,7 +69,6 @@ class SignerClient:
             self._session = None
 
     async def find_robots(self, *, model: str = "", text: str = "", limit: int = 20) -> protocol.FoundRobots:
-        """See `FindRobots`."""
         return await self._call(protocol.FoundRobots, "find_robots", model=model, text=text, limit=limit)
 
     async def describe_model(self, model: str) -> protocol.DescribedModel:
@@ -110,7 +109,6 @@ class SignerClient:
         )
 
     async def job(self, job_id: str, *, revision: int = -1, wait_seconds: float = 0.0) -> protocol.Job:
-        """See `ReadJob`."""
         return await self._call(protocol.Job, "job", job_id=job_id, revision=revision, wait_seconds=wait_seconds)
 
     async def jobs(self, *, limit: int = 20) -> tuple[protocol.Job, ...]:
@@ -118,27 +116,21 @@ class SignerClient:
         return (await self._call(protocol.Jobs, "jobs", limit=limit)).jobs
 
     async def stop_job(self, job_id: str, *, why: str = "") -> protocol.Job:
-        """See `StopJob`."""
         return await self._call(protocol.Job, "stop_job", job_id=job_id, why=why)
 
     async def withdraw(self, job_id: str) -> protocol.Job:
-        """See `WithdrawJob`."""
         return await self._call(protocol.Job, "withdraw", job_id=job_id)
 
     async def recording(self, job_id: str, *, topic: str = "", first: int = 0, limit: int = 50) -> protocol.Recording:
-        """See `ReadRecording`."""
         return await self._call(protocol.Recording, "recording", job_id=job_id, topic=topic, first=first, limit=limit)
 
     async def verify(self, job_id: str) -> protocol.Verification:
-        """See `VerifyJob`."""
         return await self._call(protocol.Verification, "verify", job_id=job_id)
 
     async def balance(self) -> protocol.AccountFunds:
-        """See `Balance`."""
         return await self._call(protocol.AccountFunds, "balance")
 
     async def statement(self, *, first: str = "", last: str = "", limit: int = 100) -> protocol.AccountStatement:
-        """See `ReadStatement`."""
         return await self._call(protocol.AccountStatement, "statement", first=first, last=last, limit=limit)
 
     async def consents(self) -> tuple[protocol.Consent, ...]:
@@ -154,19 +146,15 @@ class SignerClient:
         return await self._call(protocol.Job, "deny", id=consent)
 
     async def log(self, *, first: int | None = None, limit: int = 100) -> protocol.LogEntries:
-        """See `ReadLog`."""
         return await self._call(protocol.LogEntries, "log", first=first, limit=limit)
 
     async def verify_log(self) -> protocol.LogVerified:
-        """See `LogVerified`."""
         return await self._call(protocol.LogVerified, "verify_log")
 
     async def policy(self) -> protocol.PolicyInUse:
-        """See `PolicyInUse`."""
         return await self._call(protocol.PolicyInUse, "policy")
 
     async def use_policy(self) -> protocol.PolicyInUse:
-        """See `UsePolicy`."""
         return await self._call(protocol.PolicyInUse, "use_policy")
 
     async def ask(self, operation: str, fields: Mapping[str, Any]) -> protocol.SignerAnswer:

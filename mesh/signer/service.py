@@ -72,8 +72,7 @@ from mesh.signer._answers import (
     strangers,
     value_text,
 )
-from mesh.signer._budget import Budget, BudgetHold, ConsentRecord, KeptJob
-from mesh.signer._log import SignerLog, log_files, time_text, verify_log
+from mesh.signer._kept import Budget, BudgetHold, ConsentRecord, KeptJob, SignerLog, log_files, time_text, verify_log
 from mesh.signer.policy import Decision, parse_policy, read_policy_file
 from mesh.signer.protocol import DOOR, OWNER, Job, SignerError, SignerFailure
 from mesh.validator.verification import Claim, JobFiles, check_end, verify
@@ -176,12 +175,10 @@ class Signer(Lifecycle):
 
     @property
     def door(self) -> Path:
-        """The socket for programs."""
         return self.folder / protocol.DOOR_SOCKET
 
     @property
     def owner(self) -> Path:
-        """The socket for the person."""
         return self.folder / protocol.OWNER_SOCKET
 
     async def _open(self, stack: AsyncExitStack) -> None:
@@ -998,11 +995,7 @@ class Signer(Lifecycle):
                 verify_log, folder, self.agent.address, head, latest=lambda: self.budget.log_head().last
             )
         return protocol.LogVerified(
-            holds=not fault,
-            entries=head.last - head.first + 1,
-            head=head.hash,
-            signer=self.agent.address,
-            fault=fault,
+            holds=not fault, entries=head.last - head.first + 1, head=head.hash, signer=self.agent.address, fault=fault
         )
 
     async def _do_policy(self, asked: protocol.ReadPolicy) -> protocol.PolicyInUse:

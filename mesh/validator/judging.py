@@ -185,13 +185,7 @@ class _Trial(RecordingObserver):
         """Whether it is a bag of the legacy software, in which most findings of `verify` stay undecided."""
 
     def run(
-        self,
-        claim: Claim,
-        files: JobFiles,
-        *,
-        bags: bool,
-        limits: Limits = GENEROUS,
-        progress: Progress | None = None,
+        self, claim: Claim, files: JobFiles, *, bags: bool, limits: Limits = GENEROUS, progress: Progress | None = None
     ) -> tuple[list[Finding], list[tuple[str, Finding]]]:
         """What `verify` and then the policies find in the files.
 
@@ -229,7 +223,6 @@ class _Trial(RecordingObserver):
         self._evidence.open_objective(objective)
 
     def marks(self, cid: str) -> tuple[str, ...]:
-        """What identifies the recording."""
         return (cid, self._hash.hexdigest()) if len(self._intervals) == _DISTINCT else (cid,)
 
 

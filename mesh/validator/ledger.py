@@ -149,7 +149,6 @@ class VerdictLedger(RoleLedger):
 
 
 def signed_result(stored: StoredVerdict) -> Result:
-    """The juror's own Result."""
     result = decode(stored.signed)
     assert isinstance(result, Result)
     return result

@@ -430,12 +430,7 @@ class Cases:
     """The open cases of a validator. `resend` is how often verdicts are sent again; `judge` decides them."""
 
     def __init__(
-        self,
-        parts: ValidatorComponents,
-        judge: CaseJudge,
-        tasks: Background,
-        *,
-        resend: RetryPolicy = RESEND,
+        self, parts: ValidatorComponents, judge: CaseJudge, tasks: Background, *, resend: RetryPolicy = RESEND
     ) -> None:
         self._parts = parts
         self._judge = judge
@@ -708,14 +703,12 @@ class ValidatorRuntime(Lifecycle):
         self.cases = Cases(parts, self.judge, await stack.enter_async_context(Background()), resend=self._resend)
 
     def tasks(self) -> Iterator[tuple[str, Coroutine[Any, Any, object]]]:
-        """What it does until it is cancelled."""
         yield "validator judge", self.judge.run()
         yield "validator listener", self._follow_chain()
         yield "validator results", self._take_results()
         yield "validator after network loss", self._send_on_return()
 
     async def measure(self) -> tuple[MetricFamily, ...]:
-        """The metrics of its work."""
         return await self.status.measure([self.results])
 
     async def _follow_chain(self) -> None:

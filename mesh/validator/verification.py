@@ -295,7 +295,6 @@ class ClockCheck:
         return Finding("period", True, made)
 
     def _enter(self) -> None:
-        """Enter the next part."""
         self._counted += max(0, self._last - self._begun())
         self.part += 1
         self._fault = self._fault or self._begin_fault(self.part)

@@ -1,9 +1,8 @@
-"""Staking on lighthouses, listing and watching them."""
+"""Staking on lighthouses, and listing them."""
 
 from __future__ import annotations
 
 import asyncio
-from contextlib import aclosing
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,25 +12,20 @@ from mesh.chain import (
     XRT,
     Account,
     Approval,
-    Chain,
     InsufficientTokens,
     NewLighthouse,
     NoContracts,
-    NodeUnreachable,
     TransactionTimeout,
     Transfer,
-    deploy,
     new_private_key,
 )
 from mesh.chain.answers import InvalidAnswer
-from mesh.dev import EmbeddedChain
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
-from tests.mesh.chain.conftest import QUICK, Flaky, events_of, no_contracts, prepare, read_to
+from tests.mesh.chain.conftest import QUICK, events_of, no_contracts, prepare, read_to
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator
     from pathlib import Path
 
     from tests.mesh.chain.conftest import DeployedMarket
@@ -182,57 +176,6 @@ async def test_only_contracts_of_the_factory_are_lighthouses(market: DeployedMar
         assert await chain.lighthouses.exists("airalab.lighthouse.3.robonomics.eth")
         assert not await chain.lighthouses.exists(market.deployment.xrt)
         assert not await chain.lighthouses.exists(ZERO_ADDRESS)
-
-
-async def _first(watching: AsyncGenerator[NewLighthouse, None], count: int) -> list[str]:
-    names = []
-    async with asyncio.timeout(30), aclosing(watching):
-        async for made in watching:
-            names.append(made.name)
-            if len(names) == count:
-                break
-    return names
-
-
-async def test_new_lighthouses_are_yielded_when_they_are_created(market: DeployedMarket) -> None:
-    async with market.chain() as chain:
-        watching = asyncio.create_task(_first(chain.lighthouses.watch(await chain.block_number() + 1), 2))
-        await _beacon(market, "fifth")
-        await _beacon(market, "sixth")
-        assert await watching == ["fifth", "sixth"]
-
-
-async def test_earlier_lighthouses_are_yielded_on_request_and_listed(market: DeployedMarket) -> None:
-    async with market.chain() as chain:
-        listed = [made.name for made in await chain.lighthouses.list()]
-        assert listed[0] == "airalab"
-        assert await _first(chain.lighthouses.watch(0), len(listed)) == listed
-
-
-async def test_watching_survives_an_outage_and_a_reorganisation() -> None:
-    async with EmbeddedChain() as node:
-        deployer = Account(node.funded_keys[0])
-        await deploy(node.provider, deployer)
-        flaky = Flaky(node)
-        async with (
-            Chain(flaky, timing=QUICK) as reader,
-            Chain(node.provider, account=deployer, timing=QUICK) as chain,
-            asyncio.timeout(30),
-            aclosing(reader.lighthouses.watch(await chain.block_number() + 1)) as watching,
-        ):
-            heard = asyncio.ensure_future(anext(watching))
-            await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="one")
-            assert (await heard).name == "one"
-            heard = asyncio.ensure_future(anext(watching))
-            flaky.is_lost = True
-            with pytest.raises(NodeUnreachable):
-                await reader.block_number()
-            # The block with the first is replaced by another with the first and the second.
-            await node.request("evm_revert", [hex(await chain.block_number() - 1)])
-            await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="one")
-            await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="two")
-            flaky.is_lost = False
-            assert (await heard).name == "two"
 
 
 async def test_creating_a_lighthouse_returns_its_event(market: DeployedMarket) -> None:

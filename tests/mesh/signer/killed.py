@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 from mesh.agent.ledger import Outbox
 from mesh.chain import Account, Chain
 from mesh.settings import load
-from mesh.signer._budget import Budget
+from mesh.signer._kept import Budget
 from mesh.signer.service import Signer
 from mesh.testing._market import RESEND, TIMING
 

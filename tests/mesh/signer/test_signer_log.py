@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.errors import AiraError
-from mesh.signer._budget import Budget
-from mesh.signer._log import SignerLog, log_files, verify_log
+from mesh.signer._kept import Budget, SignerLog, log_files, verify_log
 from schemas import Signer, keccak256
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ def lines_of(folder: Path) -> list[bytes]:
 def signed_by_another(lines: list[bytes]) -> list[bytes]:
     import msgspec
 
-    from mesh.signer._log import SignedEntry
+    from mesh.signer._kept import SignedEntry
     from schemas.decoding import decode_json
 
     entry = msgspec.structs.replace(decode_json(lines[2], SignedEntry), facts={"cost": 0}, signature="")
