@@ -39,7 +39,7 @@ from tests.mesh.validator.verdicts import judge_honest, judge_tampered
 from tests.support.routers import EmbeddedRouter
 
 if TYPE_CHECKING:
-    from mesh.validator.policies import Policy
+    from mesh.validator.judging import Policy
 
 ROUNDS: Final = 5
 SECONDS: Final = 3.0

@@ -51,7 +51,7 @@ from mesh.recording import (
 from mesh.recording.ros import RosTypes as RosTypes, UnknownRosType as UnknownRosType
 from mesh.role.running import fail as fail, run_to_end as run_to_end, run_until_stopped as run_until_stopped
 from mesh.settings import Settings as Settings
-from mesh.validator.policies import Evidence as Evidence
+from mesh.validator.judging import Evidence as Evidence
 from mesh.validator.validator import Validator as Validator
 from mesh.validator.verification import Finding as Finding
 from mesh.watching.robots import Robot as Robot

@@ -22,7 +22,7 @@ PLAIN: Final = {
     "\u2013": "-",
     "\u2019": "'",
 }
-"""Characters of our own texts, and usual ones of others, in ASCII. Their names (`\\N{…}`) would load Unicode's tables."""
+"""Characters of our own texts, and usual ones of others, in ASCII. `\\N{…}` would load Unicode's tables."""
 ASCII: Final = "aira_ascii"
 """The encoding ASCII under another name: click writes UTF-8 to a terminal whose encoding has the name ASCII."""
 

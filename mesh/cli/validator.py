@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from mesh.network import Network
     from mesh.settings import Settings
-    from mesh.validator.policies import Policy
+    from mesh.validator.judging import Policy
     from schemas.verdicts import ValidatorReport
 
 
@@ -233,7 +233,7 @@ def _about(path: Path, *, required: bool) -> Mapping[str, str]:
 
 def _policies(settings: Settings, named: tuple[str, ...], program: Path | None) -> tuple[Policy, ...]:
     """The policies to apply, each once. Raises `ConfigurationError`, `InputError`."""
-    from mesh.validator.policies import COMPLETE, policy_of
+    from mesh.validator.judging import COMPLETE, policy_of
     from mesh.validator.validator import Validator
 
     own: tuple[Policy, ...] = ()

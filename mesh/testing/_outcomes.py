@@ -12,7 +12,7 @@ import msgspec
 from mesh.agent.contracts import Outcome
 from mesh.agent.handlers import Declined
 from mesh.agent.hiring import DemandDeclined
-from mesh.validator.policies import COMPLETE, Evidence
+from mesh.validator.judging import COMPLETE, Evidence
 from schemas import Liability
 
 if TYPE_CHECKING:

@@ -53,9 +53,8 @@ from mesh.role.models import Models
 from mesh.role.program import RESEND, RoleStatus
 from mesh.telemetry.logs import LogService
 from mesh.telemetry.metrics import by_label, counter
-from mesh.validator.judging import Case, Judgement, judge
+from mesh.validator.judging import COMPLETE, Case, Judgement, judge
 from mesh.validator.ledger import VERDICTS, VerdictLedger, signed_result
-from mesh.validator.policies import COMPLETE
 from schemas import ReportKey, Result, decode, parse_address
 from schemas.keys import LIABILITY, ValidatorKey, market_selector
 from schemas.model import InvalidDescription
@@ -72,8 +71,8 @@ if TYPE_CHECKING:
     from mesh.role.following import Created
     from mesh.settings import Settings
     from mesh.telemetry.metrics import MetricFamily
+    from mesh.validator.judging import Policy
     from mesh.validator.ledger import StoredVerdict
-    from mesh.validator.policies import Policy
     from schemas import Liability, Verified
     from schemas.model import ModelDescription
 

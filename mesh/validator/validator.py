@@ -12,7 +12,7 @@ from mesh.base.log_context import log_event
 from mesh.errors import ClosedError
 from mesh.role.program import RESEND, OpenRole, Program
 from mesh.settings import load
-from mesh.validator.policies import COMPLETE, Policy, invalid_policy, own_policy, policy_of
+from mesh.validator.judging import COMPLETE, Policy, invalid_policy, own_policy, policy_of
 from schemas.verdicts import LONGEST_TEXT, MOST_POLICIES
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mesh.base.retry import RetryPolicy
     from mesh.chain import Account, Chain
     from mesh.settings import Settings
-    from mesh.validator.policies import CheckFunction
+    from mesh.validator.judging import CheckFunction
     from mesh.validator.runtime import ValidatorRuntime
 
     F = TypeVar("F", bound=CheckFunction)

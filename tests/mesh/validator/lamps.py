@@ -17,8 +17,7 @@ from mesh.agent.jobs import JobRecordings, JobRun
 from mesh.agent.ledger import Ledger
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.recording import AT_ONCE, Recorders, open_objective
-from mesh.validator.judging import Case, Judgement, judge
-from mesh.validator.policies import own_policy, policy_of
+from mesh.validator.judging import Case, Judgement, judge, own_policy, policy_of
 from schemas import (
     Liability,
     Result,
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import Job
     from mesh.base.clock import Clock
     from mesh.recording import Played
-    from mesh.validator.policies import Evidence, Policy
+    from mesh.validator.judging import Evidence, Policy
 
     Handler = Callable[[Job, Played], Awaitable[object]]
 

@@ -11,8 +11,7 @@ import pytest
 
 from mesh import ConfigurationError
 from mesh.recording import open_objective
-from mesh.validator.judging import judge
-from mesh.validator.policies import MOST_OVERDUE, POLICIES, Evidence, Policy, own_policy, policy_of
+from mesh.validator.judging import MOST_OVERDUE, POLICIES, Evidence, Policy, judge, own_policy, policy_of
 from mesh.validator.verification import Finding
 from schemas.verdicts import MOST_FINDINGS
 from tests.mesh.validator.jobs import OTHER, THIEF, WORDS, make_job
@@ -164,7 +163,7 @@ def test_a_function_of_a_user_is_a_policy(trial: Trial, function: Any, expected:
 def test_messages_beyond_the_memory_for_own_policies_are_read_again(
     trial: Trial, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mesh.validator.policies.MOST_KEPT", 1000)
+    monkeypatch.setattr("mesh.validator.judging.MOST_KEPT", 1000)
     assert trial.judge(own(says_all)).success
 
 

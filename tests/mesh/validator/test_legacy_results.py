@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from mesh.validator.judging import Case, Judgement, examine, judge
-from mesh.validator.policies import policy_of
+from mesh.validator.judging import Case, Judgement, examine, judge, policy_of
 from mesh.validator.verification import Claim, JobFiles
 from schemas import cid_of_file, parse_address
 from tests.mesh.validator.jobs import ROBOT, SampleJob
@@ -18,7 +17,7 @@ from tests.mesh.validator.trials import ALWAYS, failed, liability_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.validator.policies import Policy
+    from mesh.validator.judging import Policy
 
 ANSWERED = [*below(DUE), *below([("/blinked", "red")])]
 

@@ -10,7 +10,7 @@ import pytest
 from mesh import ConfigurationError
 from mesh.recording import Played
 from mesh.settings import Settings
-from mesh.validator.policies import POLICIES, Evidence, JudgedMessage, policy_of
+from mesh.validator.judging import POLICIES, Evidence, JudgedMessage, policy_of
 from mesh.validator.validator import Validator
 from schemas.model import ModelDescription, ModelTopic, ValueSchema
 from schemas.payloads import PayloadType, encode_value
@@ -18,7 +18,7 @@ from tests.mesh.agent.samples import liability
 from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
-    from mesh.validator.policies import Policy
+    from mesh.validator.judging import Policy
 
 COMMAND, ANSWER, OTHER = ("/do", "objective"), ("/done", "device"), ("/else", "device")
 PAIRED = policy_of("acknowledged:command=/do:answer=/done")

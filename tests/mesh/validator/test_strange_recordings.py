@@ -12,8 +12,7 @@ import pytest
 
 from mesh.recording import Unrecordable
 from mesh.recording._mcap import McapWriter
-from mesh.validator.judging import Case, examine, judge
-from mesh.validator.policies import POLICIES, own_policy, policy_of
+from mesh.validator.judging import POLICIES, Case, examine, judge, own_policy, policy_of
 from mesh.validator.verification import JobFiles
 from schemas import cid_of_file
 from schemas.payloads import PayloadType
@@ -24,7 +23,7 @@ from tests.support.bags import Bag, BagMessage
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.validator.policies import Evidence
+    from mesh.validator.judging import Evidence
 
 RECORDINGS: Final = 60
 TIMES: Final = (0, 1, 10**9, (1 << 32) - 1, 1 << 32, 10**18, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from mesh.validator.policies import POLICIES
+from mesh.validator.judging import POLICIES
 from tests.mesh.validator.jobs import make_job
 from tests.mesh.validator.tables import PAGE, honest_table, in_page, tampered_table
 from tests.mesh.validator.trials import Trial

@@ -18,7 +18,7 @@ from tests.support.raising import raises_with
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from mesh.validator.policies import Evidence
+    from mesh.validator.judging import Evidence
     from tests.support.market import Place
 
 

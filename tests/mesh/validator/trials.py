@@ -12,7 +12,7 @@ from tests.mesh.validator.jobs import OTHER, SampleJob
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mesh.validator.policies import Policy
+    from mesh.validator.judging import Policy
 
 ALWAYS = (0, 1 << 63)
 
