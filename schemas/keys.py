@@ -422,7 +422,7 @@ KINDS: Final[Mapping[MarketKind, Kind]] = MappingProxyType(
         "report": Kind(ReportKey, ("validator",)),
     }
 )
-"""Every kind of message on a market. Of the first seven, `schemas.messages` has the classes and what is checked."""
+"""Every kind of message on a market. `schemas.messages` has the classes of those that markets check."""
 
 
 def market_key(lighthouse: str, kind: MarketKind, model: str) -> str:

@@ -9,9 +9,9 @@ Reading JSON is strict: unknown, repeated and missing fields, fractions where in
 quite addresses, names or hashes are rejected with a reason. Writing is canonical: compact, no `0x` on nonces and
 signatures. Hashes and contract bytes are Solidity's `abi.encodePacked` and `abi.encode`, written out field by field.
 
-To add a kind of message: its class here, in `MESSAGE_TYPES`, and what its hash covers, in `_PACKERS`; its key and its
-row of `KINDS` in `schemas.keys`, which say who may publish it and whether the bridge to IPFS relays it. Then a channel
-can publish it and subscribe to it.
+To add a kind of message: its class here, in `SignedMessage` and `MESSAGE_TYPES`, and what its hash covers, in
+`_PACKERS`; its key and its row of `KINDS` in `schemas.keys`, which say who may publish it and whether the bridge to
+IPFS relays it. Then a channel can publish it and subscribe to it.
 
 Amounts are integers of at most 256 bits: `cost` in the token's smallest unit, fees in wn (10^-9 XRT), `deadline` is a
 block number (the order is valid while `block.number < deadline`). Source: the wire format of the legacy network.

@@ -293,14 +293,24 @@ class EventSources:
             version=contracts.version,
         )
 
+    @property
+    def named(self) -> list[tuple[str, str]]:
+        """The contracts but for the liabilities: their addresses, and their names in `EVENTS`."""
+        return [(self.factory, "Factory"), *([(self.token, "XRT")] if self.token else [])]
+
     def logs_in(self, header: BlockHeader | None) -> bool:
         """Whether a block may hold a log of the named contracts; with None, it is not known."""
-        wanted = [(address_bytes(self.factory), topic) for topic in _topics("Factory")]
-        of_token = [(address_bytes(self.token), topic) for topic in _topics("XRT")] if self.token else []
-        if self.parties is None:
-            return header is None or header.may_log(*wanted, *of_token)
-        parties = [bytes(12) + address_bytes(party) for party in self.parties]
-        return header is None or header.may_log(*wanted, *((*one, party) for one in of_token for party in parties))
+        if header is None:
+            return True
+        wanted: list[tuple[bytes, ...]] = []
+        for address, contract in self.named:
+            of_contract = [(address_bytes(address), topic) for topic in _topics(contract)]
+            if contract == "XRT" and self.parties is not None:
+                parties = [bytes(12) + address_bytes(party) for party in self.parties]
+                wanted += ((*one, party) for one in of_contract for party in parties)
+            else:
+                wanted += of_contract
+        return header.may_log(*wanted)
 
     async def chosen(self, decoded: Sequence[DecodedLog]) -> list[DecodedLog]:
         """The same logs, with None for each event that is not one of those that are read."""
@@ -394,8 +404,8 @@ async def read_events(
     """
     logs: list[Log] = []
     if sources.logs_in(header):
-        contracts = [one for one in (sources.factory, sources.token) if one]
-        logs = await _logs(node, first, last, header, contracts, topics_of("Factory", "XRT"))
+        addresses, contracts = zip(*sources.named, strict=True)
+        logs = await _logs(node, first, last, header, addresses, topics_of(*contracts))
     decoded = [(log, decode_log(log)) for log in logs]
     for log, event in decoded:
         if isinstance(event, NewLiability) and log.address == sources.factory:
@@ -415,7 +425,8 @@ async def glance(node: Node, sources: EventSources, first: int, last: int) -> li
 
     Each range is asked for once, so a machine of the node that is behind may leave some out.
     """
-    asked = [node.logs(first, last, addresses=(), topics=topics_of("Factory", "Liability"))]
+    contracts = ["Liability", *(contract for _, contract in sources.named if contract != "XRT")]
+    asked = [node.logs(first, last, addresses=(), topics=topics_of(*contracts))]
     for party in (sources.parties or ()) if sources.token else ():
         for place in (1, 2):
             token = node.logs(first, last, addresses=[sources.token], topics=topics_of("XRT"), about=party, place=place)
