@@ -31,6 +31,7 @@ from mesh.agent.handlers import Declined
 from mesh.agent.hiring import DemandDeclined, Hiring
 from mesh.agent.orders import (
     ALONE,
+    DEMAND_TAKEN,
     EQUAL_DECLINED,
     HANDLED_FOR,
     AnsweredDemand,
@@ -349,11 +350,11 @@ class Trader(Lifecycle):
         no place for one more job.
         """
         order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time(), robot=robot, is_ours=True)
+        if isinstance(order.signed, Demand) and robot:
+            await self._agree(order)
         if attempts is not None:
             attempts.ordered(order.identity, order.deadline)
             order.attempts, order.created = attempts, asyncio.get_running_loop().create_future()
-        if isinstance(order.signed, Demand) and robot:
-            await self.hiring.agree(order.signed, robot)
         if on_signed is not None:
             await on_signed(order.signed)
         if kind is Offer and (asked := ALONE.get()) is not None:
@@ -393,6 +394,23 @@ class Trader(Lifecycle):
             self._forget(order)
             raise
         return self._shown(order)
+
+    async def _agree(self, order: TradedOrder) -> None:
+        """Get the robot's offer for a demand; one of generation 5 is signed again if its nonce was used meanwhile.
+
+        Another program of the account has used it then, and the robot says that the demand is taken.
+        """
+        while True:
+            assert isinstance(order.signed, Demand)
+            try:
+                return await self.hiring.agree(order.signed, order.robot)
+            except DemandDeclined as error:
+                if error.declines[0].code != DEMAND_TAKEN or order.nonce is None:
+                    raise
+                ask = partial(self._chain.liabilities.next_nonce, self._address)
+                if await self._chain.retrying(ask, outages=self._parts.outages) <= order.nonce:
+                    raise
+                order.signed = await self.writer.sign_again(order.signed)
 
     async def require_open(self, answered: AnsweredDemand) -> None:
         """Raise the error of a demand that is taken if one has become a contract, or was withdrawn on the chain.

@@ -93,7 +93,7 @@ async def refuse_what_is_not_trusted(url: str) -> None:
     """Plain HTTP gets no answer, and a client that does not know the site's authority asks nothing."""
     headers = {"Authorization": f"Bearer {TOKEN}"}
     async with httpx.AsyncClient(headers=headers, timeout=20) as http:
-        with pytest.raises(httpx.RemoteProtocolError, match="disconnected without sending a response"):
+        with pytest.raises((httpx.RemoteProtocolError, httpx.ReadError)):  # closed, with or without a reset
             await http.post(url.replace("https://", "http://"), json={})
     async with httpx2.AsyncClient(headers=headers, timeout=20) as http2:
         with pytest.raises(httpx2.ConnectError, match="CERTIFICATE_VERIFY_FAILED"):

@@ -210,6 +210,30 @@ async def test_a_person_is_told_when_a_provider_gave_the_job_to_another_robot(pl
         assert (await person.contract(made.liability)).robot == rival.address
 
 
+async def test_an_order_whose_nonce_another_program_uses_meanwhile_is_signed_again(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two programs of an account that order at once, in generation 5, take the same nonce."""
+    robot, person = place.agent("robot"), place.agent("person", generation=5)
+    async with place.provider(), working(robot), person, asyncio.timeout(60):
+        trader = person.runtime.trader
+        asked: list[int] = []
+        agree = trader.hiring.agree
+
+        async def overtaken(demand: Demand, address: str) -> None:
+            if not asked:
+                other = await trader.writer.sign_again(demand)
+                assert other.nonce == demand.nonce
+                await person.parts.chain.liabilities.withdraw(other)  # uses the nonce up
+            asked.append(int(demand.nonce))
+            await agree(demand, address)
+
+        monkeypatch.setattr(trader.hiring, "agree", overtaken)
+        contract = await person.demand(job(place), cost=4, robot=robot.address)
+        assert asked == [asked[0], asked[0] + 1]
+        assert (await contract.outcome()).success
+
+
 async def test_a_job_that_its_robot_has_already_is_not_declined(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """A person who reads the chain later than the robot sends the order again, also when the robot is full."""
     released, robot = asyncio.Event(), place.agent("robot", queue_limit=1)

@@ -125,8 +125,8 @@ async def test_a_flood_of_strangers_withdrawals_makes_no_other_forgotten(local: 
         local.publish(local.withdrawal(demand))
         assert (await local.rejection_of(demand)).reason == "withdrawn"
 
-        for _ in range(8):
-            local.publish(local.withdrawal(local.demand("rival", deadline=demand.deadline - 1), "rival"))
+        for later in range(8):  # none is before those that are known, and so none takes their place
+            local.publish(local.withdrawal(local.demand("rival", deadline=demand.deadline - 8 + later), "rival"))
         await until(lambda: len(provider.withdrawals) == 4)
         await until(lambda: provider.drops.totals().get("withdrawals", 0) > 0)
         assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
