@@ -19,7 +19,6 @@ from mesh.base.background import Background
 from mesh.base.extras import needs_extra
 from mesh.cli.options import ADDRESS, FILE, with_settings
 from mesh.cli.output import announce
-from mesh.role.program import WatcherStatus
 from mesh.role.running import open_when_ready, run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings
 from mesh.telemetry.serving import Telemetry
@@ -181,6 +180,8 @@ async def _job(address: str, settings: Settings, telemetry: Telemetry, front: Fo
 def _show_health(
     stack: AsyncExitStack, telemetry: Telemetry, network: Network, channel: Channel, front: FoxgloveFront
 ) -> None:
+    from mesh.role.program import WatcherStatus
+
     status = WatcherStatus(network, channel, front.drops)
     stack.enter_context(telemetry.showing(measure=lambda: status.measure(()), health=status.health))
 

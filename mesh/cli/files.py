@@ -19,10 +19,7 @@ import click
 from mesh.base.background import Background
 from mesh.cli.chain_client import own_address
 from mesh.cli.output import printable, progress, short_address
-from mesh.content import Exchange, Store
-from mesh.content.store import make_store
 from mesh.errors import AiraError, ConfigurationError, InputError
-from mesh.recording import pack_described
 from mesh.settings import NetworkSettings
 from schemas import InvalidCid, cid_of_file, parse_cid
 from schemas.address import is_ens_name
@@ -33,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
     from mesh.agent.agent import Agent, Messages
+    from mesh.content import Store
     from mesh.network import Network
     from mesh.settings import Settings
     from schemas.model import ModelDescription
@@ -139,6 +137,8 @@ async def objective_of(agent: Agent, given: Path | str | Messages) -> str:
     description = await agent.runtime.models.find(await agent.parts.chain.names.model(agent.model))
     with TemporaryDirectory(prefix="aira-messages-") as folder:
         path = Path(folder) / "objective.mcap"
+        from mesh.recording import pack_described
+
         await asyncio.to_thread(pack_described, given, path, description)
         return await agent.add(path)
 
@@ -194,6 +194,8 @@ def account_store(settings: Settings) -> Store:
 
     This and the store's methods block on the disk; use threads. Raises `ConfigurationError`.
     """
+    from mesh.content.store import make_store
+
     address = own_address(settings)
     folder = settings.state_directory / address if address else settings.state_directory
     return make_store(settings, folder / "content", limit=LARGEST_FILE)
@@ -215,6 +217,7 @@ async def fetch(settings: Settings, store: Store, cid: str, *, size_limit: int |
     If that takes more than a moment, says on stderr what it waits for, which peers it asks, and when it gives up.
     `size_limit` is in bytes. Raises `InvalidCid`, `NetworkUnavailable`, `ContentUnavailable` and other `ContentError`s.
     """
+    from mesh.content import Exchange
     from mesh.network import Endpoints, Network
 
     parse_cid(cid)
