@@ -207,7 +207,7 @@ MUTATIONS: Final = (
         "await chain.retrying(partial(self._ensure, order), outages=self._parts.outages)",
         "pass",
         "reorganise_after,forget",
-        seeds=60,
+        seeds=400,
     ),
     Mutation(
         "each transaction is sent twice",
@@ -255,7 +255,7 @@ MUTATIONS: Final = (
         "self._epoch + self._clock.monotonic_ns()",
         "self._clock.time_ns()",
         "clock_every",
-        seeds=40,
+        seeds=150,
     ),
     Mutation(
         "the listener's cursor runs ahead of what it has handled",
@@ -279,6 +279,7 @@ MUTATIONS: Final = (
         "self.set_aside(order, reason, detail)",
         "continue",
         "late,revoke",
+        seeds=400,
     ),
     Mutation(
         "a job that was stopped is a success",
@@ -342,6 +343,7 @@ MUTATIONS: Final = (
         "task.add_done_callback(lambda _task: self._under_way.discard(order))",
         "pass",
         "pair,drop",
+        seeds=60,
     ),
 )
 
