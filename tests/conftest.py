@@ -55,12 +55,10 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Everything in CI; by default one EVM and one router, no `full` tests, and one value of `sample` parameters."""
-    if IN_CI:
-        return
+    """Take one value of `in_turn` parameters, and outside CI one EVM, one router, no `full` tests, a value of `sample`."""
     groups: dict[tuple[object, ...], list[pytest.Item]] = {}
     for item in items:
-        if not _is_only_in_ci(item):
+        if IN_CI or not _is_only_in_ci(item):
             groups.setdefault(_without_samples(item), []).append(item)
     sampled_before: Counter[object] = Counter()
     kept = set[pytest.Item]()
@@ -133,7 +131,8 @@ def anvil() -> Iterator[Anvil]:
 
 def _without_samples(item: pytest.Item) -> tuple[object, ...]:
     """File, name and parameters of a test, without those parameters of which one value is enough."""
-    sampled = {name for mark in item.iter_markers("sample") for name in mark.args}
+    marks = ("in_turn",) if IN_CI else ("in_turn", "sample")
+    sampled = {name for mark in marks for marker in item.iter_markers(mark) for name in marker.args}
     call = getattr(item, "callspec", None)
     if call is None or not sampled:
         return item.path, item.nodeid

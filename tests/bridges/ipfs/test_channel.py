@@ -175,7 +175,7 @@ async def test_messages_of_another_bridge_are_not_sent_back(
 
 
 @pytest.mark.full
-@pytest.mark.sample("together")
+@pytest.mark.in_turn("together")
 @pytest.mark.parametrize("together", [True, False], ids=["at-one-daemon", "at-two-daemons"])
 async def test_two_bridges_relay_a_thousand_messages_each_way_exactly_once(
     router: EmbeddedRouter,

@@ -17,6 +17,7 @@ from tests.support.waiting import until_found
 SLOW = [{"topic": "/count", "value": {"count": 3, "mode": "fine"}}]
 
 
+@pytest.mark.in_turn("state")
 @pytest.mark.parametrize("state", ["asked", "waiting", "running"])
 @pytest.mark.parametrize("victim", ["door", "client", "signer"])
 async def test_a_job_is_found_again(world: World, victim: str, state: str) -> None:

@@ -30,7 +30,7 @@ async def market_chain() -> AsyncIterator[MarketChain]:
         yield chain
 
 
-@pytest.mark.sample("over")
+@pytest.mark.in_turn("over")
 @pytest.mark.parametrize("over", ["http", "websocket"])
 @pytest.mark.parametrize("name", rows())
 async def test_a_whole_job_is_paid_behind_each_provider(

@@ -69,7 +69,7 @@ FOR_DOUBTS = ("eth_getBlockByHash", "eth_getBlockReceipts")
 """What is asked only where an empty answer about logs is doubted."""
 
 
-@pytest.mark.sample("nodes")
+@pytest.mark.in_turn("nodes")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("nodes", [1, 2])
 async def test_each_method_is_asked_again_after_a_spoiled_answer(
@@ -124,7 +124,7 @@ async def test_a_permit_is_signed_through_a_node_that_at_times_lacks_the_contrac
         assert proxy.spoiled.total()
 
 
-@pytest.mark.sample("kind")
+@pytest.mark.in_turn("kind")
 @pytest.mark.parametrize("method", ANSWERS)
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_that_spoils_every_answer_to_a_method_is_unreachable(
