@@ -133,7 +133,9 @@ def jobs_per_minute(
     transaction, or every `block_time` seconds. The provider has at most `unmined` transactions that are not mined.
     """
     with router() as (endpoint, pid), tempfile.TemporaryDirectory() as folder:
-        settings = Settings(connect=(endpoint,), data_dir=folder, playback="at-once", unmined_limit=unmined)
+        settings = Settings(
+            connect=(endpoint,), data_dir=folder, playback="at-once", unmined_limit=unmined, free_contracts=1_000_000
+        )
         return asyncio.run(_jobs(settings, pid, jobs=jobs, robots=robots, at_once=at_once, block_time=block_time))
 
 
