@@ -24,8 +24,8 @@ TOKEN: Final = "0x" + "22" * 20
 MODEL: Final = cid_of_digest(bytes(32))
 
 
-def unsigned_demands(count: int, *, deadline: int = 2**40, lighthouse: str = ADDRESS) -> Iterator[Demand]:
-    """Demands for one model that differ in objective and nonce."""
+def unsigned_demands(count: int, *, deadline: int = 2**32 - 1, lighthouse: str = ADDRESS) -> Iterator[Demand]:
+    """Demands for one model that differ in objective and nonce. The latest deadline is that of legacy messages."""
     for _ in range(count):
         yield Demand(
             model=MODEL,
