@@ -24,14 +24,16 @@ TOKEN: Final = "0x" + "22" * 20
 MODEL: Final = cid_of_digest(bytes(32))
 
 
-def unsigned_demands(count: int, *, deadline: int = 2**32 - 1, lighthouse: str = ADDRESS) -> Iterator[Demand]:
+def unsigned_demands(
+    count: int, *, deadline: int = 2**32 - 1, lighthouse: str = ADDRESS, cost: int = 1000
+) -> Iterator[Demand]:
     """Demands for one model that differ in objective and nonce. The latest deadline is that of legacy messages."""
     for _ in range(count):
         yield Demand(
             model=MODEL,
             objective=cid_of_digest(secrets.token_bytes(32)),
             token=TOKEN,
-            cost=1000,
+            cost=cost,
             lighthouse=lighthouse,
             validator=ZERO_ADDRESS,
             validator_fee=0,
@@ -40,12 +42,11 @@ def unsigned_demands(count: int, *, deadline: int = 2**32 - 1, lighthouse: str =
         )
 
 
-def signed_demands(count: int, *, lighthouse: str = ADDRESS) -> list[Demand]:
+def signed_demands(count: int, *, lighthouse: str = ADDRESS, cost: int = 1000) -> list[Demand]:
     """The same demands, each signed by one of sixteen people."""
     people = [Signer(secrets.token_bytes(32)) for _ in range(16)]
-    return [
-        people[number % 16].sign(demand) for number, demand in enumerate(unsigned_demands(count, lighthouse=lighthouse))
-    ]
+    demands = unsigned_demands(count, lighthouse=lighthouse, cost=cost)
+    return [people[number % 16].sign(demand) for number, demand in enumerate(demands)]
 
 
 def installed_anvil() -> Path | None:

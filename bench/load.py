@@ -102,7 +102,7 @@ def publish(endpoint: str, lighthouse: str, address: str, count: int, ready: Any
 
 
 async def _publish(endpoint: str, lighthouse: str, address: str, count: int, ready: Any, added: Any) -> None:
-    demands = signed_demands(count, lighthouse=address)
+    demands = signed_demands(count, lighthouse=address, cost=0)  # their makers have no money
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
         Channel(network.session, lighthouse, address=address) as channel,
@@ -165,7 +165,7 @@ async def _jobs(
             given = (role, replace(settings, data_dir=f"{settings.data_dir}/{role}"), node.funded_keys, number, theirs)
             process = SPAWN.Process(target=run, args=given, daemon=True)
             process.start()
-            stack.callback(process.join)
+            stack.callback(process.join, 30)  # seconds: if the jobs fail, it is not told to end
             assert process.pid is not None
             pids[role] = process.pid
         await asyncio.gather(*(_heard(pipe) for pipe in pipes.values()))
