@@ -707,7 +707,9 @@ class Settlement:
         data_gas = await parts.chain.retrying(
             partial(parts.chain.liabilities.data_gas, demand.message, offer.message), outages=parts.lookups
         )
-        fee = permit_fee(demand.message) if await self._permit(match) is not None else 0
+        fee = permit_fee(demand.message)
+        if fee and await self._permit(match) is None:
+            fee = 0
         if parts.free.lacking(match, data_gas=data_gas, permit_fee=fee) and not await parts.free.take(match):
             self._decline(match, data_gas)
             return
