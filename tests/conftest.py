@@ -55,7 +55,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Take one value of `in_turn` parameters, and outside CI one EVM, one router, no `full` tests, a value of `sample`."""
+    """One value of `in_turn` parameters; outside CI also one of `sample`, one EVM, one router, and no `full` tests."""
     groups: dict[tuple[object, ...], list[pytest.Item]] = {}
     for item in items:
         if IN_CI or not _is_only_in_ci(item):

@@ -30,7 +30,6 @@ transaction only the block is known, and that it is mined again soon.)
 from __future__ import annotations
 
 import heapq
-from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -97,8 +96,8 @@ class Orders:
         """By liability: the messages that were used there, and the results for it, in order of arrival."""
         self._held: dict[bytes, OrderRecord] = {}
         """The results that wait for others, in order of arrival."""
-        self._used: deque[tuple[int, bytes]] = deque()
-        """Block and message of each event that was read, the oldest first."""
+        self._used: list[tuple[int, bytes]] = []
+        """A heap of block and message of each event that was read, and for whose transaction nobody waits any more."""
         self._pairs: BoundedDict[bytes, bytes] = BoundedDict(REMEMBERED)
         """Of each order of a pair (identity), the other one."""
 
@@ -234,7 +233,7 @@ class Orders:
             return False
         if record.state is OrderStage.MINED:
             record.move(OrderStage.CONFIRMED)
-            self._used.append((record.block, record.identity))
+            heapq.heappush(self._used, (record.block, record.identity))
         return True
 
     def hold(self, result: Verified[Result]) -> Verified[Result] | None:
@@ -301,7 +300,7 @@ class Orders:
     def confirm(self, head: int) -> None:
         """Forget the messages whose event is so deep below block `head` that it stays."""
         while self._used and (self._used[0][0] <= head - self._depth or len(self._used) > self._used_limit):
-            block, identity = self._used.popleft()
+            block, identity = heapq.heappop(self._used)
             record = self._records.get(identity)
             if record is not None and record.block == block and record.state is OrderStage.CONFIRMED:
                 self._forget(record)
@@ -321,7 +320,7 @@ class Orders:
         elif record.state is not OrderStage.MINED:
             if record.state is not OrderStage.CONFIRMED:
                 record.move(OrderStage.CONFIRMED)
-            self._used.append((block, record.identity))
+            heapq.heappush(self._used, (block, record.identity))
 
     def _place(self, record: OrderRecord, liability: str) -> None:
         """Note where a message is used; an empty `liability` means nowhere."""

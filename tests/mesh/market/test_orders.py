@@ -166,10 +166,10 @@ def test_an_order_that_another_contract_uses_after_a_reorganisation_belongs_to_t
 def test_the_number_of_used_messages_is_bounded() -> None:
     demands = [verified_demand() for _ in range(3)]
     orders = orders_with(used=2)
-    for demand in demands:
+    for block, demand in enumerate(demands, 10):
         orders.add(demand, head=0)
-        orders.created(CONTRACT, 10, order_id(demand))
-    orders.confirm(10)
+        orders.created(CONTRACT, block, order_id(demand))
+    orders.confirm(12)
     assert states(orders, *demands) == [None, OrderStage.CONFIRMED, OrderStage.CONFIRMED]
 
 
@@ -224,6 +224,19 @@ def test_a_copy_of_an_unfunded_order_is_matched_once_its_maker_can_pay() -> None
     orders.set_aside(demand, now=0.0, head=0)
     assert isinstance(orders.add(offer, head=0), Added)
     assert orders.add(demand, head=0) == Match(demand, offer)
+
+
+def test_a_used_order_is_forgotten_when_its_own_block_is_deep() -> None:
+    """Also if the transaction of another one, in a later block, was waited for less long."""
+    orders, demand, offer = orders_with(), verified_demand(), verified_offer()
+    assert isinstance(orders.add(demand, head=1), Added)
+    assert orders.add(offer, head=1) == Match(demand, offer)
+    for block, order in ((2, offer), (3, demand)):
+        orders.created(CONTRACT, block, order_id(order))
+    for order in (demand, offer):
+        assert orders.end(order)
+    orders.confirm(2 + DEPTH)
+    assert states(orders, demand, offer) == [OrderStage.CONFIRMED, None]
 
 
 @pytest.mark.parametrize("state", sorted(ENDS))
