@@ -26,7 +26,7 @@ MUTANTS = 40
 MEMORY = 256 << 20
 SECONDS = 20.0
 """Of the processor, to examine a file, and again to read it when it is played. The slowest file takes 3 on an idle
-machine; one without a bound takes minutes."""
+machine, and took 6 on a busy one."""
 REASONS = {"not-a-recording", "corrupt", "expands-too-much", "too-long", "unreadable-message", "unplayable-topic"}
 OPENING = """
 import json, sys, time
