@@ -25,9 +25,9 @@ MODEL: Final = cid_of_digest(bytes(32))
 
 
 def unsigned_demands(
-    count: int, *, deadline: int = 2**32 - 1, lighthouse: str = ADDRESS, cost: int = 1000
+    count: int, *, deadline: int = 10**9, lighthouse: str = ADDRESS, cost: int = 1000
 ) -> Iterator[Demand]:
-    """Demands for one model that differ in objective and nonce. The latest deadline is that of legacy messages."""
+    """Demands for one model that differ in objective and nonce. The legacy network takes them, too."""
     for _ in range(count):
         yield Demand(
             model=MODEL,

@@ -165,7 +165,7 @@ async def _jobs(
             given = (role, replace(settings, data_dir=f"{settings.data_dir}/{role}"), node.funded_keys, number, theirs)
             process = SPAWN.Process(target=run, args=given, daemon=True)
             process.start()
-            stack.callback(process.join, 30)  # seconds: if the jobs fail, it is not told to end
+            stack.callback(process.join, 30)  # seconds; when the jobs fail, nobody tells it to stop
             assert process.pid is not None
             pids[role] = process.pid
         await asyncio.gather(*(_heard(pipe) for pipe in pipes.values()))

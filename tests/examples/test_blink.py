@@ -100,7 +100,7 @@ def test_a_ros_bag_makes_the_lamp_blink_as_well(market: dict[str, str], tmp_path
 
 
 @pytest.mark.full
-@pytest.mark.in_turn("protocol")
+@pytest.mark.sample("protocol")
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_the_argument_chooses_the_lamp(protocol: str, market: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "result.mcap"
